@@ -1,0 +1,33 @@
+# Two commands a newcomer needs: `make demo` and `make test`. Both set everything up first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.PHONY: demo test test-fast lint bench clean
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,dev]'
+	touch $(READY)
+
+demo: $(READY)  ## fit the five recordings that ship with the project
+	$(BIN)/tune --flights reference_flights/*.bag --out runs/demo
+
+test: $(READY)  ## every test, the slow ones too
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+test-fast: $(READY)  ## what a change is checked against while it is being made
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+
+lint: $(READY)  ## style, types, and who may import whom
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+
+bench: $(READY)  ## ratios on this machine, written to benchmarks/RESULTS.md; needs a quiet machine
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf $(VENV) runs

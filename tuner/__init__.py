@@ -1,0 +1,1 @@
+"""A service around the simulated flight: recordings in, coefficients and reports out."""

@@ -1,0 +1,46 @@
+"""The errors that a user can cause: each is one line saying where, what is wrong, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class InputError(Exception):
+    """The user's input is wrong; the command line turns it into one line and exit status 2.
+
+    Parameters
+    ----------
+    where
+        The file or option at fault.
+    what
+        What is wrong with it.
+    remedy
+        What to do about it.
+    """
+
+    def __init__(self, where: str | Path, what: str, remedy: str) -> None:
+        self.where = str(where)
+        self.what = what
+        self.remedy = remedy
+        super().__init__(" ".join(f"{where}: {what}; {remedy}".split()))
+
+
+class ConfigError(InputError):
+    """A vehicle, controller or job file cannot be used."""
+
+
+class RecordingError(InputError):
+    """A recording cannot be read, or lacks what is asked of it."""
+
+
+class ExportError(InputError):
+    """An export was refused or could not be written."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return ``did you mean 'x'?`` for the nearest known word, or the list of known words."""
+    names = sorted(known)
+    close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    return f"did you mean '{close[0]}'?" if close else f"known are {', '.join(names)}"
