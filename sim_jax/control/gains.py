@@ -1,0 +1,77 @@
+"""The controllers' gains, laws and filters as one pytree; what decides structure is static."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+
+from sim_jax.numeric import Scalar
+from sim_jax.vector import Vec3
+
+
+class PositionGains(eqx.Module):
+    """Geometric position controller of mavros_controllers."""
+
+    kp: Vec3
+    """1/s², acceleration per position error, world axes."""
+    kv: Vec3
+    """1/s, acceleration per velocity error, world axes."""
+    max_feedback_acceleration: Scalar
+    """m/s², length at which the feedback is cut."""
+    reference_drag: Vec3
+    """1/s, diagonal of D in the reference's body axes."""
+    velocity_yaw: bool = eqx.field(static=True, default=False)
+    """Take the heading from the velocity instead of zero."""
+
+
+class AttitudeGains(eqx.Module):
+    """Attitude law and thrust map of mavros_controllers."""
+
+    time_constant: Scalar
+    """s."""
+    normalized_constant: Scalar
+    """Thrust set-point per m/s² of wanted specific force."""
+    normalized_offset: Scalar
+    """Thrust set-point at zero specific force."""
+    law: Literal["quaternion", "rotation_matrix"] = eqx.field(static=True, default="quaternion")
+
+
+class RateGains(eqx.Module):
+    """PX4 rate controller; axes roll, pitch, yaw. K multiplies P, I and D."""
+
+    p: Vec3
+    i: Vec3
+    d: Vec3
+    ff: Vec3
+    k: Vec3
+    integrator_limit: Vec3
+
+
+class Filters(eqx.Module):
+    """Low-passes between gyro and rate controller; None leaves one out."""
+
+    gyro_cutoff: Scalar | None
+    """Hz, two-pole Butterworth on the rate (IMU_GYRO_CUTOFF)."""
+    dgyro_cutoff: Scalar | None
+    """Hz, one pole on its derivative (IMU_DGYRO_CUTOFF)."""
+
+
+class MixerSettings(eqx.Module):
+    """PX4 quad-X mixer."""
+
+    airmode: Literal[0, 1, 2] = eqx.field(static=True, default=0)
+    thrust_factor: float = eqx.field(static=True, default=0.0)
+    """THR_MDL_FAC: 0 linear, 1 thrust proportional to the squared command."""
+    pwm_quantisation: bool = eqx.field(static=True, default=False)
+    """Truncate commands to whole PWM microseconds, as PX4's output does; stops gradients."""
+
+
+class Controller(eqx.Module):
+    """Everything between a reference and the motor commands."""
+
+    position: PositionGains
+    attitude: AttitudeGains
+    rate: RateGains
+    filters: Filters
+    mixer: MixerSettings

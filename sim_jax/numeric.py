@@ -1,0 +1,34 @@
+"""Scalars with derivatives that stay finite where the plain functions' do not."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float
+
+#: One number per vehicle of the batch; shape () for a single vehicle.
+Scalar: TypeAlias = Float[Array, "*batch"]
+#: One truth value per vehicle of the batch.
+Flag: TypeAlias = Bool[Array, "*batch"]
+
+GRAVITY = 9.81
+"""m/s², acting on the plant."""
+
+
+def saturate(value: Scalar, lower: Scalar | float, upper: Scalar | float) -> Scalar:
+    """Limit a value; at a limit the derivative is the inner one, not the mean of both sides."""
+    return jnp.where(value < lower, lower, jnp.where(value > upper, upper, value))
+
+
+def safe_sqrt(square: Scalar) -> Scalar:
+    """Return the square root, with derivative zero instead of infinite at zero."""
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def safe_divide(numerator: Scalar, denominator: Scalar) -> Scalar:
+    """Divide, giving zero with derivative zero where the denominator is zero."""
+    nonzero = denominator != 0
+    return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)

@@ -1,0 +1,171 @@
+"""Unit quaternions (w, x, y, z), body to world."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from sim_jax.numeric import Scalar, saturate
+from sim_jax.vector import Vec3
+
+
+class Matrix3(eqx.Module):
+    """A rotation matrix by its columns: the body axes in world coordinates."""
+
+    x_axis: Vec3
+    y_axis: Vec3
+    z_axis: Vec3
+
+    def to_world(self, body: Vec3) -> Vec3:
+        """Turn a body vector into world coordinates: R v."""
+        return self.x_axis * body.x + self.y_axis * body.y + self.z_axis * body.z
+
+    def to_body(self, world: Vec3) -> Vec3:
+        """Turn a world vector into body coordinates: Rᵀ v."""
+        return Vec3(self.x_axis.dot(world), self.y_axis.dot(world), self.z_axis.dot(world))
+
+
+class Quaternion(eqx.Module):
+    """A rotation from body to world.
+
+    Attributes
+    ----------
+    w, x, y, z
+        Scalar part first; each of shape (\\*batch).
+    """
+
+    w: Scalar
+    x: Scalar
+    y: Scalar
+    z: Scalar
+
+    def product(self, other: Quaternion) -> Quaternion:
+        """Return the Hamilton product self ⊗ other: first other, then self."""
+        return Quaternion(
+            self.w * other.w - self.x * other.x - self.y * other.y - self.z * other.z,
+            self.w * other.x + self.x * other.w + self.y * other.z - self.z * other.y,
+            self.w * other.y - self.x * other.z + self.y * other.w + self.z * other.x,
+            self.w * other.z + self.x * other.y - self.y * other.x + self.z * other.w,
+        )
+
+    def conjugate(self) -> Quaternion:
+        """Return the inverse rotation."""
+        return Quaternion(self.w, -self.x, -self.y, -self.z)
+
+    def normalized(self) -> Quaternion:
+        """Return the same rotation with unit norm."""
+        inverse = 1.0 / jnp.sqrt(self.w**2 + self.x**2 + self.y**2 + self.z**2)
+        return Quaternion(self.w * inverse, self.x * inverse, self.y * inverse, self.z * inverse)
+
+    def advanced(self, along: Quaternion, body_rate: Vec3, duration: Scalar | float) -> Quaternion:
+        """Return self + duration · ½ along ⊗ (0, ω), normalised: one step of q̇ = ½ q ⊗ ω.
+
+        Parameters
+        ----------
+        along
+            The rotation at which the derivative is taken.
+        body_rate
+            rad/s, body frame.
+        duration
+            s.
+        """
+        half = body_rate * (0.5 * duration)
+        return Quaternion(
+            self.w - (along.x * half.x + along.y * half.y + along.z * half.z),
+            self.x + (along.w * half.x + along.y * half.z - along.z * half.y),
+            self.y + (along.w * half.y + along.z * half.x - along.x * half.z),
+            self.z + (along.w * half.z + along.x * half.y - along.y * half.x),
+        ).normalized()
+
+    def matrix(self) -> Matrix3:
+        """Return the rotation matrix R with v_world = R v_body."""
+        x2, y2, z2 = self.x + self.x, self.y + self.y, self.z + self.z
+        xx, yy, zz = self.x * x2, self.y * y2, self.z * z2
+        xy, xz, yz = self.x * y2, self.x * z2, self.y * z2
+        wx, wy, wz = self.w * x2, self.w * y2, self.w * z2
+        return Matrix3(
+            x_axis=Vec3(1.0 - (yy + zz), xy + wz, xz - wy),
+            y_axis=Vec3(xy - wz, 1.0 - (xx + zz), yz + wx),
+            z_axis=Vec3(xz + wy, yz - wx, 1.0 - (xx + yy)),
+        )
+
+    def z_axis(self) -> Vec3:
+        """Return the body's z axis in world coordinates."""
+        return Vec3(
+            2.0 * (self.x * self.z + self.w * self.y),
+            2.0 * (self.y * self.z - self.w * self.x),
+            1.0 - 2.0 * (self.x * self.x + self.y * self.y),
+        )
+
+    def roll_pitch_yaw(self) -> Vec3:
+        """Return roll, pitch, yaw in rad (yaw about world z first, then pitch, then roll)."""
+        sine = saturate(2.0 * (self.w * self.y - self.z * self.x), -1.0, 1.0)
+        return Vec3(
+            jnp.arctan2(
+                2.0 * (self.w * self.x + self.y * self.z),
+                1.0 - 2.0 * (self.x * self.x + self.y * self.y),
+            ),
+            jnp.arcsin(sine),
+            jnp.arctan2(
+                2.0 * (self.w * self.z + self.x * self.y),
+                1.0 - 2.0 * (self.y * self.y + self.z * self.z),
+            ),
+        )
+
+    def rotation_vector_to(self, other: Quaternion) -> Vec3:
+        """Return the small rotation from self to other as a body vector in rad.
+
+        Twice the vector part of the error quaternion: exact to third order, with a derivative
+        everywhere, which the exact logarithm has not at the identity.
+        """
+        error = self.conjugate().product(other)
+        sign = jnp.where(error.w < 0, -2.0, 2.0)
+        return Vec3(sign * error.x, sign * error.y, sign * error.z)
+
+    def stacked(self) -> Float[Array, "4 *batch"]:
+        """Return the components as one array, axis first."""
+        return jnp.stack(jnp.broadcast_arrays(self.w, self.x, self.y, self.z))
+
+    @staticmethod
+    def of(values: Float[Array, "4 *batch"]) -> Quaternion:
+        """Take the components from the first axis of an array."""
+        return Quaternion(values[0], values[1], values[2], values[3])
+
+    @staticmethod
+    def identity(like: Scalar) -> Quaternion:
+        """Return the rotation that does nothing, in the shape and precision of a scalar."""
+        zero = jnp.zeros_like(like)
+        return Quaternion(jnp.ones_like(like), zero, zero, zero)
+
+    @staticmethod
+    def from_matrix(matrix: Matrix3) -> Quaternion:
+        """Return the quaternion of a rotation matrix, by its largest diagonal combination.
+
+        The four branches of the usual algorithm, chosen by selection so that a batch can take
+        different ones; the divisor is never small.
+        """
+        x, y, z = matrix.x_axis, matrix.y_axis, matrix.z_axis
+        by_w = x.x + y.y + z.z > 0
+        by_x = x.x > jnp.maximum(y.y, z.z)
+        by_y = y.y > z.z
+
+        def choose(w: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
+            return jnp.where(by_w, w, jnp.where(by_x, x, jnp.where(by_y, y, z)))
+
+        square = choose(
+            1.0 + x.x + y.y + z.z,
+            1.0 + x.x - y.y - z.z,
+            1.0 - x.x + y.y - z.z,
+            1.0 - x.x - y.y + z.z,
+        )
+        about_x, about_y, about_z = y.z - z.y, z.x - x.z, x.y - y.x
+        plus_xy, plus_xz, plus_yz = y.x + x.y, z.x + x.z, z.y + y.z
+        half = 0.5 / jnp.sqrt(square)
+        return Quaternion(
+            choose(square, about_x, about_y, about_z) * half,
+            choose(about_x, square, plus_xy, plus_xz) * half,
+            choose(about_y, plus_xy, square, plus_yz) * half,
+            choose(about_z, plus_xz, plus_yz, square) * half,
+        )

@@ -1,0 +1,94 @@
+"""The coefficients of a vehicle as one pytree, each with its unit and meaning beside it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from sim_jax.numeric import Scalar
+from sim_jax.vector import Vec3
+
+
+def _number(value: ArrayLike) -> Scalar:
+    return jnp.asarray(value, dtype=float) if isinstance(value, (int, float)) else value  # type: ignore[return-value]
+
+
+class Body(eqx.Module):
+    """Mass and inertia about the centre of mass, diagonal in body axes."""
+
+    mass: Scalar = eqx.field(converter=_number)
+    """kg, take-off mass."""
+    inertia_xx: Scalar = eqx.field(converter=_number)
+    """kg m², about body x (roll)."""
+    inertia_yy: Scalar = eqx.field(converter=_number)
+    """kg m², about body y (pitch)."""
+    inertia_zz: Scalar = eqx.field(converter=_number)
+    """kg m², about body z (yaw)."""
+
+
+class Rotor(eqx.Module):
+    """Where one rotor sits and which way it turns."""
+
+    position: Vec3
+    """m, rotor centre from the centre of mass, body frame."""
+    spin: Literal[1, -1] = eqx.field(static=True)
+    """+1 turns counter-clockwise seen from above, -1 clockwise."""
+
+
+class Motor(eqx.Module):
+    """From motor command to rotor speed (thesis Eq. 4.2, 5.3; SDF motor model)."""
+
+    input_scaling: Scalar = eqx.field(converter=_number)
+    """rad/s per unit of command."""
+    zero_position_armed: Scalar = eqx.field(converter=_number)
+    """rad/s at zero command."""
+    max_rotor_velocity: Scalar = eqx.field(converter=_number)
+    """rad/s, limit of the reference speed."""
+    time_constant_up: Scalar = eqx.field(converter=_number)
+    """s, when the reference is above the speed."""
+    time_constant_down: Scalar = eqx.field(converter=_number)
+    """s, when it is not."""
+    input_offset: Scalar = eqx.field(converter=_number, default=0.0)
+    """Added to the command before scaling."""
+    quadratic: Scalar = eqx.field(converter=_number, default=0.0)
+    """rad/s per squared command, for polynomial RPM curves (thesis 4.4.1)."""
+
+
+class Aerodynamics(eqx.Module):
+    """From rotor speed and air velocity to force and moment (Eq. 6.5, 6.6, 7.2, 8.2, 9.2)."""
+
+    motor_constant: Scalar = eqx.field(converter=_number)
+    """N s²/rad², thrust per squared rotor speed."""
+    moment_constant: Scalar = eqx.field(converter=_number)
+    """m, drag torque per thrust."""
+    rotor_drag_coefficient: Scalar = eqx.field(converter=_number)
+    """N s²/(rad m), in-plane drag per rotor speed and in-plane velocity."""
+    rolling_moment_coefficient: Scalar = eqx.field(converter=_number)
+    """N s²/rad, rolling moment per rotor speed and in-plane velocity."""
+    max_relative_airspeed: Scalar = eqx.field(converter=_number, default=25.0)
+    """m/s, axial air speed at which thrust has fallen to zero."""
+    reaction_torque: Literal["body", "world"] = eqx.field(static=True, default="body")
+    """Axis of the drag torque: body z (upstream) or world z (the thesis's branch)."""
+
+
+class Setup(eqx.Module):
+    """What the set-up around the vehicle adds: both are coefficients like any other."""
+
+    estimate_latency: Scalar = eqx.field(converter=_number, default=0.0)
+    """s, age of the state estimate that the position and attitude controllers see."""
+    actuator_latency: Scalar = eqx.field(converter=_number, default=0.0)
+    """s, from the mixer's output to the motor."""
+
+
+class Vehicle(eqx.Module):
+    """One vehicle, or a batch of them when its leaves have a trailing batch axis."""
+
+    body: Body
+    rotors: tuple[Rotor, Rotor, Rotor, Rotor]
+    """PX4 order: front right ccw, rear left ccw, front left cw, rear right cw."""
+    motor: Motor
+    aerodynamics: Aerodynamics
+    setup: Setup
