@@ -1,0 +1,60 @@
+"""Which loop runs when: rates of physics, rate control, position control and the log."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+from jax import Array
+from jaxtyping import Bool, Int
+
+
+class Schedule(eqx.Module):
+    """The rates of a simulated flight; all static, each combination compiles once."""
+
+    physics_rate: int = eqx.field(static=True, default=400)
+    """Hz of the integration; the fastest."""
+    rate_control_rate: int = eqx.field(static=True, default=400)
+    """Hz of rate controller, mixer and gyro filters (SITL: 250)."""
+    position_control_rate: int = eqx.field(static=True, default=100)
+    """Hz of position and attitude control, and of the reference."""
+    log_rate: int = eqx.field(static=True, default=100)
+    """Hz of the logged samples; divides physics_rate."""
+    integrator: Literal["midpoint", "semi_implicit"] = eqx.field(static=True, default="midpoint")
+    """Second order, or first order as Gazebo's engine."""
+    pose_rate: float | None = eqx.field(static=True, default=None)
+    """Hz at which poses reach the controller, held in between; None: every tick."""
+    longest_estimate_latency: float = eqx.field(static=True, default=0.0)
+    """s that the estimate's delay line holds; 0 leaves it out."""
+    longest_actuator_latency: float = eqx.field(static=True, default=0.0)
+    """s that the commands' delay line holds; 0 leaves it out."""
+
+    def __check_init__(self) -> None:
+        for name in ("rate_control_rate", "position_control_rate", "log_rate"):
+            if not 0 < getattr(self, name) <= self.physics_rate:
+                raise ValueError(f"{name} must be above 0 and at most physics_rate")
+        if self.physics_rate % self.log_rate:
+            raise ValueError("log_rate must divide physics_rate")
+
+    @property
+    def step(self) -> float:
+        """Seconds of one physics step."""
+        return 1.0 / self.physics_rate
+
+    @property
+    def steps_per_sample(self) -> int:
+        """Physics steps from one logged sample to the next."""
+        return self.physics_rate // self.log_rate
+
+    def control_tick(self, step: Int[Array, ""]) -> Int[Array, ""]:
+        """Return the number of the position controller's tick that is current at a physics step."""
+        return (step * self.position_control_rate) // self.physics_rate
+
+    def control_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
+        """Tell whether the position controller runs at a physics step."""
+        return self.control_tick(step) > self.control_tick(step - 1)
+
+    def rate_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
+        """Tell whether the rate controller runs at a physics step."""
+        ticks = self.rate_control_rate
+        return (step * ticks) // self.physics_rate > ((step - 1) * ticks) // self.physics_rate

@@ -1,0 +1,135 @@
+"""What the controllers see: a state estimate that is old, a gyro that is filtered."""
+
+from __future__ import annotations
+
+from math import ceil, pi, sqrt
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array, lax
+from jaxtyping import Float, Int
+
+from sim_jax.control.gains import Filters
+from sim_jax.numeric import Scalar
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.vector import Vec3
+
+
+def history_length(longest: float, step: float) -> int:
+    """Return how many steps a delay line must hold to look ``longest`` seconds back."""
+    return ceil(longest / step - 1e-9) + 2
+
+
+def _weights(length: int, cursor: Int[Array, ""], age: Scalar) -> Float[Array, "length *batch"]:
+    """Return the share of each slot in a linear interpolation at a continuous age in steps.
+
+    The slot at ``cursor`` is the newest. Right-sided derivative at whole steps, and the shares and
+    their derivatives always sum to one and to zero.
+    """
+    ages = (cursor - jnp.arange(length)) % length
+    ages = ages.reshape((length,) + (1,) * jnp.ndim(age))
+    apart = age - ages
+    rising, falling = 1.0 + apart, 1.0 - apart
+    share = jnp.where(apart < 0, rising, falling)
+    weights: Array = jnp.where((apart < -1) | (apart >= 1), 0.0, share)
+    return weights
+
+
+def push(
+    history: Float[Array, "length rows *batch"],
+    values: Float[Array, "rows *batch"],
+    step: Int[Array, ""],
+) -> Float[Array, "length rows *batch"]:
+    """Write the newest values of a delay line at physics step number ``step``."""
+    return lax.dynamic_update_index_in_dim(history, values, step % history.shape[0], 0)
+
+
+def look_back(
+    history: Float[Array, "length rows *batch"], step: Int[Array, ""], age: Scalar
+) -> Float[Array, "rows *batch"]:
+    """Read a delay line ``age`` steps back, fractions interpolated linearly."""
+    weights = _weights(history.shape[0], step % history.shape[0], age)
+    return jnp.sum(history * weights[:, None], axis=0)
+
+
+def packed(motion: Motion) -> Float[Array, "10 *batch"]:
+    """Return what an estimator delivers (position, velocity, attitude) as rows."""
+    return jnp.concatenate(
+        [motion.position.stacked(), motion.velocity.stacked(), motion.attitude.stacked()]
+    )
+
+
+def unpacked(rows: Float[Array, "10 *batch"]) -> tuple[Vec3, Vec3, Quaternion]:
+    """Return position, velocity and attitude from rows; the attitude is normalised again."""
+    return Vec3.of(rows[0:3]), Vec3.of(rows[3:6]), Quaternion.of(rows[6:10]).normalized()
+
+
+def past_of(motion: Motion, length: int, step: float) -> Float[Array, "length 10 *batch"]:
+    """Fill a delay line as if the vehicle had arrived with constant velocity and attitude.
+
+    Slot 0 is the present; ``step`` is the physics step in s.
+    """
+    ages = (-jnp.arange(length) % length) * step
+    ages = ages.astype(motion.position.x.dtype).reshape((length,) + (1,) * motion.position.x.ndim)
+    now = jnp.broadcast_to(packed(motion), (length, *packed(motion).shape))
+    moved = now[:, 0:3] - now[:, 3:6] * ages[:, None]
+    return jnp.concatenate([moved, now[:, 3:]], axis=1)
+
+
+class GyroFilter(eqx.Module):
+    """PX4's low-passes on the gyro, prepared once a rollout; None leaves one out."""
+
+    b0: Scalar | None
+    a1: Scalar | None
+    a2: Scalar | None
+    derivative_share: Scalar | None
+
+    @staticmethod
+    def at(filters: Filters, rate: float) -> GyroFilter:
+        """Prepare PX4's LowPassFilter2p (Butterworth) and AlphaFilter at a sample rate in Hz."""
+        b0 = a1 = a2 = share = None
+        if filters.gyro_cutoff is not None:
+            ohm = jnp.tan(pi * filters.gyro_cutoff / rate)
+            norm = 1.0 + sqrt(2.0) * ohm + ohm * ohm
+            b0 = ohm * ohm / norm
+            a1 = 2.0 * (ohm * ohm - 1.0) / norm
+            a2 = (1.0 - sqrt(2.0) * ohm + ohm * ohm) / norm
+        if filters.dgyro_cutoff is not None:
+            constant = 1.0 / (2.0 * pi * filters.dgyro_cutoff)
+            share = (1.0 / rate) / (constant + 1.0 / rate)
+        return GyroFilter(b0, a1, a2, share)
+
+
+class GyroMemory(eqx.Module):
+    """State of the gyro's filters; what a left-out filter would need is None."""
+
+    newer: Vec3 | None
+    older: Vec3 | None
+    rate: Vec3
+    """rad/s, filtered rate of the last sample."""
+    acceleration: Vec3
+    """rad/s², filtered derivative of the last sample."""
+
+    @staticmethod
+    def settled(gyro: GyroFilter, rate: Vec3) -> GyroMemory:
+        """Return the state after a long time at a constant rate."""
+        settled = None if gyro.b0 is None else rate * (1.0 / (4.0 * gyro.b0))
+        return GyroMemory(settled, settled, rate, Vec3.zeros(rate.x))
+
+
+def filtered(gyro: GyroFilter, memory: GyroMemory, rate: Vec3, sample_rate: float) -> GyroMemory:
+    """Take one gyro sample in rad/s through the filters."""
+    newer, older, smooth = memory.newer, memory.older, rate
+    if gyro.b0 is not None and newer is not None and older is not None:
+        assert gyro.a1 is not None
+        assert gyro.a2 is not None
+        fresh = rate - newer * gyro.a1 - older * gyro.a2
+        smooth = (fresh + newer * 2.0 + older) * gyro.b0
+        newer, older = fresh, newer
+    acceleration = (smooth - memory.rate) * sample_rate
+    if gyro.derivative_share is not None:
+        acceleration = (
+            memory.acceleration + (acceleration - memory.acceleration) * gyro.derivative_share
+        )
+    return GyroMemory(newer, older, smooth, acceleration)

@@ -1,0 +1,99 @@
+"""Everything that changes during a flight: the carry of the rollout's loop."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from sim_jax.control.mixer import PerRotor
+from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.schedule import Schedule
+from sim_jax.sensing import GyroFilter, GyroMemory, history_length, past_of
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+
+
+class Start(eqx.Module):
+    """What a flight starts from."""
+
+    motion: Motion
+    rotor_speed: PerRotor
+    """rad/s."""
+    command: PerRotor
+    """0..1, what the motors were told before the start."""
+    rate_integral: Vec3
+    """State of the rate controller's integrator, FRD."""
+
+
+class Setpoints(eqx.Module):
+    """What the attitude controller asks of the rate controller."""
+
+    rate: Vec3
+    """rad/s, body FLU."""
+    thrust: Scalar
+    """0..1."""
+
+
+class State(eqx.Module):
+    """Vehicle, controllers' memories and delay lines; delay lines not needed are None."""
+
+    motion: Motion
+    rotor_speed: PerRotor
+    setpoints: Setpoints
+    integral: Vec3
+    gyro: GyroMemory
+    command: PerRotor
+    estimates: Float[Array, "length 10 *batch"] | None
+    commands: Float[Array, "length 4 *batch"] | None
+    crash_time: Scalar
+    """s, infinite while flying."""
+
+
+def hover(vehicle: Vehicle, position: Vec3) -> Start:
+    """Return a level vehicle at rest at a position in m, its rotors carrying its weight."""
+    thrust = vehicle.body.mass * GRAVITY / 4.0
+    speed = jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
+    command = (speed - vehicle.motor.zero_position_armed) / vehicle.motor.input_scaling
+    rest = Vec3.zeros(position.x)
+    return Start(
+        motion=Motion(position, rest, Quaternion.identity(position.x), rest),
+        rotor_speed=(speed, speed, speed, speed),
+        command=(command, command, command, command),
+        rate_integral=rest,
+    )
+
+
+def first_state(
+    start: Start, schedule: Schedule, gyro: GyroFilter, shape: tuple[int, ...]
+) -> State:
+    """Return the state at time 0, every leaf in the full shape of the batch."""
+    dtype = jnp.result_type(*jax.tree.leaves(start))
+    start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), start)
+    estimates = commands = None
+    if schedule.longest_estimate_latency > 0:
+        hold = 0.0 if schedule.pose_rate is None else 1.0 / schedule.pose_rate
+        length = history_length(schedule.longest_estimate_latency + hold, schedule.step)
+        estimates = past_of(start.motion, length, schedule.step)
+    elif schedule.pose_rate is not None:
+        raise ValueError("pose_rate needs a delay line: set longest_estimate_latency")
+    if schedule.longest_actuator_latency > 0:
+        length = history_length(schedule.longest_actuator_latency, schedule.step)
+        commands = jnp.broadcast_to(jnp.stack(start.command), (length, 4, *shape))
+    memory = GyroMemory.settled(gyro, start.motion.body_rate)
+    thrust = sum(start.command[1:], start.command[0]) * 0.25
+    return State(
+        motion=start.motion,
+        rotor_speed=start.rotor_speed,
+        setpoints=Setpoints(Vec3.zeros(thrust), thrust),
+        integral=start.rate_integral,
+        gyro=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), memory),
+        command=start.command,
+        estimates=estimates,
+        commands=commands,
+        crash_time=jnp.full(shape, jnp.inf, dtype),
+    )
