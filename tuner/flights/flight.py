@@ -48,7 +48,7 @@ class Series:
     values: Array
 
     def __post_init__(self) -> None:
-        if self.time.ndim != 1 or self.values.ndim != 2 or len(self.time) != len(self.values):  # noqa: PLR2004
+        if self.time.ndim != 1 or self.values.ndim != 2 or len(self.time) != len(self.values):
             raise ValueError(f"time {self.time.shape} and values {self.values.shape} do not match")
         if len(self.time) > 1 and not np.all(np.diff(self.time) > 0):
             raise ValueError("time is not strictly increasing")

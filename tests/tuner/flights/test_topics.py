@@ -1,0 +1,59 @@
+"""Topic maps: what a user may write, and what a wrong one is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tuner.errors import ConfigError
+from tuner.flights.topics import load_topic_map, shipped_maps
+from tuner.flights.units import to_enu_flu
+
+
+def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:
+    assert "thesis_lab" in {topic_map.name for topic_map in shipped_maps()}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name: x\nformat: ros\nsignals: {positon: /a}", "did you mean 'position'"),
+        ("name: x\nformat: ros\nsignals: {position: {topik: /a}}", "topik"),
+        ("name: x\nformat: ros\nsignals: {rotor_speed: {topic: /a, unit: rmp}}", "'rpm'"),
+        ("name: x\nformat: ros\nsignals: {position: {topic: /a, fields: [x]}}", "3 columns, 1"),
+        ("- a\n- b", "is no topic map"),
+        ("a: [", "no valid YAML"),
+        ("name: x\nformat: rosbag\nsignals: {}", "format"),
+    ],
+)
+def test_wrong_map_is_one_line_that_names_the_fault(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "lab.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_topic_map(path)
+    assert said in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_unknown_name_suggests_a_shipped_map() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'thesis_lab'"):
+        load_topic_map("thesis_lap")
+
+
+def test_namespace_moves_every_topic() -> None:
+    moved = load_topic_map("thesis_lab").under("/uav1/")
+    assert moved.signals["position"][0].topic == "/uav1/optitrack/pose"
+
+
+def test_ned_frd_attitude_becomes_enu_flu() -> None:
+    random = np.random.default_rng(0)
+    q = Rotation.from_quat(random.normal(size=(20, 4)))
+    world = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # NED to ENU
+    body = np.diag([1.0, -1.0, -1.0])  # FLU to FRD
+    got = to_enu_flu(q.as_quat(scalar_first=True), "attitude")
+    matrices = Rotation.from_quat(got, scalar_first=True).as_matrix()
+    assert np.allclose(matrices, world @ q.as_matrix() @ body)

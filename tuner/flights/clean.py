@@ -1,0 +1,178 @@
+"""Dirt out of one signal: order, duplicates, NaN, quaternions, outliers; everything is counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.flights.flight import Array, Note
+
+#: Multiples of how far samples stick out nearby that make an outlier.
+THRESHOLD = 6.0
+
+
+@dataclass(frozen=True)
+class Honest:
+    """How far noise and honest motion take a sample from its neighbours.
+
+    Attributes
+    ----------
+    floor
+        In the signal's unit.
+    curvature
+        Largest second derivative in time of honest motion, unit/s^2.
+    """
+
+    floor: float
+    curvature: float = 0.0
+
+
+#: Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the
+#: angular acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back.
+HONEST: Mapping[str, Honest] = {
+    "position": Honest(floor=0.02, curvature=30.0),
+    "attitude": Honest(floor=0.03, curvature=100.0),
+    "rotor_speed": Honest(floor=30.0),
+}
+
+#: Signals that cannot leave a range; a value beyond it is a corrupt sample.
+RANGES: Mapping[str, tuple[float, float]] = {
+    "command": (-0.02, 1.02),
+    "thrust_setpoint": (-0.02, 1.02),
+    "rotor_speed": (0.0, 20_000.0),
+    "battery_voltage": (0.0, 100.0),
+}
+
+
+def clean(
+    signal: str, topic: str, time: Array, values: Array
+) -> tuple[Array, Array, tuple[Note, ...]]:
+    """Return the trustworthy samples of a signal in strictly increasing time.
+
+    Parameters
+    ----------
+    signal
+        Name in `SIGNALS`; decides which tests apply.
+    topic
+        Named in the notes.
+    time
+        (n,) seconds, any order.
+    values
+        (n, k).
+
+    Returns
+    -------
+    tuple
+        Time (m,), values (m, k) with m <= n, and what was dropped or repaired.
+    """
+    notes = []
+
+    def note(count: int, text: str) -> None:
+        if count:
+            notes.append(Note("info", topic, f"{count} {signal} samples {text}", int(count)))
+
+    low, high = RANGES.get(signal, (-np.inf, np.inf))
+    beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
+    note(int(beyond.any(axis=1).sum()), f"outside {low:g} to {high:g} dropped")
+    values = np.where(beyond, np.nan, values)
+    if signal in {"command", "thrust_setpoint"}:
+        values = np.clip(values, 0.0, 1.0)
+
+    one_per_row = signal == "rotor_speed"
+    empty = np.isnan(values).all(axis=1) if one_per_row else np.isnan(values).any(axis=1)
+    empty |= ~np.isfinite(time)
+    counted = np.asarray(beyond.any(axis=1))
+    note(int((empty & ~counted).sum()), "without a number dropped")
+    usable = np.logical_not(empty)
+    time, values = time[usable], values[usable]
+
+    late = int((np.diff(time) < 0).sum())
+    note(late, "out of order, put in order")
+    order = np.argsort(time, kind="stable")
+    time, values = time[order], values[order]
+    time, values, doubles = _merge_equal_times(time, values)
+    note(doubles, "with a stamp seen before dropped")
+
+    if signal == "attitude":
+        time, values, odd = _unit_quaternions(time, values)
+        note(odd, "that are no unit quaternion dropped or normalised")
+
+    if signal in HONEST:
+        outlier = np.zeros(values.shape, dtype=bool)
+        for column in range(values.shape[1]):
+            measured = np.flatnonzero(np.isfinite(values[:, column]))
+            outlier[measured, column] = outliers(
+                time[measured], values[measured, column], HONEST[signal]
+            )
+        note(int(outlier.any(axis=1).sum()), "far from their neighbours dropped as outliers")
+        if one_per_row:
+            values = np.where(outlier, np.nan, values)
+            keep = np.isfinite(values).any(axis=1)
+        else:
+            keep = ~outlier.any(axis=1)
+        time, values = time[keep], values[keep]
+    return time, values, tuple(notes)
+
+
+def outliers(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
+    """Tell which samples of a signal stick out on one side of all that surrounds them.
+
+    A sample is compared with the medians of the three samples before and the three after it. Ramps
+    and steps lie between the two, so that fast motion and a motor's jump are kept; one or two
+    samples that leave and come back are not. The bound adapts to the signal's own roughness.
+
+    Parameters
+    ----------
+    time
+        (n,) s, strictly increasing.
+    values
+        (n,) one column.
+    honest
+        What the signal may do by itself.
+    """
+    if len(values) < 7:
+        return np.zeros(len(values), dtype=bool)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(values, 3, mode="reflect", reflect_type="odd"), 7
+    )
+    before = np.median(windows[:, :3], axis=1)
+    after = np.median(windows[:, 4:], axis=1)
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    excess = np.maximum(np.maximum(low - values, values - high), 0.0)
+    rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
+    apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
+    bound = honest.floor + 2 * honest.curvature * apart**2
+    usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
+    return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
+
+
+def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int]:
+    """Keep one row of each time; the columns that a row lacks are filled from its twins."""
+    if len(time) < 2 or np.all(np.diff(time) > 0):
+        return time, values, 0
+    kept, start = np.unique(time, return_index=True)
+    merged = values[start]
+    filled = 0
+    for row, (first, last) in enumerate(zip(start, [*start[1:], len(time)], strict=True)):
+        for twin in range(first + 1, last):
+            lacking = np.isnan(merged[row]) & np.isfinite(values[twin])
+            merged[row, lacking] = values[twin, lacking]
+            filled += bool(lacking.any())
+    return kept, merged, len(time) - len(kept) - filled
+
+
+def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
+    """Normalise, drop what has no direction, and let the sign follow the sample before."""
+    norm = np.linalg.norm(values, axis=1)
+    usable = norm > 0.5
+    odd = int((np.abs(norm - 1) > 0.01).sum())
+    time, unit = time[usable], values[usable] / norm[usable, None]
+    if len(unit) > 1:
+        flips = np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        unit = unit * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    if len(unit) and unit[0, 0] < 0:
+        unit = -unit
+    return time, unit, odd

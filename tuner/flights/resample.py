@@ -1,0 +1,70 @@
+"""Signals on one uniform clock: linear, along the shortest arc, or held."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.flights.flight import SIGNALS, Array, Series
+
+#: Beyond this gap between two samples, in s, nothing is known; slower signals get three periods.
+GAP = 0.25
+#: Seconds after their last sample for which counters hold.
+FOREVER = np.inf
+
+
+def resample(signal: str, series: Series, clock: Array) -> Array:
+    """Return the (N, k) values of a signal on a uniform clock (N,), NaN where none are known."""
+    columns, _, way = SIGNALS[signal]
+    result = np.full((len(clock), columns), np.nan)
+    if len(series.time) == 0:
+        return result
+    if way == "arc":
+        return _along_arc(series, clock)
+    for column in range(columns):
+        measured = np.isfinite(series.values[:, column])
+        if not measured.any():
+            continue
+        time, values = series.time[measured], series.values[measured, column]
+        if way == "linear":
+            result[:, column] = np.interp(clock, time, values)
+            result[np.logical_not(_covered(time, clock)), column] = np.nan
+        else:
+            gap = FOREVER if signal == "lap" else _longest_gap(time)
+            result[:, column] = _hold(time, values, clock, gap)
+    return result
+
+
+def _longest_gap(time: Array) -> float:
+    return max(GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP
+
+
+def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
+    """Tell for which instants samples lie on both sides, not too far apart."""
+    after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
+    before = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(time) - 1)
+    inside = (clock >= time[0]) & (clock <= time[-1])
+    near = time[after] - time[before] <= _longest_gap(time)
+    return np.asarray(inside & near, dtype=np.bool_)
+
+
+def _along_arc(series: Series, clock: Array) -> Array:
+    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 (slow to import)
+
+    result = np.full((len(clock), 4), np.nan)
+    known = _covered(series.time, clock)
+    if len(series.time) < 2 or not known.any():
+        return result
+    turns = Slerp(series.time, Rotation.from_quat(series.values, scalar_first=True))
+    arc = turns(clock[known]).as_quat(scalar_first=True)
+    flips = np.where((arc[1:] * arc[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    sign = np.concatenate([[1.0], np.cumprod(flips)])
+    result[known] = arc * (sign if arc[0, 0] >= 0 else -sign)[:, None]
+    return result
+
+
+def _hold(time: Array, values: Array, clock: Array, gap: float) -> Array:
+    # A nanosecond of tolerance: stamps that were moved onto ticks carry rounding errors.
+    index = np.searchsorted(time, clock + 1e-9, side="right") - 1
+    known = (index >= 0) & (clock - time[np.maximum(index, 0)] <= gap)
+    return np.where(known, values[np.maximum(index, 0)], np.nan)
