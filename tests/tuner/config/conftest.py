@@ -1,0 +1,8 @@
+import pytest
+
+from tuner.config import configs_folder
+
+
+@pytest.fixture
+def vehicle_text():
+    return (configs_folder() / "vehicles" / "hovergames.yaml").read_text(encoding="utf-8")

@@ -1,0 +1,168 @@
+import shutil
+
+import pytest
+
+from tuner.config import Options, configs_folder, find_flights, find_job_file, settle
+from tuner.errors import ConfigError, InputError
+
+
+@pytest.fixture
+def lab(tmp_path):
+    """A folder of three recordings (their content is no matter here) and the lab's job file."""
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.bag").touch()
+    (tmp_path / "tune.yaml").write_text(
+        "mass: 2.5\nholdout: [c]\ncontroller: hovergames_sitl\nfixed: [mass]\n"
+        "search: {seed: 7, starts: 3}\n"
+    )
+    return tmp_path
+
+
+def test_the_job_file_beside_the_flights_is_used(lab):
+    s = settle(Options([f"{lab}/*.bag"]))
+    assert [flight.name for flight in s.flights] == ["a.bag", "b.bag", "c.bag"]
+    assert s.job_path == lab / "tune.yaml"
+    assert s.vehicle.mass == 2.5
+    assert s.vehicle.name == "hovergames"
+    assert s.controller.name == "hovergames_sitl"
+    assert s.job.holdout == ("c",)
+    assert s.job.search.seed == 7
+    assert str(lab / "tune.yaml") in s.origin["controller"]
+    assert s.origin["mass"] == str(lab / "tune.yaml")
+    assert s.origin["vehicle"] == "default (hovergames.yaml)"
+
+
+def test_the_command_line_wins_and_the_origin_says_so(lab):
+    s = settle(
+        Options(
+            [f"{lab}/*.bag"],
+            holdout=["a"],
+            vehicle="hovergames_updated",
+            controller="hovergames",
+            mass=2.6,
+            fit=["motor_constant"],
+            method="cma",
+            seed=3,
+        )
+    )
+    assert s.vehicle.name == "hovergames_updated"
+    assert s.vehicle.mass == 2.6
+    assert s.controller.name == "hovergames"
+    assert s.job.holdout == ("a",)
+    assert (s.job.free, s.job.fixed) == (("motor_constant",), ())
+    assert (s.job.search.method, s.job.search.seed, s.job.search.starts) == ("cma", 3, 3)
+    assert s.origin["vehicle"].startswith("--vehicle")
+    assert s.origin["mass"] == "--mass"
+    assert s.origin["holdout"] == "--holdout"
+    assert s.origin["free coefficients"] == "--fit"
+
+
+def test_another_job_file_can_be_named(lab, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other") / "mine.yaml"
+    other.write_text("mass: 9\n")
+    s = settle(Options([f"{lab}/*.bag"], config=str(other)))
+    assert s.vehicle.mass == 9
+    assert s.job.holdout == ()
+
+
+def test_without_a_job_file_the_defaults_hold(lab):
+    (lab / "tune.yaml").unlink()
+    s = settle(Options([f"{lab}/a.bag"]))
+    assert s.job_path is None
+    assert s.vehicle.mass == 2.079
+    assert s.origin["mass"] == "default (hovergames.yaml)"
+    assert s.origin["controller"] == "default (hovergames.yaml)"
+
+
+def test_fixing_takes_away_from_what_is_free(lab):
+    assert settle(Options([f"{lab}/*.bag"], fix=["gyro_cutoff"])).job.fixed == (
+        "mass",
+        "gyro_cutoff",
+    )
+    (lab / "tune.yaml").write_text("free: [motor_constant, inertia_xx]\n")
+    assert settle(Options([f"{lab}/*.bag"], fix=["inertia_xx"])).job.free == ("motor_constant",)
+
+
+def test_a_flight_held_out_by_path_joins_the_others(lab):
+    s = settle(Options([f"{lab}/a.bag"], holdout=[f"{lab}/b.bag"]))
+    assert [flight.stem for flight in s.flights] == ["a", "b"]
+    assert s.job.holdout == ("b",)
+    both = settle(Options([f"{lab}/a.bag", f"{lab}/b.bag"], holdout=[f"{lab}/b.bag"]))
+    assert [flight.stem for flight in both.flights] == ["a", "b"]
+
+
+def test_settings_for_flights_not_given_today_are_no_error(lab):
+    assert settle(Options([f"{lab}/a.bag"])).job.holdout == ()
+
+
+def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypatch):
+    shutil.copy(configs_folder() / "vehicles" / "hovergames_updated.yaml", lab / "mine.yaml")
+    (lab / "tune.yaml").write_text("vehicle: mine.yaml\n")
+    monkeypatch.chdir("/")
+    assert settle(Options([f"{lab}/a.bag"])).vehicle.name == "hovergames_updated"
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"flights": ["{lab}/z.bag"]}, "does not exist"),
+        ({"flights": ["{lab}/*.db3"]}, "matches no file"),
+        ({"flights": ["{lab}"]}, "is a folder"),
+        ({"flights": []}, "names no recording"),
+        ({"holdout": ["d"]}, "no flight 'd'"),
+        ({"holdout": ["a", "b", "c"]}, "holds out every flight"),
+        ({"mass": -1.0}, "mass is -1.0; it should be greater than 0"),
+        ({"mass": float("nan")}, "mass is nan"),
+        ({"seed": -1}, "seed is -1"),
+        ({"fit": ["mass"], "fix": ["mass"]}, "cannot stand beside --fix"),
+        ({"fit": ["mas"]}, "--fit: unknown coefficient 'mas'; did you mean 'mass'?"),
+        ({"vehicle": "nosuch"}, "neither a file nor one of the shipped vehicles"),
+        ({"vehicle": "nosuch.yaml"}, "does not exist"),
+        ({"config": "{lab}/gone.yaml"}, "does not exist"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_in_one_line(lab, change, expected):
+    fill = lambda value: value.format(lab=lab) if isinstance(value, str) else value  # noqa: E731
+    said = {"flights": ["{lab}/*.bag"]} | change
+    said = {
+        key: [fill(word) for word in value] if isinstance(value, list) else fill(value)
+        for key, value in said.items()
+    }
+    with pytest.raises(InputError) as error:
+        settle(Options(**said))
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_misspelt_flight_in_the_job_file_is_named(lab):
+    (lab / "tune.yaml").write_text("flights: {aa: {weight: 2}}\n")
+    with pytest.raises(ConfigError, match="'aa' that is not there; did you mean 'a'"):
+        settle(Options([f"{lab}/*.bag"]))
+    (lab / "tune.yaml").write_text("holdout: [cc]\n")
+    with pytest.raises(ConfigError, match="'cc' that is not there"):
+        settle(Options([f"{lab}/*.bag"]))
+
+
+def test_two_recordings_of_one_name_are_refused(lab):
+    (lab / "more").mkdir()
+    (lab / "more" / "a.bag").touch()
+    with pytest.raises(InputError, match="same name"):
+        settle(Options([f"{lab}/a.bag", f"{lab}/more/a.bag"]))
+
+
+def test_two_job_files_are_refused(lab):
+    (lab / "more").mkdir()
+    (lab / "more" / "d.bag").touch()
+    (lab / "more" / "tune.yaml").touch()
+    with pytest.raises(ConfigError, match="second job file"):
+        find_job_file([lab / "a.bag", lab / "more" / "d.bag"])
+
+
+def test_a_recording_named_twice_is_one_flight(lab):
+    assert len(find_flights([f"{lab}/a.bag", f"{lab}/../{lab.name}/a.bag", f"{lab}/a*"])) == 1
+
+
+def test_a_ros_2_recording_is_a_folder(lab):
+    (lab / "d").mkdir()
+    (lab / "d" / "metadata.yaml").touch()
+    assert find_flights([f"{lab}/d"]) == (lab / "d",)

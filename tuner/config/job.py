@@ -1,0 +1,267 @@
+"""The job file, ``tune.yaml``: everything a fit can be told, with nothing required."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from annotated_types import Ge, Interval, Len
+from pydantic import AfterValidator, Field, model_validator
+
+from tuner.config.coefficient_names import COEFFICIENTS
+from tuner.config.model import (
+    Flag,
+    Number,
+    Positive,
+    Section,
+    Whole,
+    read_model,
+    refuse,
+)
+from tuner.config.shipped import Kind, find_config
+from tuner.errors import ConfigError, did_you_mean
+
+#: Recorded signals whose residuals a fit can weigh, by their names in a `Flight`.
+CHANNELS = ("position", "velocity", "attitude", "body_rate", "rotor_speed", "command")
+
+InletName = Literal["auto", "reference", "body_rate", "actuator", "rotor_speed"]
+Method = Literal["auto", "gradient", "cma", "hybrid"]
+TrajectoryName = Literal["circle", "lemniscate", "straight", "diagonal", "yaw_spin", "hover"]
+
+
+def _known(word: str, known: tuple[str, ...], kind: str) -> str:
+    if word not in known:
+        raise refuse(f"unknown {kind} '{word}'", did_you_mean(word, known))
+    return word
+
+
+CoefficientName = Annotated[
+    str, AfterValidator(lambda name: _known(name, tuple(COEFFICIENTS), "coefficient"))
+]
+ChannelName = Annotated[str, AfterValidator(lambda name: _known(name, CHANNELS, "channel"))]
+
+
+class Prior(Section):
+    """What is believed of a coefficient before the flights: mean ± standard deviation, its unit."""
+
+    mean: Number
+    sd: Positive
+
+
+class CoefficientSettings(Section):
+    """How the search may move one coefficient; None leaves the tuner's own choice.
+
+    Attributes
+    ----------
+    lower, upper
+        Bounds, in the coefficient's unit.
+    scale
+        Whether the search moves the logarithm or the number.
+    prior
+        Pulls the fit towards a mean.
+    """
+
+    lower: Number | None = None
+    upper: Number | None = None
+    scale: Literal["log", "linear"] | None = None
+    prior: Prior | None = None
+
+    @model_validator(mode="after")
+    def _leave_room(self) -> Self:
+        if self.lower is not None and self.upper is not None and self.lower >= self.upper:
+            raise refuse(f"lower {self.lower:g} is not below upper {self.upper:g}", "swap them")
+        if self.scale == "log":
+            for name in ("lower", "upper"):
+                value = getattr(self, name)
+                if value is not None and value <= 0:
+                    raise refuse(
+                        f"{name} {value:g} has no logarithm",
+                        "give a positive bound or scale: linear",
+                    )
+            if self.prior is not None and self.prior.mean <= 0:
+                raise refuse(
+                    f"prior mean {self.prior.mean:g} has no logarithm",
+                    "give a positive mean or scale: linear",
+                )
+        return self
+
+
+class Search(Section):
+    """How the minimum is looked for.
+
+    Attributes
+    ----------
+    method
+        ``gradient`` is Levenberg-Marquardt, ``cma`` is CMA-ES, ``hybrid`` is one after the other.
+    seed
+        Of everything random.
+    starts
+        How many starting points; the first is the vehicle file's, the others lie around it.
+    robust
+        ``huber`` bounds the pull of outliers, ``none`` is plain least squares.
+    window
+        s, length of the windows of inlets below ``reference``.
+    max_iterations
+        Of each stage.
+    """
+
+    method: Method = "auto"
+    seed: Annotated[Whole, Ge(0)] = 0
+    starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
+    robust: Literal["huber", "none"] = "huber"
+    window: Annotated[Number, Interval(ge=0.1, le=60)] = 1.0
+    max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100
+
+
+class TrajectorySettings(Section):
+    """The trajectory of a recording that holds no reference; keys and units of ``tune simulate``.
+
+    Attributes
+    ----------
+    name
+        Which shape.
+    radius
+        m.
+    omega
+        rad/s.
+    speed_scale
+        The publisher's velocity scaler.
+    yaw_rate
+        rad/s, of a yaw spin.
+    """
+
+    name: TrajectoryName
+    radius: Positive = 2.0
+    omega: Positive = 0.7
+    speed_scale: Positive = 2.1
+    yaw_rate: Number = 2.0
+
+
+class FlightSettings(Section):
+    """What holds for one flight alone; None leaves what holds for all.
+
+    Attributes
+    ----------
+    inlet
+        Where the recording is fed into the simulated loop.
+    weight
+        Multiplies the flight's residuals.
+    time_offset
+        s by which the recording's clock is late, or ``free`` to have it fitted.
+    trajectory
+        What was flown, where the recording holds no reference.
+    """
+
+    inlet: InletName | None = None
+    weight: Positive = 1.0
+    time_offset: Number | Literal["free"] | None = None
+    trajectory: TrajectorySettings | None = None
+
+
+class ExportSettings(Section):
+    """What is exported into the result folder beside ``best_fit.yaml``.
+
+    Attributes
+    ----------
+    formats
+        ``sdf`` and ``px4``; ``yaml`` with source and confidence of each coefficient.
+    into
+        The SDF model that ``sdf`` starts from; the original stays as it is.
+    """
+
+    formats: tuple[Literal["yaml", "sdf", "px4"], ...] = ()
+    into: Path | None = None
+
+
+class JobFile(Section):
+    """The settings of one tuning job.
+
+    Attributes
+    ----------
+    vehicle, controller, topics
+        Files, or None for what ships. `read_job` makes paths absolute and finds shipped names.
+    mass
+        kg, as weighed; instead of the vehicle file's.
+    holdout
+        Flights that are evaluated, never fitted.
+    free
+        Exactly the coefficients to fit; None for the tuner's own choice.
+    fixed
+        Coefficients to leave alone, out of the tuner's own choice.
+    coefficients
+        Bounds, scale and prior of single coefficients.
+    ties
+        Groups that share one value, each kept at the ratio of the starting values.
+    channels
+        Recorded signals to use or not; those not named are used where they were recorded.
+    weights
+        Multiplies a channel's residuals, on top of the weight that its noise gives it.
+    inlet
+        Where recordings are fed into the simulated loop.
+    time_offset
+        s by which the recordings' clocks are late, or ``free`` to have each fitted.
+    search, flights, export
+        See there; ``flights`` goes by file name without suffix.
+    """
+
+    vehicle: Path | None = None
+    controller: Path | None = None
+    topics: Path | None = None
+    mass: Positive | None = None
+    holdout: tuple[str, ...] = ()
+    free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
+    fixed: tuple[CoefficientName, ...] = ()
+    coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
+    ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()
+    channels: dict[ChannelName, Flag] = Field(default_factory=dict)
+    weights: dict[ChannelName, Positive] = Field(default_factory=dict)
+    inlet: InletName = "auto"
+    time_offset: Number | Literal["free"] = "free"
+    search: Search = Search()
+    flights: dict[str, FlightSettings] = Field(default_factory=dict)
+    export: ExportSettings = ExportSettings()
+
+    @model_validator(mode="after")
+    def _contradict_nothing(self) -> Self:
+        if self.free is not None and self.fixed:
+            raise refuse("both 'free' and 'fixed' are given", "keep one of them")
+        _once("free", self.free or ())
+        _once("ties", tuple(name for group in self.ties for name in group))
+        if self.channels and not any(self.channels.get(name, True) for name in CHANNELS):
+            raise refuse("every channel is switched off", "leave one on")
+        return self
+
+
+def read_job(path: str | Path) -> JobFile:
+    """Read a job file; paths in it count from its folder.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the file, the key, its value, what it should be.
+    """
+    path = Path(path)
+    job = read_model(JobFile, path)
+    kinds: dict[str, Kind] = {
+        "vehicle": "vehicles",
+        "controller": "controllers",
+        "topics": "topics",
+    }
+    found: dict[str, Path] = {}
+    for key, kind in kinds.items():
+        reference = getattr(job, key)
+        if reference is not None:
+            try:
+                found[key] = find_config(kind, str(reference), path.parent)
+            except ConfigError as error:
+                raise ConfigError(path, f"{key} '{reference}' {error.what}", error.remedy) from None
+    if job.export.into is not None:
+        into = path.parent / job.export.into.expanduser()
+        return job.model_copy(update=found | {"export": job.export.replace(into=into)})
+    return job.model_copy(update=found)
+
+
+def _once(key: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise refuse(f"{key} names '{name}' twice", "keep it once")

@@ -1,0 +1,266 @@
+"""Where the command line, the job file and the defaults meet: one settled job."""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from tuner.config.coefficient_names import check_names, with_values
+from tuner.config.controller import ControllerFile, read_controller
+from tuner.config.job import JobFile, Method, read_job
+from tuner.config.model import config_error
+from tuner.config.shipped import Kind, find_config
+from tuner.config.vehicle import VehicleFile, read_vehicle
+from tuner.config.yaml_file import Document
+from tuner.errors import ConfigError, InputError, did_you_mean
+
+JOB_FILE = "tune.yaml"
+DEFAULT_NAME = "hovergames"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What was said on the command line; None is nothing said.
+
+    Attributes
+    ----------
+    flights
+        Recordings, or quoted globs.
+    holdout
+        Names or paths of flights that are evaluated, never fitted.
+    vehicle, controller
+        Paths, or names of shipped files.
+    mass
+        kg.
+    config
+        The job file.
+    fit, fix
+        Coefficients: exactly those to fit, or those to leave alone.
+    method, seed
+        Of the search.
+    """
+
+    flights: Sequence[str]
+    holdout: Sequence[str] | None = None
+    vehicle: str | None = None
+    controller: str | None = None
+    mass: float | None = None
+    config: str | None = None
+    fit: Sequence[str] | None = None
+    fix: Sequence[str] | None = None
+    method: Method | None = None
+    seed: int | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A settled job.
+
+    Attributes
+    ----------
+    flights
+        The recordings, those held out too; their stems are distinct.
+    vehicle
+        Where the fit starts, the weighed mass in it.
+    controller
+        What flew.
+    job
+        The job file with the command line's choices in it; ``holdout`` names given flights only.
+    job_path
+        The job file that was read, None without one.
+    origin
+        Setting to where it comes from, in words: the command line, a file, or the default.
+    """
+
+    flights: tuple[Path, ...]
+    vehicle: VehicleFile
+    controller: ControllerFile
+    job: JobFile
+    job_path: Path | None
+    origin: Mapping[str, str]
+
+
+def settle(options: Options) -> Settings:
+    """Read what the options and the flights' job file name, and let the command line win.
+
+    Raises
+    ------
+    InputError
+        A path, name or value cannot be used.
+    """
+    flights = find_flights(options.flights)
+    job_path = _job_path(options, flights)
+    job = read_job(job_path) if job_path else JobFile()
+    origin: dict[str, str] = {}
+
+    holdout, extra = _holdout(options, job, flights)
+    flights = (*flights, *extra)
+    _names_are_distinct(flights)
+    _check_flight_names(job, job_path, flights)
+    if all(flight.stem in holdout for flight in flights):
+        raise InputError("--holdout", "holds out every flight", "leave one to fit")
+    try:
+        job = _override(job, options, holdout)
+    except ValidationError as error:
+        raise config_error(error, Document(Path("command line"), {}, {})) from None
+
+    vehicle_path, origin["vehicle"] = _choose(
+        "vehicles", options.vehicle, "--vehicle", job.vehicle, job_path
+    )
+    vehicle = read_vehicle(vehicle_path)
+    controller_path, origin["controller"] = _choose(
+        "controllers", options.controller, "--controller", job.controller, job_path
+    )
+    if job.mass is not None:
+        vehicle = with_values(vehicle, {"mass": job.mass})
+    origin["mass"] = _from(
+        "--mass" if options.mass is not None else None,
+        job_path if job.mass is not None else None,
+        origin["vehicle"],
+    )
+    origin["holdout"] = _from(
+        "--holdout" if options.holdout is not None else None, job_path if holdout else None
+    )
+    origin["free coefficients"] = _from(
+        "--fit" if options.fit is not None else "--fix" if options.fix is not None else None,
+        job_path if job.free is not None or job.fixed else None,
+    )
+    return Settings(flights, vehicle, read_controller(controller_path), job, job_path, origin)
+
+
+def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
+    """Return the recordings that paths and quoted globs mean, each once, globs sorted.
+
+    Raises
+    ------
+    InputError
+        A path does not exist, a glob matches nothing, or nothing is named at all.
+    """
+    found: dict[Path, Path] = {}
+    for pattern in patterns:
+        path = Path(pattern).expanduser()
+        if path.exists():
+            matches = [path]
+        elif glob.has_magic(pattern):
+            matches = [Path(match) for match in sorted(glob.glob(str(path)))]  # noqa: PTH207
+            if not matches:
+                raise InputError(pattern, "matches no file", "check the folder and the pattern")
+        else:
+            raise InputError(path, "does not exist", "check the path")
+        for match in matches:
+            if match.is_dir() and not (match / "metadata.yaml").exists():
+                raise InputError(
+                    match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
+                )
+            found.setdefault(match.resolve(), match)
+    if not found:
+        raise InputError("--flights", "names no recording", "give the recordings to use")
+    return tuple(found.values())
+
+
+def find_job_file(flights: Iterable[Path]) -> Path | None:
+    """Return the ``tune.yaml`` beside the flights, None without one.
+
+    Raises
+    ------
+    ConfigError
+        The flights lie in several folders with a job file each.
+    """
+    folders = {flight.resolve().parent: flight.parent for flight in flights}
+    found = [shown / JOB_FILE for shown in folders.values() if (shown / JOB_FILE).is_file()]
+    if len(found) > 1:
+        raise ConfigError(
+            found[1], f"is a second job file beside {found[0]}", "name one of them with --config"
+        )
+    return found[0] if found else None
+
+
+def _job_path(options: Options, flights: tuple[Path, ...]) -> Path | None:
+    return Path(options.config).expanduser() if options.config else find_job_file(flights)
+
+
+def _choose(
+    kind: Kind, said: str | None, option: str, in_job: Path | None, job_path: Path | None
+) -> tuple[Path, str]:
+    """Return a file and where the choice of it comes from."""
+    if said is not None:
+        path = find_config(kind, said, Path())
+        return path, f"{option} {path}"
+    if in_job is not None:
+        return in_job, f"{in_job} ({job_path})"
+    path = find_config(kind, DEFAULT_NAME, Path("/nonexistent"))
+    return path, f"default ({path.name})"
+
+
+def _from(option: str | None, job_path: Path | None, otherwise: str = "default") -> str:
+    return option or (str(job_path) if job_path else otherwise)
+
+
+def _holdout(
+    options: Options, job: JobFile, flights: tuple[Path, ...]
+) -> tuple[tuple[str, ...], tuple[Path, ...]]:
+    """Return the held-out flights' names and the recordings that are named only as such."""
+    names = {flight.stem for flight in flights}
+    if options.holdout is None:
+        return tuple(name for name in job.holdout if name in names), ()
+    held: list[str] = []
+    extra: list[Path] = []
+    for word in options.holdout:
+        if word in names:
+            held.append(word)
+        elif Path(word).exists() or glob.has_magic(word):
+            for path in find_flights([word]):
+                held.append(path.stem)
+                if path.resolve() not in {flight.resolve() for flight in (*flights, *extra)}:
+                    extra.append(path)
+        else:
+            raise InputError("--holdout", f"no flight '{word}'", did_you_mean(word, names))
+    return tuple(dict.fromkeys(held)), tuple(extra)
+
+
+def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFile:
+    """Return the job file's settings with the command line's over them."""
+    check_names(options.fit or (), "--fit")
+    check_names(options.fix or (), "--fix")
+    changes: dict[str, object] = {"holdout": holdout}
+    if options.fit is not None and options.fix is not None:
+        raise ConfigError("--fit", "cannot stand beside --fix", "give one of them")
+    if options.fit is not None:
+        changes |= {"free": tuple(dict.fromkeys(options.fit)), "fixed": ()}
+    elif options.fix is not None and job.free is not None:
+        changes["free"] = tuple(name for name in job.free if name not in options.fix)
+    elif options.fix is not None:
+        changes["fixed"] = tuple(dict.fromkeys((*job.fixed, *options.fix)))
+    if options.mass is not None:
+        changes["mass"] = options.mass
+    search = {"method": options.method, "seed": options.seed}
+    changes["search"] = job.search.replace(**{k: v for k, v in search.items() if v is not None})
+    return job.replace(**changes)
+
+
+def _names_are_distinct(flights: tuple[Path, ...]) -> None:
+    seen: dict[str, Path] = {}
+    for flight in flights:
+        if flight.stem in seen:
+            raise InputError(
+                flight, f"has the same name as {seen[flight.stem]}", "rename one of the recordings"
+            )
+        seen[flight.stem] = flight
+
+
+def _check_flight_names(job: JobFile, job_path: Path | None, flights: tuple[Path, ...]) -> None:
+    """Refuse settings for a flight that exists neither here nor beside the job file."""
+    given = [flight.stem for flight in flights]
+    folders = {flight.parent for flight in flights} | ({job_path.parent} if job_path else set())
+    known = {file.stem for folder in folders for file in folder.iterdir()} | set(given)
+    for name in (*job.holdout, *job.flights):
+        if name not in known:
+            raise ConfigError(
+                job_path or "flights",
+                f"names a flight '{name}' that is not there",
+                did_you_mean(name, given),
+            )

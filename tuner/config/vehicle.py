@@ -1,0 +1,184 @@
+"""The vehicle file: the coefficients of one multirotor, under the names that Gazebo users know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, JsonValue, model_validator
+
+from tuner.config.model import (
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Vector,
+    read_model,
+    refuse,
+)
+
+#: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
+QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))
+
+
+class Inertia(Section):
+    """Principal moments of inertia about the centre of mass, kg m², body axes forward-left-up."""
+
+    xx: Positive
+    yy: Positive
+    zz: Positive
+
+    @model_validator(mode="after")
+    def _belongs_to_a_body(self) -> Self:
+        for name, value in self:
+            others = self.xx + self.yy + self.zz - value
+            if value > others * (1 + 1e-9):
+                raise refuse(
+                    f"inertia.{name} is {value!r}, more than the other two together ({others:.6g})",
+                    "no rigid body has such moments, correct one of them",
+                )
+        return self
+
+
+class Rotor(Section):
+    """Where a rotor sits (body frame forward-left-up, m, from the centre of mass) and how it turns.
+
+    The spin is seen from above.
+    """
+
+    position: Vector
+    spin: Literal["ccw", "cw"]
+
+
+class Motor(Section):
+    """From command to rotor speed.
+
+    ``Ω_ref = min((u + input_offset)·input_scaling + zero_position_armed + quadratic·u²,
+    max_rotor_velocity)``, followed with one of two first-order lags.
+
+    Attributes
+    ----------
+    input_scaling
+        rad/s per unit of command.
+    zero_position_armed
+        rad/s at zero command.
+    max_rotor_velocity
+        rad/s.
+    time_constant_up, time_constant_down
+        s, while speeding up and while slowing down.
+    input_offset
+        Added to the command, 0..1.
+    quadratic
+        rad/s per squared unit of command.
+    """
+
+    input_scaling: Positive
+    zero_position_armed: NonNegative
+    max_rotor_velocity: Positive
+    time_constant_up: Positive
+    time_constant_down: Positive
+    input_offset: Number = 0.0
+    quadratic: Number = 0.0
+
+
+class Aerodynamics(Section):
+    """From rotor speed and air velocity to force and moment.
+
+    Attributes
+    ----------
+    motor_constant
+        N s²/rad²: thrust per squared rotor speed.
+    moment_constant
+        m: drag torque per thrust.
+    rotor_drag_coefficient
+        N s²/(rad m).
+    rolling_moment_coefficient
+        N s²/rad.
+    max_relative_airspeed
+        m/s along the rotor axis, at which thrust vanishes.
+    reaction_torque
+        Whether the drag torque acts about the body's z axis or, as one simulator has it, the
+        world's.
+    """
+
+    motor_constant: Positive
+    moment_constant: NonNegative
+    rotor_drag_coefficient: NonNegative
+    rolling_moment_coefficient: NonNegative
+    max_relative_airspeed: Positive = 25.0
+    reaction_torque: Literal["body", "world"] = "body"
+
+
+class Setup(Section):
+    """What the set-up adds to the vehicle.
+
+    Attributes
+    ----------
+    estimate_latency
+        s by which the state that the controllers see is old.
+    actuator_latency
+        s from a motor command to its effect.
+    gyro_cutoff
+        Hz of the gyro's low-pass filter; None where the controller file's holds.
+    """
+
+    estimate_latency: NonNegative = 0.0
+    actuator_latency: NonNegative = 0.0
+    gyro_cutoff: Positive | None = None
+
+
+class VehicleFile(Section):
+    """One multirotor.
+
+    Attributes
+    ----------
+    name
+        What reports call it.
+    mass
+        kg, take-off mass.
+    inertia
+        Principal moments of inertia.
+    rotors
+        Four, in PX4's motor order (front right, rear left, front left, rear right).
+    motor, aerodynamics, setup
+        See there.
+    source
+        Where the numbers come from: free text and numbers, kept as they are.
+    """
+
+    name: str
+    mass: Positive
+    inertia: Inertia
+    rotors: tuple[Rotor, Rotor, Rotor, Rotor]
+    motor: Motor
+    aerodynamics: Aerodynamics
+    setup: Setup = Setup()
+    source: dict[str, JsonValue] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _is_a_quad_x(self) -> Self:
+        for index, (rotor, expected) in enumerate(zip(self.rotors, QUAD_X, strict=True)):
+            sign_x, sign_y, spin = expected
+            if rotor.position[0] * sign_x <= 0 or rotor.position[1] * sign_y <= 0:
+                raise refuse(
+                    f"rotors[{index}] sits at {list(rotor.position)}",
+                    "list the rotors in PX4's order: front right, rear left, front left, rear "
+                    "right (x forward, y left)",
+                )
+            if rotor.spin != spin:
+                raise refuse(
+                    f"rotors[{index}] turns {rotor.spin}",
+                    "the quad-X mixer needs the first two rotors ccw and the last two cw",
+                )
+        return self
+
+
+def read_vehicle(path: str | Path) -> VehicleFile:
+    """Read a vehicle file.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the file, the key, its value, what it should be.
+    """
+    return read_model(VehicleFile, path)

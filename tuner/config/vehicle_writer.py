@@ -1,0 +1,49 @@
+"""A vehicle out to a file, with the unit beside each coefficient."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tuner.config.coefficient_names import COEFFICIENTS
+from tuner.config.vehicle import VehicleFile
+from tuner.config.yaml_file import commented, dump_yaml, write_text
+
+UNIT_COLUMN = 44
+
+
+def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -> None:
+    """Write a vehicle file that `read_vehicle` reads back to an equal vehicle.
+
+    Parameters
+    ----------
+    vehicle
+        What to write.
+    path
+        The file to make or replace; it appears whole.
+    header
+        Comment lines for the top of the file.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
+    """
+    data = vehicle.model_dump(mode="json", exclude_none=True)
+    if not vehicle.source:
+        del data["source"]
+    write_text(Path(path), commented(header) + _with_units(dump_yaml(data)))
+
+
+def _with_units(text: str) -> str:
+    """Put a coefficient's unit behind its line."""
+    units = {coefficient.place: coefficient.unit for coefficient in COEFFICIENTS.values()}
+    section = ""
+    lines = []
+    for line in text.splitlines():
+        key, _, value = line.partition(":")
+        inside = line.startswith("  ")
+        if not inside:
+            section = key
+        unit = units.get((section if inside else "", key.strip()))
+        lines.append(f"{line + '  ':<{UNIT_COLUMN}}# {unit}" if unit and value else line)
+    return "\n".join(lines) + "\n"
