@@ -6,7 +6,7 @@ from tuner.config.job import CHANNELS, JobFile, TrajectorySettings, read_job
 from tuner.config.settings import Options, Settings, find_flights, find_job_file, settle
 from tuner.config.shipped import configs_folder, find_config
 from tuner.config.vehicle import VehicleFile, read_vehicle
-from tuner.config.vehicle_writer import write_vehicle
+from tuner.config.vehicle_writer import vehicle_text, write_vehicle
 
 __all__ = [
     "CHANNELS",
@@ -27,6 +27,7 @@ __all__ = [
     "read_vehicle",
     "settle",
     "values_of",
+    "vehicle_text",
     "with_values",
     "write_vehicle",
 ]

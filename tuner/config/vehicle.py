@@ -53,8 +53,9 @@ class Rotor(Section):
 class Motor(Section):
     """From command to rotor speed.
 
-    ``Ω_ref = min((u + input_offset)·input_scaling + zero_position_armed + quadratic·u²,
-    max_rotor_velocity)``, followed with one of two first-order lags.
+    With ``v = u + input_offset``, the speed that a command u in 0..1 asks for is
+    ``min(v·input_scaling + v²·quadratic + zero_position_armed, max_rotor_velocity)``; the rotor
+    follows with one of two first-order lags.
 
     Attributes
     ----------
@@ -69,7 +70,7 @@ class Motor(Section):
     input_offset
         Added to the command, 0..1.
     quadratic
-        rad/s per squared unit of command.
+        rad/s per squared unit of command; negative bends the curve down.
     """
 
     input_scaling: Positive

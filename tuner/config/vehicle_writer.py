@@ -28,10 +28,15 @@ def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -
     ConfigError
         The file cannot be written.
     """
+    write_text(Path(path), vehicle_text(vehicle, header=header))
+
+
+def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
+    """Return the text of a vehicle file, as `write_vehicle` writes it."""
     data = vehicle.model_dump(mode="json", exclude_none=True)
     if not vehicle.source:
         del data["source"]
-    write_text(Path(path), commented(header) + _with_units(dump_yaml(data)))
+    return commented(header) + _with_units(dump_yaml(data))
 
 
 def _with_units(text: str) -> str:

@@ -41,6 +41,10 @@ def test_an_installed_wheel_carries_the_configuration(tmp_path):
     subprocess.run([sys.executable, "-c", build], cwd=source, check=True, capture_output=True)
     (wheel,) = (tmp_path / "dist").glob("*.whl")
     shutil.unpack_archive(wheel, tmp_path / "site", "zip")
+    for folder in ("tuner", "sim_jax"):
+        for file in (ROOT / folder).rglob("*"):
+            if file.is_file() and file.suffix != ".pyc":
+                assert (tmp_path / "site" / file.relative_to(ROOT)).exists(), file
 
     show = (
         "import tuner; from tuner.config import *; print(tuner.__file__);"

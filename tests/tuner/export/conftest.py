@@ -1,0 +1,98 @@
+from pathlib import Path
+
+import pytest
+
+from tuner.config import COEFFICIENTS, configs_folder, read_vehicle, values_of, write_vehicle
+from tuner.result import (
+    AxesRmse,
+    CoefficientResult,
+    FlightResult,
+    RunResult,
+    SearchResult,
+    read_run,
+    write_result,
+)
+
+MODELS = Path(__file__).resolve().parents[3] / "examples" / "models"
+
+
+@pytest.fixture
+def vehicle():
+    return read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
+
+
+def rmse(scale):
+    return AxesRmse(x=scale, y=scale, z=scale / 2, roll=20 * scale, pitch=20 * scale, yaw=5 * scale)
+
+
+@pytest.fixture
+def make_run(tmp_path):
+    """Return a function that writes a result folder; what it is given replaces what is usual."""
+
+    def make(*, coefficients=None, flights=None, vehicle="hovergames_updated"):
+        start = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
+        best = read_vehicle(configs_folder() / "vehicles" / f"{vehicle}.yaml")
+        found = {}
+        for name, initial in values_of(start).items():
+            value = values_of(best)[name]
+            found[name] = {
+                "unit": COEFFICIENTS[name].unit,
+                "initial": initial,
+                "best": value,
+                "fitted": value != initial,
+                "lower": 0.2 * initial,
+                "upper": 5.0 * initial,
+                "std_error": 0.01 * value,
+                "ci95": (0.98 * value, 1.02 * value),
+                "identifiable": True,
+            } | (coefficients or {}).get(name, {})
+        usual = {
+            "circle": {"split": "fit", "rmse_best": rmse(0.001)},
+            "held": {"split": "holdout", "rmse_best": rmse(0.002)},
+        }
+        shown = [
+            FlightResult(
+                **{
+                    "name": name,
+                    "path": f"{name}.bag",
+                    "sha256": "0" * 64,
+                    "duration": 36.0,
+                    "time_offset": 0.0,
+                    "rmse_initial": rmse(0.1),
+                }
+                | flight
+                | (flights or {}).get(name, {})
+            )
+            for name, flight in usual.items()
+        ]
+        folder = tmp_path / "run"
+        folder.mkdir(exist_ok=True)
+        write_vehicle(best, folder / "best_fit.yaml")
+        result = RunResult(
+            schema_version=1,
+            status="done",
+            seed=0,
+            versions={"tune": "0.1.0"},
+            settings={},
+            coefficients={name: CoefficientResult(**data) for name, data in found.items()},
+            flights=tuple(shown),
+            search=SearchResult(
+                method="gradient",
+                evaluations=30,
+                iterations=10,
+                wall_time=1.0,
+                cost_initial=100.0,
+                cost_best=1.0,
+                converged=True,
+                message="",
+            ),
+        )
+        write_result(result, folder)
+        return read_run(folder)
+
+    return make
+
+
+def as_the_run_says(run, _vehicle):
+    """Stand in for flying again where a test is about something else."""
+    return {flight.name: flight.rmse_best for flight in run.result.flights}

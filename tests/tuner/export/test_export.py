@@ -1,0 +1,146 @@
+import shutil
+from datetime import date
+
+import pytest
+
+from tests.tuner.export.conftest import MODELS, as_the_run_says, rmse
+from tuner.config import read_vehicle
+from tuner.errors import ExportError
+from tuner.export.export import export
+from tuner.export.gates import check
+
+TODAY = date(2024, 5, 6)
+
+
+def exported(run, kind="yaml", refly=as_the_run_says, **options):
+    return export(run, kind, refly=refly, today=TODAY, **options)
+
+
+def test_yaml_carries_source_date_run_and_confidence(make_run):
+    run = make_run()
+    done = exported(run)
+    assert done.path == run.folder / "export" / "hovergames_updated.yaml"
+    vehicle = read_vehicle(done.path)
+    assert vehicle.mass == 2.243
+    assert vehicle.source["run"] == str(run.folder.resolve())
+    assert vehicle.source["date"] == "2024-05-06"
+    assert vehicle.source["versions"] == {"tune": "0.1.0"}
+    assert vehicle.source["flights"]["held"] == f"holdout, sha256 {'0' * 64}"
+    fitted = vehicle.source["coefficients"]["motor_constant"]
+    assert fitted["status"] == "fitted"
+    assert fitted["std_error"] == pytest.approx(1.45e-7)
+    assert fitted["ci95"] == pytest.approx([0.98 * 1.45e-5, 1.02 * 1.45e-5])
+    assert vehicle.source["coefficients"]["time_constant_up"] == {"status": "fixed"}
+    assert done.path.read_text().startswith("# fitted to circle; run run; 2024-05-06\n")
+
+
+def test_what_is_not_identifiable_keeps_its_initial_value_and_says_so(make_run):
+    run = make_run(coefficients={"moment_constant": {"identifiable": False}})
+    done = exported(run)
+    assert read_vehicle(done.path).aerodynamics.moment_constant == 0.06
+    assert any("moment_constant is not identifiable" in note for note in done.notes)
+    status = read_vehicle(done.path).source["coefficients"]["moment_constant"]["status"]
+    assert status == "not identifiable, initial value kept"
+
+
+@pytest.mark.parametrize("kind", ["sdf", "px4"])
+def test_the_other_formats_land_in_the_result_folder_too(make_run, kind):
+    done = exported(make_run(), kind)
+    assert done.path.parent.name == "export"
+    assert "fitted to circle" in done.path.read_text()
+
+
+def test_a_model_is_patched_where_it_is_or_beside(make_run, tmp_path):
+    model = tmp_path / "quad.sdf"
+    shutil.copy(MODELS / "quad_x.sdf", model)
+    before = model.read_text()
+    beside = tmp_path / "patched.sdf"
+    assert exported(make_run(), "sdf", into=model, out=beside).path == beside
+    assert model.read_text() == before
+    assert exported(make_run(), "sdf", into=model).path == model
+    assert model.read_text() == beside.read_text() != before
+
+
+def test_into_goes_with_sdf_only(make_run, tmp_path):
+    with pytest.raises(ExportError, match="--into"):
+        exported(make_run(), "px4", into=tmp_path / "x")
+
+
+def test_a_missing_model_is_named(make_run, tmp_path):
+    with pytest.raises(ExportError, match=r"gone\.sdf: cannot be read"):
+        exported(make_run(), "sdf", into=tmp_path / "gone.sdf")
+
+
+BAD = [
+    (
+        {"flights": {"held": {"rmse_best": rmse(0.2)}}},
+        "held position 0.3 m, before 0.15",
+    ),
+    (
+        {"flights": {"held": {"rmse_best": {**rmse(0.001).model_dump(), "yaw": 3.0}}}},
+        "held attitude 3 degrees",
+    ),
+    (
+        {"coefficients": {"motor_constant": {"upper": 1.45e-5}}},
+        "motor_constant 1.45e-05 is its upper",
+    ),
+    ({"coefficients": {"inertia_xx": {"lower": 0.028}}}, "inertia_xx 0.028 is its lower"),
+]
+
+
+@pytest.mark.parametrize(("bad", "expected"), BAD)
+def test_a_bad_set_is_refused_and_nothing_is_written(make_run, bad, expected):
+    run = make_run(**bad)
+    with pytest.raises(ExportError) as error:
+        exported(run)
+    assert expected in str(error.value)
+    assert "--accept" in str(error.value)
+    assert not (run.folder / "export").exists()
+
+
+@pytest.mark.parametrize(("bad", "_expected"), BAD)
+def test_a_reason_overrides_and_stands_in_the_file(make_run, bad, _expected):
+    done = exported(make_run(**bad), accept="only to look at")
+    assert "exported against a refusal: only to look at" in done.path.read_text()
+    assert not all(gate.passed for gate in done.gates)
+
+
+def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
+    def crashes(run, vehicle):
+        crashed = dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"))
+        return as_the_run_says(run, vehicle) | {"circle": rmse(0.1).model_copy(update=crashed)}
+
+    def differs(run, vehicle):
+        return as_the_run_says(run, vehicle) | {"circle": rmse(0.0012)}
+
+    def forgets(run, vehicle):
+        return {"circle": as_the_run_says(run, vehicle)["circle"]}
+
+    for refly, expected in (
+        (crashes, "circle crashes"),
+        (differs, "circle x gives 0.0012, the run 0.001"),
+        (forgets, "held was not flown again"),
+    ):
+        with pytest.raises(ExportError, match=expected):
+            exported(make_run(), refly=refly)
+
+
+def test_a_fixed_coefficient_may_equal_its_bound(make_run):
+    run = make_run(coefficients={"mass": {"fitted": False, "upper": 2.243}})
+    assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
+
+
+def test_gates_fly_what_the_format_holds(make_run, tmp_path):
+    flown = []
+
+    def refly(run, vehicle):
+        flown.append(vehicle)
+        return as_the_run_says(run, vehicle)
+
+    run = make_run()
+    curved = run.vehicle.replace(motor=run.vehicle.motor.replace(quadratic=30.0))
+    exported(run.model_copy(update={"vehicle": curved}), "sdf", refly=refly, out=tmp_path / "a.sdf")
+    exported(
+        run.model_copy(update={"vehicle": curved}), "yaml", refly=refly, out=tmp_path / "a.yaml"
+    )
+    assert [vehicle.motor.quadratic for vehicle in flown] == [0.0, 30.0]

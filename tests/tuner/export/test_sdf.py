@@ -1,0 +1,252 @@
+import difflib
+import re
+
+import numpy as np
+import pytest
+from lxml import etree
+
+from tests.tuner.export.conftest import MODELS
+from tuner.errors import ExportError
+from tuner.export.draft import write
+from tuner.export.sdf.model import read_model
+from tuner.export.sdf.patch import sdf_draft
+from tuner.export.sdf.read_back import composite, vehicle_in
+from tuner.export.sdf.snippet import snippet_draft
+from tuner.export.sdf.template import blanked, rendered
+
+CLASSIC, GZ, TEMPLATE = (
+    MODELS / "quad_x.sdf",
+    MODELS / "quad_x_gz.sdf",
+    MODELS / "quad_x.sdf.jinja",
+)
+ALL = pytest.mark.parametrize("path", [CLASSIC, GZ, TEMPLATE], ids=lambda path: path.name)
+
+
+def changes(before, after):
+    """Return the (removed, added) lines of a diff, each pair once."""
+    lines = difflib.ndiff(before.splitlines(), after.splitlines())
+    return {line[0] + line[1:].strip() for line in lines if line[0] in "+-"}
+
+
+def patched(tmp_path, vehicle, text, name="model.sdf"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return sdf_draft(path, vehicle, "by a test")
+
+
+@pytest.mark.parametrize("path", [CLASSIC, GZ], ids=lambda path: path.name)
+def test_only_our_values_change(path, vehicle):
+    before = path.read_text(encoding="utf-8")
+    draft = sdf_draft(path, vehicle, "by a test")
+    expected = {
+        "+<!-- Coefficients by tune: by a test -->",
+        "-<mass>2.04</mass>  <!-- frame, battery, companion computer -->",
+        "+<mass>2.204</mass>  <!-- frame, battery, companion computer -->",
+        "-<ixx>0.021</ixx>",
+        "+<ixx>0.0271486293466</ixx>",
+        "-<ixz>0</ixz>",
+        "+<ixz>2.78733838609e-06</ixz>",
+        "-<iyy>0.021</iyy>",
+        "+<iyy>0.0320310694714</iyy>",
+        "-<izz>0.04</izz>",
+        "+<izz>0.0363636446048</izz>",
+        "-<motorConstant>8.55e-06</motorConstant>",
+        "+<motorConstant>1.45e-05</motorConstant>",
+        "-<momentConstant>0.06</momentConstant>",
+        "+<momentConstant>0.033</momentConstant>",
+        "-<rotorDragCoefficient>0.000806</rotorDragCoefficient>",
+        "+<rotorDragCoefficient>0.000145</rotorDragCoefficient>",
+    }
+    if path == CLASSIC:
+        expected |= {"-<input_scaling>1000</input_scaling>", "+<input_scaling>950</input_scaling>"}
+    assert changes(before, draft.text) == expected
+    assert len(draft.text.splitlines()) == len(before.splitlines()) + 1
+    assert draft.text.count("<motorConstant>1.45e-05<") == 4
+
+
+def test_a_template_keeps_its_expressions_and_sets_its_variables(vehicle):
+    before = TEMPLATE.read_text(encoding="utf-8")
+    draft = sdf_draft(TEMPLATE, vehicle, "by a test")
+    diff = changes(before, draft.text)
+    assert "+{%- set motor_constant = 1.45e-05 -%}" in diff
+    assert "+<input_scaling>950</input_scaling>" in diff
+    assert not any("{{" in line for line in diff)
+    assert sum(line.startswith("+") for line in diff) == 10
+    final = etree.fromstring(rendered(draft.text, TEMPLATE).encode())
+    assert [e.text for e in final.iter("motorConstant")] == ["1.45e-05"] * 4
+    assert [e.text for e in final.iter("input_scaling")] == ["950"] * 4
+
+
+@ALL
+def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
+    draft = sdf_draft(path, vehicle, "by a test")
+    whole = composite(read_model(rendered(draft.text, path), path))
+    assert whole.mass == pytest.approx(2.243, rel=1e-11)
+    np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
+    assert any("'base_link' gets 2.204 kg" in note and "rotor_3" in note for note in draft.notes)
+
+
+@ALL
+def test_patching_again_changes_nothing(path, vehicle, tmp_path):
+    once = sdf_draft(path, vehicle, "by a test").text
+    assert patched(tmp_path, vehicle, once, path.name).text == once
+
+
+@ALL
+def test_a_later_export_replaces_the_earlier_comment(path, vehicle, tmp_path):
+    once = patched(tmp_path, vehicle, path.read_text(encoding="utf-8"), path.name).text
+    (tmp_path / path.name).write_text(once, encoding="utf-8")
+    twice = sdf_draft(tmp_path / path.name, vehicle, "by -- another").text
+    assert once.replace("by a test", "by - - another") == twice
+
+
+@ALL
+def test_what_was_written_is_read_back(path, vehicle, tmp_path):
+    target = tmp_path / path.name
+    draft = sdf_draft(path, vehicle, "by a test")
+    write(draft, target)
+    assert draft.faults(target) == []
+    target.write_text(draft.text.replace("0.000145", "0.000146"), encoding="utf-8")
+    assert any("rotor_drag_coefficient" in fault for fault in draft.faults(target))
+    target.write_text(draft.text.replace("2.204", "2.205"), encoding="utf-8")
+    assert any(fault.startswith("mass is 2.24") for fault in draft.faults(target))
+
+
+def test_comments_formatting_and_line_ends_survive(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8")
+    text = text.replace(
+        "<motorConstant>8.55e-06</motorConstant>",
+        "<motorConstant  >\t8.55e-06 <!-- Kraftbeiwert, gemessen für n ≥ 3000 --> </motorConstant>",
+        1,
+    )
+    odd = patched(tmp_path, vehicle, text).text
+    wanted = (
+        "<motorConstant  >\t1.45e-05 <!-- Kraftbeiwert, gemessen für n ≥ 3000 --> </motorConstant>"
+    )
+    assert wanted in odd
+    assert odd.endswith("<!-- vim: set et ts=2 sw=2 : -->\n")
+
+
+def test_comments_may_hold_dashes_as_simulators_let_them(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8").replace("laid out", "-- laid <out> ----")
+    out = patched(tmp_path, vehicle, text).text
+    assert "-- laid <out> ---- as PX4's models are" in out
+
+
+def test_windows_line_ends_survive(vehicle, tmp_path):
+    path = tmp_path / "model.sdf"
+    path.write_bytes(CLASSIC.read_bytes().replace(b"\n", b"\r\n"))
+    draft = sdf_draft(path, vehicle, "by a test")
+    write(draft, path)
+    raw = path.read_bytes()
+    assert raw.count(b"\r\n") == raw.count(b"\n") - 1  # our own comment's line
+
+
+def test_a_missing_tag_is_added(vehicle, tmp_path):
+    text = re.sub(r" *<rollingMomentCoefficient>.*\n", "", CLASSIC.read_text(encoding="utf-8"))
+    text = re.sub(r" *<input_offset>.*\n", "", text)
+    out = patched(tmp_path, vehicle, text).text
+    assert out.count("      <rollingMomentCoefficient>1e-06</rollingMomentCoefficient>\n") == 4
+    assert out.count("          <input_offset>0</input_offset>\n") == 4
+
+
+def test_other_motors_and_channels_stay(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8").replace(
+        "<motorNumber>3</motorNumber>", "<motorNumber>4</motorNumber>"
+    )
+    out = patched(tmp_path, vehicle, text).text
+    assert out.count("<motorConstant>1.45e-05<") == 3
+    assert "<input_scaling>3.14</input_scaling>" in out
+
+
+def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8")
+    text = text.replace(
+        "<pose>0.02 0 0.01 0 0 0</pose>\n      <inertial>",
+        "<pose relative_to='base_link'>0.1 0 0.05 0 0 90</pose>\n      <inertial>"
+        "<pose degrees='true'>0 0.01 0 0 0 30</pose>",
+    ).replace("<pose>0 0 0 0 0 0</pose>", "<pose>0 0 0.2 0 0 0.3</pose>", 1)
+    draft = patched(tmp_path, vehicle, text)
+    whole = composite(read_model(draft.text, CLASSIC))
+    np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
+    assert any("rotor_0 sits at" in note or "rotor_0 sits" in note for note in draft.notes)
+
+
+def test_what_has_no_tag_is_said(vehicle):
+    vehicle = vehicle.replace(
+        motor=vehicle.motor.replace(quadratic=-50.0),
+        aerodynamics=vehicle.aerodynamics.replace(max_relative_airspeed=20.0),
+        setup=vehicle.setup.replace(estimate_latency=0.012),
+    )
+    draft = sdf_draft(CLASSIC, vehicle, "by a test")
+    said = " / ".join(draft.notes)
+    assert "no tag for quadratic" in said
+    assert "25 m/s built in" in said
+    assert "estimate_latency (0.012 s)" in said
+    assert draft.vehicle.motor.quadratic == 0
+    assert draft.vehicle.aerodynamics.max_relative_airspeed == 25
+
+
+def test_the_commands_of_gz_sim_are_px4_parameters(vehicle):
+    said = " / ".join(sdf_draft(GZ, vehicle, "by a test").notes)
+    assert "SIM_GZ_EC_MIN1..4 to 100 and SIM_GZ_EC_MAX1..4 to 1050" in said
+    assert "SIM_GZ" not in " / ".join(sdf_draft(CLASSIC, vehicle, "by a test").notes)
+
+
+def test_included_models_are_named(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8").replace(
+        "<static>", "<include><uri>model://gps</uri></include><static>"
+    )
+    assert any("model://gps" in note for note in patched(tmp_path, vehicle, text).notes)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("libgazebo_motor_model.so", "libother.so", "no motor model plugin"),
+        ("<mass>0.015</mass>", "<mass>2.5</mass>", "weigh 2.524 kg, the vehicle only 2.243 kg"),
+        ("<mass>0.015</mass>", "<mass>{{ m }}</mass>", "no mass that is a number"),
+        (
+            "<mass>2.04</mass>",
+            "<mass>{{ m | default(2) }}</mass>",
+            "where a number of ours belongs",
+        ),
+        ("<pose>0.02 0 0.01 0 0 0</pose>", "<pose>0 0</pose>", "has the pose '0 0'"),
+        (
+            "<pose>0.02 0 0.01 0 0 0</pose>",
+            "<pose relative_to='imu_link'>0 0 0 0 0 0</pose>",
+            "relative to 'imu_link'",
+        ),
+        ("<model name='quad_x'>", "<model name='quad_x'><b>", "not well-formed"),
+        ("</sdf>", "{% if %}</sdf>", "cannot be rendered"),
+        ("<ixx>0.021</ixx>", "<ixx>{% if a %}1{% else %}2{% endif %}</ixx>", "number of ours"),
+    ],
+)
+def test_a_model_we_cannot_serve_is_refused_in_one_line(vehicle, tmp_path, old, new, expected):
+    text = CLASSIC.read_text(encoding="utf-8")
+    assert old in text
+    with pytest.raises(ExportError) as error:
+        patched(tmp_path, vehicle, text.replace(old, new))
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_blanking_a_template_keeps_every_place():
+    text = "a {# {{ x }} #} b {{ c }}\n{%- set d = 1 -%} e"
+    blank = blanked(text)
+    assert len(blank) == len(text)
+    assert blank.index("b") == text.index(" b ") + 1
+    assert blank.index("e") == text.rindex("e")
+    assert "{" not in blank
+
+
+@pytest.mark.parametrize("simulator", ["gazebo-classic", "gz-sim"])
+def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
+    draft = snippet_draft(vehicle, simulator, "by a test")
+    path = tmp_path / "snippet.sdf"
+    write(draft, path)
+    model = f"<model><link name='base_link'>{draft.text}</link></model>"
+    assert vehicle_in(model, path, vehicle) == vehicle
+    assert draft.text.count("<channel ") == (4 if simulator == "gazebo-classic" else 0)
+    path.write_text(draft.text.replace("1.45e-05", "1.46e-05"), encoding="utf-8")
+    assert draft.faults(path)

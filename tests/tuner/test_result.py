@@ -1,0 +1,53 @@
+import json
+
+import pytest
+
+from tests.tuner.export.conftest import make_run  # noqa: F401 (a fixture)
+from tuner.errors import InputError
+from tuner.result import read_run, write_result
+
+
+def test_a_result_comes_back_from_its_file_as_it_was(make_run):  # noqa: F811
+    run = make_run()
+    write_result(run.result, run.folder)
+    again = read_run(run.folder)
+    assert again == run
+    assert again.vehicle.name == "hovergames_updated"
+
+
+def test_keys_of_later_versions_are_passed_over(make_run):  # noqa: F811
+    run = make_run()
+    path = run.folder / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"later": 1}))
+    assert read_run(run.folder).result == run.result
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        ({"schema_version": 2}, "newer than 1"),
+        ({"seed": "x"}, "seed is 'x'"),
+        (
+            {"coefficients": {"mas": {"unit": "", "initial": 1, "best": 1, "fitted": False}}},
+            "'mas'",
+        ),
+    ],
+)
+def test_what_is_no_result_is_refused_in_one_line(make_run, change, expected):  # noqa: F811
+    run = make_run()
+    path = run.folder / "result.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    with pytest.raises(InputError) as error:
+        read_run(run.folder)
+    assert expected in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_a_folder_without_a_result_is_named(tmp_path):
+    with pytest.raises(InputError, match="finished run"):
+        read_run(tmp_path)
+    with pytest.raises(InputError, match="is no folder"):
+        read_run(tmp_path / "gone")
+    (tmp_path / "result.json").write_text("{")
+    with pytest.raises(InputError, match=r"result\.json"):
+        read_run(tmp_path)

@@ -1,0 +1,90 @@
+"""A file on its way out: its text, what of the vehicle is in it, how it is read back."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tuner.config import VehicleFile, values_of
+from tuner.config.yaml_file import write_text
+from tuner.errors import ConfigError, ExportError
+
+MAX_BYTES = 10_000_000
+#: Numbers are written with twelve digits; mass and inertia may go through sums of links.
+TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A file before it is written.
+
+    Attributes
+    ----------
+    text
+        All of it.
+    vehicle
+        The vehicle as whoever reads the file will fly it.
+    notes
+        What was done, and what the format has no place for.
+    faults
+        Given the file as it stands on the disk, what is wrong with the numbers in it.
+    """
+
+    text: str
+    vehicle: VehicleFile
+    notes: tuple[str, ...]
+    faults: Callable[[Path], Sequence[str]]
+
+
+def differences(wanted: VehicleFile, found: VehicleFile) -> list[str]:
+    """Return the coefficients that are not the wanted ones, in words."""
+    theirs = values_of(found)
+    return [
+        f"{name} is {theirs[name]!r}, not {value!r}"
+        for name, value in values_of(wanted).items()
+        if not math.isclose(theirs[name], value, rel_tol=TOLERANCE, abs_tol=1e-15)
+    ]
+
+
+def write(draft: Draft, path: Path) -> None:
+    """Write a draft and read it back.
+
+    Raises
+    ------
+    ExportError
+        It cannot be written, or does not hold what it should.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, draft.text)
+    except OSError as error:
+        raise ExportError(
+            path, f"cannot be written ({error.strerror})", "check the folder"
+        ) from None
+    except ConfigError as error:
+        raise ExportError(path, error.what, error.remedy) from None
+    wrong = draft.faults(path)
+    if wrong:
+        raise ExportError(path, f"does not read back: {'; '.join(wrong)}", "do not use it")
+
+
+def read_file(path: Path) -> str:
+    """Read a text file of a simulator.
+
+    Raises
+    ------
+    ExportError
+        It is missing, too large, or no text.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+        if len(raw) > MAX_BYTES:
+            raise ExportError(path, "is larger than 10 MB", "give a model file")
+        return raw.decode("utf-8")
+    except OSError as error:
+        raise ExportError(path, f"cannot be read ({error.strerror})", "check the path") from None
+    except UnicodeDecodeError:
+        raise ExportError(path, "is not UTF-8 text", "give a model file") from None

@@ -1,0 +1,109 @@
+"""One export from a run to a file: gates, writing, reading back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Literal
+
+from tuner.config import VehicleFile
+from tuner.errors import ExportError
+from tuner.export.draft import Draft, write
+from tuner.export.gates import Gate, Refly, check
+from tuner.export.provenance import exported_vehicle, provenance
+from tuner.export.px4 import px4_draft
+from tuner.export.sdf.patch import sdf_draft
+from tuner.export.sdf.snippet import Simulator, snippet_draft
+from tuner.export.vehicle_yaml import yaml_draft
+from tuner.result import Run
+
+Format = Literal["yaml", "sdf", "px4"]
+SUFFIX: dict[Format, str] = {"yaml": ".yaml", "sdf": ".sdf", "px4": ".params"}
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A file that was written and read back.
+
+    Attributes
+    ----------
+    path
+        The file.
+    gates
+        The conditions that were checked; those not met were accepted.
+    notes
+        What was done, and what the format has no place for.
+    """
+
+    path: Path
+    gates: tuple[Gate, ...]
+    notes: tuple[str, ...]
+
+
+def export(
+    run: Run,
+    kind: Format,
+    *,
+    refly: Refly,
+    today: date,
+    into: Path | None = None,
+    out: Path | None = None,
+    simulator: Simulator = "gazebo-classic",
+    accept: str = "",
+) -> Exported:
+    """Write a run's coefficients in a format, if they hold there.
+
+    Parameters
+    ----------
+    run
+        A result folder.
+    kind
+        ``yaml``, ``sdf`` or ``px4``.
+    refly
+        Flies the run's flights with a vehicle.
+    today
+        For the provenance.
+    into
+        With ``sdf``, the model to patch; without, the tags alone are written.
+    out
+        Where to write; by default the model itself, or ``export/`` in the result folder.
+    simulator
+        Whose plugins a bare snippet is for.
+    accept
+        A reason to export in spite of gates that are not met; it goes into the provenance.
+
+    Raises
+    ------
+    ExportError
+        A gate is not met, the model cannot be patched, or the file does not read back.
+    """
+    if into is not None and kind != "sdf":
+        raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
+    vehicle, decided = exported_vehicle(run, today)
+    draft = _draft(kind, vehicle, provenance(run, today, accept), into, simulator)
+    gates = check(run, draft.vehicle, refly)
+    refused = [objection for gate in gates for objection in gate.objections]
+    if refused and not accept:
+        raise ExportError(
+            run.folder,
+            f"its numbers are not fit to export: {'; '.join(refused)}",
+            "fit again, or export with --accept 'REASON'",
+        )
+    path = out or into or run.folder / "export" / f"{run.vehicle.name}{SUFFIX[kind]}"
+    write(draft, path)
+    return Exported(path, gates, (*decided, *draft.notes))
+
+
+def _draft(
+    kind: Format, vehicle: VehicleFile, provenance: str, into: Path | None, simulator: Simulator
+) -> Draft:
+    match kind:
+        case "yaml":
+            return yaml_draft(vehicle, provenance)
+        case "px4":
+            return px4_draft(vehicle, provenance)
+        case "sdf" if into is None:
+            return snippet_draft(vehicle, simulator, provenance)
+        case "sdf":
+            return sdf_draft(into, vehicle, provenance)

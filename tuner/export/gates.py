@@ -1,0 +1,101 @@
+"""What a run must meet before its numbers leave it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from tuner.config import VehicleFile
+from tuner.result import AxesRmse, Run
+
+#: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.
+Refly = Callable[[Run, VehicleFile], Mapping[str, AxesRmse]]
+
+#: Part of the distance between bounds that counts as sitting on one.
+ON_BOUND = 1e-4
+#: Part by which a held-out flight may be met worse than with the initial coefficients.
+WORSE = 0.01
+#: What a re-flown RMSE may differ from the run's: relative, or in m and degrees.
+SAME_RELATIVE, SAME_ABSOLUTE = 0.01, 1e-4
+
+POSITION = ("x", "y", "z")
+ATTITUDE = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One condition: what it is, and what stands against it (nothing if it is met)."""
+
+    name: str
+    objections: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing stands against it."""
+        return not self.objections
+
+
+def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
+    """Hold a run and the vehicle as exported against every condition."""
+    flown = refly(run, vehicle)
+    return (
+        Gate("every trajectory of the run is flown without a crash", tuple(_crashes(flown))),
+        Gate("the exported numbers fly as the run says", tuple(_otherwise(run, flown))),
+        Gate("no held-out flight is worse than before", tuple(_worse(run))),
+        Gate("no coefficient sits on a bound", tuple(_on_bounds(run))),
+    )
+
+
+def _crashes(flown: Mapping[str, AxesRmse]) -> list[str]:
+    return [f"{name} crashes" for name, rmse in flown.items() if rmse.x is None]
+
+
+def _otherwise(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
+    found = []
+    for flight in run.result.flights:
+        again = flown.get(flight.name)
+        if again is None:
+            found.append(f"{flight.name} was not flown again")
+            continue
+        for axis in (*POSITION, *ATTITUDE):
+            then, now = getattr(flight.rmse_best, axis), getattr(again, axis)
+            if then is not None and now is not None and not _same(then, now):
+                found.append(f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}")
+    return found
+
+
+def _same(then: float, now: float) -> bool:
+    return math.isclose(then, now, rel_tol=SAME_RELATIVE, abs_tol=SAME_ABSOLUTE)
+
+
+def _worse(run: Run) -> list[str]:
+    found = []
+    for flight in run.result.flights:
+        if flight.split != "holdout":
+            continue
+        for what, axes, unit in (("position", POSITION, "m"), ("attitude", ATTITUDE, "degrees")):
+            before, after = _length(flight.rmse_initial, axes), _length(flight.rmse_best, axes)
+            if after > before * (1 + WORSE):
+                found.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
+    return found
+
+
+def _length(rmse: AxesRmse, axes: tuple[str, ...]) -> float:
+    """Return the RMSE over several axes together; infinite for a crash."""
+    values = [getattr(rmse, axis) for axis in axes]
+    return math.inf if None in values else math.hypot(*values)
+
+
+def _on_bounds(run: Run) -> list[str]:
+    found = []
+    for name, coefficient in run.result.coefficients.items():
+        lower, upper = coefficient.lower, coefficient.upper
+        if not coefficient.fitted:
+            continue
+        span = upper - lower if lower is not None and upper is not None else None
+        for side, bound in (("lower", lower), ("upper", upper)):
+            near = ON_BOUND * (abs(bound or 0.0) if span is None else span)
+            if bound is not None and abs(coefficient.best - bound) <= near:
+                found.append(f"{name} {coefficient.best:g} is its {side} bound")
+    return found

@@ -1,0 +1,199 @@
+"""A vehicle's coefficients into a model: which tags are ours, and what each becomes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from tuner.config import VehicleFile
+from tuner.errors import ExportError
+from tuner.export.draft import Draft, differences, read_file
+from tuner.export.sdf.composite import Array, Inertial, base_for, together
+from tuner.export.sdf.model import Model, inertials, read_model
+from tuner.export.sdf.read_back import vehicle_in
+from tuner.export.sdf.spans import Edit, Element, append_child, apply, number, set_value
+from tuner.export.sdf.tags import CHANNEL_TAGS, MOTOR_TAGS, as_flown, as_text, lost_in, values
+from tuner.export.sdf.template import blanked, rendered
+
+#: Products of inertia below this part of the trace are taken as none.
+NO_PRODUCT = 1e-9
+PROVENANCE = "Coefficients by tune"
+
+#: m within which a rotor counts as sitting where the vehicle file has it.
+PLACE_TOLERANCE = 0.005
+
+
+def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
+    """Put a vehicle's coefficients into a model, leaving every other character as it is.
+
+    Parameters
+    ----------
+    path
+        The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one.
+    vehicle
+        Whose coefficients.
+    provenance
+        One line that says where they come from; it becomes a comment in the model.
+
+    Raises
+    ------
+    ExportError
+        The model cannot be understood, or would not come out with the wanted numbers.
+    """
+    text = read_file(path)
+    blank = blanked(text)
+    model = read_model(blank, path)
+    whole = read_model(rendered(text, path), path)
+    base = _base(whole, vehicle)
+    edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
+    edits = [_through_variable(text, blank, edit, path) for edit in edits]
+    edits.append(_provenance_edit(text, model, provenance))
+    patched = apply(text, dict.fromkeys(edits))
+    found = vehicle_in(rendered(patched, path), path, vehicle)
+    wrong = differences(as_flown(vehicle), found)
+    if wrong:
+        raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
+    return Draft(
+        patched,
+        found,
+        tuple(_notes(whole, vehicle, base)),
+        lambda written: differences(
+            as_flown(vehicle), vehicle_in(rendered(read_file(written), written), written, vehicle)
+        ),
+    )
+
+
+def _base(model: Model, vehicle: VehicleFile) -> Inertial:
+    """Return the base link's body that makes the whole model weigh and turn like the vehicle."""
+    others = [body for link, body in inertials(model) if link is not model.base]
+    inertia = vehicle.inertia
+    try:
+        return base_for(
+            vehicle.mass,
+            np.diag([inertia.xx, inertia.yy, inertia.zz]),
+            model.pose_of_inertial(model.base),
+            others,
+        )
+    except ValueError as error:
+        raise ExportError(
+            model.path, str(error), "lighten those links, or give another model"
+        ) from None
+
+
+def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
+    inertial = model.base.find("inertial")
+    tensor = inertial.find("inertia") if inertial else None
+    if inertial is None or tensor is None:
+        raise ExportError(
+            model.path,
+            f"base link '{model.base.attributes.get('name')}' has no <inertial> with <inertia>",
+            "give it one, its numbers do not matter",
+        )
+    yield from _set(inertial, model.text, {"mass": base.mass})
+    entries = base.inertia
+    yield from _set(
+        tensor, model.text, {"ixx": entries[0, 0], "iyy": entries[1, 1], "izz": entries[2, 2]}
+    )
+    products = {"ixy": entries[0, 1], "ixz": entries[0, 2], "iyz": entries[1, 2]}
+    for tag, value in products.items():
+        none = abs(value) < NO_PRODUCT * np.trace(entries)
+        if not none or tensor.find(tag) is not None:
+            yield from _set(tensor, model.text, {tag: 0.0 if none else value})
+
+
+def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
+    for motor in model.motors():
+        yield from _set(motor, model.text, values(vehicle, MOTOR_TAGS))
+    for channel in model.channels():
+        yield from _set(channel, model.text, values(vehicle, CHANNEL_TAGS))
+
+
+def _set(parent: Element, text: str, values: dict[str, float]) -> Iterator[Edit]:
+    """Yield the edits that give children values; those that have them already stay untouched."""
+    for tag, value in values.items():
+        child = parent.find(tag)
+        if child is None:
+            yield append_child(parent, text, tag, as_text(value))
+        else:
+            now = number(child, text)
+            if now is None or as_text(now) != as_text(value):
+                yield set_value(child, text, as_text(value))
+
+
+def _through_variable(text: str, blank: str, edit: Edit, path: Path) -> Edit:
+    """Return an edit of a ``{{ variable }}`` as an edit of the number it is set to."""
+    old = text[edit.start : edit.end]
+    if old == blank[edit.start : edit.end]:
+        return edit
+    name = re.fullmatch(r"\s*\{\{-?\s*(\w+)\s*-?\}\}\s*", old)
+    settings = (
+        re.finditer(rf"\{{%-?\s*set\s+{name.group(1)}\s*=\s*([-+.\deE]+)\s*-?%\}}", text)
+        if name
+        else iter(())
+    )
+    found = list(settings)
+    if len(found) != 1:
+        raise ExportError(
+            path,
+            f"has the expression {old.strip()} where a number of ours belongs",
+            "write a number there, or set its variable to a number once",
+        )
+    return Edit(found[0].start(1), found[0].end(1), edit.text)
+
+
+def _provenance_edit(text: str, model: Model, provenance: str) -> Edit:
+    """Return the edit that puts our comment first in the model, in place of an earlier one."""
+    comment = f"<!-- {PROVENANCE}: {provenance.replace('--', '- -')} -->"
+    earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", text, re.DOTALL)
+    if earlier:
+        return Edit(earlier.start(), earlier.end(), comment)
+    first = model.root.children[0]
+    before = text[text.rfind("\n", 0, first.start) + 1 : first.start]
+    indent = "\n" + before if not before.strip() else ""
+    return Edit(model.root.content, model.root.content, indent + comment)
+
+
+def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
+    """Yield what was done, and what of the vehicle the format has no place for."""
+    name = model.base.attributes.get("name", "")
+    others = [(link, body) for link, body in inertials(model) if link is not model.base]
+    if others:
+        names = ", ".join(link.attributes.get("name", "") for link, _ in others)
+        yield (
+            f"the vehicle's {as_text(vehicle.mass)} kg and inertia are those of all links "
+            f"together: '{name}' gets {as_text(base.mass)} kg and what inertia {names} leave"
+        )
+    if model.included:
+        yield f"the mass of what the model includes is not counted: {', '.join(model.included)}"
+    centre = together([base, *(body for _, body in others)]).pose.position
+    for rotor, expected in _rotor_places(model, vehicle, centre):
+        yield (
+            f"{rotor}, which the vehicle file puts {expected} m from it; the model's geometry is "
+            "left as it is"
+        )
+    motor = vehicle.motor
+    if not model.channels():
+        low = motor.input_offset * motor.input_scaling + motor.zero_position_armed
+        yield (
+            "the model has no control channels (gz-sim has them in PX4's parameters): set "
+            f"SIM_GZ_EC_MIN1..4 to {low:.0f} and SIM_GZ_EC_MAX1..4 to "
+            f"{low + motor.input_scaling:.0f}, as the px4 export does"
+        )
+    yield from lost_in(vehicle)
+
+
+def _rotor_places(model: Model, vehicle: VehicleFile, centre: Array) -> Iterator[tuple[str, str]]:
+    """Yield the rotors whose place from the centre of mass is not the vehicle file's."""
+    links = {link.attributes.get("name"): link for link in model.links}
+    for index, rotor in enumerate(vehicle.rotors):
+        link = links.get(f"rotor_{index}")
+        if link is not None:
+            place = model.pose_of_link(link).position - centre
+            if np.abs(place - rotor.position).max() > PLACE_TOLERANCE:
+                yield (
+                    f"rotor_{index} sits {place.round(4).tolist()} m from the centre of mass",
+                    str(list(rotor.position)),
+                )

@@ -1,0 +1,25 @@
+"""The vehicle file of a run, with source and confidence of each coefficient."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tuner.config import VehicleFile, read_vehicle, vehicle_text
+from tuner.export.draft import Draft
+
+
+def yaml_draft(vehicle: VehicleFile, provenance: str) -> Draft:
+    """Return a vehicle file that ``tune --vehicle`` reads.
+
+    Parameters
+    ----------
+    vehicle
+        What to write, its ``source`` included.
+    provenance
+        One line for the top of the file.
+    """
+
+    def faults(path: Path) -> list[str]:
+        return [] if read_vehicle(path) == vehicle else ["it holds another vehicle"]
+
+    return Draft(vehicle_text(vehicle, header=provenance), vehicle, (), faults)
