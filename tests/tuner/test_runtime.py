@@ -1,0 +1,79 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tuner import runtime
+
+REPORT = """
+import json, os
+{before}
+from tuner import runtime
+runtime.configure()
+import jax, jax.numpy as jnp
+print(json.dumps(dict(
+    devices=len(jax.devices()), dtype=str(jnp.zeros(2).dtype), nproc=os.environ["NPROC"],
+    flags=os.environ["XLA_FLAGS"], cache=jax.config.jax_compilation_cache_dir,
+    answer=float(jnp.arange(4.0).sum()), line=runtime.describe(),
+)))
+"""
+
+
+def in_fresh_python(tmp_path: Path, before: str = "", **environment: str) -> dict[str, object]:
+    clean = {k: v for k, v in os.environ.items() if k not in {"NPROC", "XLA_FLAGS"}}
+    clean = {k: v for k, v in clean.items() if not k.startswith("JAX_")}
+    root = Path(runtime.__file__).parents[1]
+    clean |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT.format(before=before)],
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return json.loads(done.stdout)
+
+
+def test_one_device_a_core_double_precision_and_a_kept_cache(tmp_path: Path) -> None:
+    found = in_fresh_python(tmp_path)
+    assert found["devices"] == runtime.cores()
+    assert found["dtype"] == "float64"
+    assert found["nproc"] == "1"
+    assert found["answer"] == 6.0
+    assert any((tmp_path / "multirotor-tune" / "compiled").iterdir())
+    assert "NPROC=1" in str(found["line"])
+
+
+def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
+    found = in_fresh_python(
+        tmp_path,
+        NPROC="2",
+        XLA_FLAGS="--xla_force_host_platform_device_count=3",
+        JAX_ENABLE_X64="0",
+        JAX_COMPILATION_CACHE_DIR=str(tmp_path / "elsewhere"),
+    )
+    assert found["devices"] == 3
+    assert found["dtype"] == "float32"
+    assert found["nproc"] == "2"
+    assert str(found["flags"]).count("device_count") == 1
+    assert found["cache"] == str(tmp_path / "elsewhere")
+
+
+def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
+    found = in_fresh_python(tmp_path, before="import jax.numpy as jnp; jnp.ones(3).sum()")
+    assert found["devices"] == 1
+    assert found["dtype"] == "float64"
+    assert found["answer"] == 6.0
+
+
+def test_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert runtime.cache_folder() == tmp_path / "multirotor-tune"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert runtime.cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"

@@ -1,0 +1,109 @@
+"""How jax is set up for this program: threads, devices, vector width, precision, compiled code.
+
+What was measured on a processor with AVX-512 and two cores: XLA's own thread pool makes kernels of
+this size two to four times slower, so it is turned off and the cores come back as one device each;
+512-bit vectors give a seventh. Without fusions of several outputs XLA computes every component of a
+step's result for itself, all that it depends on included: ten times the operations, and minutes
+instead of seconds to compile a Jacobian. Whatever the user has set in the environment stays.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+#: Releases of jaxlib (major.minor) known to accept XLA's newer flags: an unknown one is fatal.
+_RELEASES_KNOWN = ("0.10",)
+
+
+def cache_folder() -> Path:
+    """Return the folder in which this program may keep what it can make again."""
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        base = Path(chosen)
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path.home() / ".cache"
+    return base / "multirotor-tune"
+
+
+def cores() -> int:
+    """Return how many processor cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1
+
+
+def _has_avx512() -> bool:
+    try:
+        return " avx512f " in Path("/proc/cpuinfo").read_text(errors="replace")
+    except OSError:
+        return False
+
+
+def _flags() -> dict[str, str]:
+    flags = {
+        "--xla_force_host_platform_device_count": str(cores()),
+        "--xla_backend_extra_options": "xla_cpu_use_multi_output_fusion",
+    }
+    if _has_avx512():
+        flags["--xla_cpu_prefer_vector_width"] = "512"
+    if version("jaxlib").rpartition(".")[0] in _RELEASES_KNOWN:
+        flags["--xla_cpu_copy_insertion_use_region_analysis"] = "true"
+    return flags
+
+
+def _set_environment() -> None:
+    os.environ.setdefault("NPROC", "1")
+    given = os.environ.get("XLA_FLAGS", "")
+    names = {flag.partition("=")[0] for flag in given.split()}
+    added = [f"{name}={value}" for name, value in _flags().items() if name not in names]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+
+
+def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
+    """Set jax up for simulation; call it once, before the first computation.
+
+    The environment variables ``NPROC`` and ``XLA_FLAGS`` are read when jax makes its devices, so
+    that a program that has already computed with jax keeps the threads and devices it has, at the
+    price of speed and of nothing else. On a GPU nothing here has an effect but the precision and
+    the cache.
+
+    Parameters
+    ----------
+    float64
+        Compute in double precision unless ``JAX_ENABLE_X64`` says otherwise.
+    keep_compiled
+        Keep compiled code in the user's cache folder, so that the same job starts at once the next
+        time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
+    """
+    _set_environment()
+    import jax
+
+    if "JAX_ENABLE_X64" not in os.environ:
+        jax.config.update("jax_enable_x64", float64)
+    if keep_compiled and jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    logger.debug("%s", describe())
+
+
+def describe() -> str:
+    """Return one line on the settings in force, to stand beside every measured figure."""
+    import jax
+
+    devices = jax.devices()
+    precision = "float64" if jax.config.jax_enable_x64 else "float32"
+    return (
+        f"jax {jax.__version__}, {len(devices)} {devices[0].platform} device(s), {precision}, "
+        f"NPROC={os.environ.get('NPROC', '')}, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}"
+    )
