@@ -86,11 +86,11 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
         time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
     """
     _set_environment()
-    import jax
+    import jax  # noqa: PLC0415 (must come after the environment, and is slow)
 
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", float64)
-    if keep_compiled and jax.config.jax_compilation_cache_dir is None:
+    if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -99,10 +99,10 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
 
 def describe() -> str:
     """Return one line on the settings in force, to stand beside every measured figure."""
-    import jax
+    import jax  # noqa: PLC0415 (slow to import)
 
     devices = jax.devices()
-    precision = "float64" if jax.config.jax_enable_x64 else "float32"
+    precision = jax.dtypes.canonicalize_dtype(float)
     return (
         f"jax {jax.__version__}, {len(devices)} {devices[0].platform} device(s), {precision}, "
         f"NPROC={os.environ.get('NPROC', '')}, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}"
