@@ -3,40 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.flights.flight import Array, Note
-
-#: Multiples of how far samples stick out nearby that make an outlier.
-THRESHOLD = 6.0
-
-
-@dataclass(frozen=True)
-class Honest:
-    """How far noise and honest motion take a sample from its neighbours.
-
-    Attributes
-    ----------
-    floor
-        In the signal's unit.
-    curvature
-        Largest second derivative in time of honest motion, unit/s^2.
-    """
-
-    floor: float
-    curvature: float = 0.0
-
-
-#: Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the
-#: angular acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back.
-HONEST: Mapping[str, Honest] = {
-    "position": Honest(floor=0.02, curvature=30.0),
-    "attitude": Honest(floor=0.03, curvature=100.0),
-    "rotor_speed": Honest(floor=30.0),
-}
+from tuner.flights.outliers import HONEST, excursions, frozen, sticking_out
 
 #: Signals that cannot leave a range; a value beyond it is a corrupt sample.
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -100,11 +72,20 @@ def clean(
         time, values, odd = _unit_quaternions(time, values)
         note(odd, "that are no unit quaternion dropped or normalised")
 
+    if signal in ("position", "attitude"):
+        stuck = frozen(time, values, HONEST[signal])
+        note(int(stuck.sum()), "repeat the one before while the vehicle moves: dropped")
+        away, lasting = excursions(time[~stuck], values[~stuck], HONEST[signal])
+        note(int(away.sum()), "jump away and back within a second: dropped")
+        if lasting:
+            text = f"the {signal} jumps {lasting} times and stays there: check the recording"
+            notes.append(Note("warning", topic, text, lasting))
+        time, values = time[~stuck][~away], values[~stuck][~away]
     if signal in HONEST:
-        outlier = np.zeros(values.shape, dtype=bool)
+        outlier = np.zeros(values.shape, dtype=np.bool_)
         for column in range(values.shape[1]):
             measured = np.flatnonzero(np.isfinite(values[:, column]))
-            outlier[measured, column] = outliers(
+            outlier[measured, column] = sticking_out(
                 time[measured], values[measured, column], HONEST[signal]
             )
         note(int(outlier.any(axis=1).sum()), "far from their neighbours dropped as outliers")
@@ -112,41 +93,9 @@ def clean(
             values = np.where(outlier, np.nan, values)
             keep = np.isfinite(values).any(axis=1)
         else:
-            keep = ~outlier.any(axis=1)
+            keep = np.asarray(~outlier.any(axis=1))
         time, values = time[keep], values[keep]
     return time, values, tuple(notes)
-
-
-def outliers(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
-    """Tell which samples of a signal stick out on one side of all that surrounds them.
-
-    A sample is compared with the medians of the three samples before and the three after it. Ramps
-    and steps lie between the two, so that fast motion and a motor's jump are kept; one or two
-    samples that leave and come back are not. The bound adapts to the signal's own roughness.
-
-    Parameters
-    ----------
-    time
-        (n,) s, strictly increasing.
-    values
-        (n,) one column.
-    honest
-        What the signal may do by itself.
-    """
-    if len(values) < 7:
-        return np.zeros(len(values), dtype=bool)
-    windows = np.lib.stride_tricks.sliding_window_view(
-        np.pad(values, 3, mode="reflect", reflect_type="odd"), 7
-    )
-    before = np.median(windows[:, :3], axis=1)
-    after = np.median(windows[:, 4:], axis=1)
-    low, high = np.minimum(before, after), np.maximum(before, after)
-    excess = np.maximum(np.maximum(low - values, values - high), 0.0)
-    rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
-    apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
-    bound = honest.floor + 2 * honest.curvature * apart**2
-    usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
-    return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
 
 
 def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int]:

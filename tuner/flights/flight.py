@@ -21,6 +21,7 @@ SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
     "acceleration": (3, "m/s^2", "linear"),
     "rotor_speed": (4, "rad/s", "linear"),
     "command": (4, "", "hold"),
+    "attitude_setpoint": (4, "", "hold"),
     "rate_setpoint": (3, "rad/s", "hold"),
     "thrust_setpoint": (1, "", "hold"),
     "reference_position": (3, "m", "hold"),

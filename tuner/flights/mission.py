@@ -1,43 +1,184 @@
-"""The mission in a recording: when it starts and ends, and whether it is a yaw spin."""
+"""The missions in a recording: where each starts and ends, and whether it is a yaw spin."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tuner.flights.flight import Series
+from tuner.flights.flight import Array, Series
 
 #: Reference motion below this, in m or m/s, is a reference at rest.
 AT_REST = 1e-5
+#: Set-points that pause for longer, in s, begin another mission.
+PAUSE = 1.0
+#: A shorter stretch, in s, is no mission.
+SHORTEST = 2.0
+#: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s.
+IDLE = 0.12
+IDLE_SPEED = 80.0
+#: Higher above the ground than this, in m, the vehicle flies.
+CLEAR = 0.12
+#: Set-points that begin this soon after the pose, in s, ran all the time.
+FROM_THE_START = 0.5
 
 
-def mission_span(series: Mapping[str, Series]) -> tuple[float, float]:
-    """Return start and end of the mission in the time of the series.
+@dataclass(frozen=True)
+class Mission:
+    """A stretch of a recording that is flown and compared.
 
-    It starts where the attitude set-points begin or, where there are none, where the reference
-    starts to move; without either, with the pose. It ends with the last sample of those, or with
-    the pose if that ends earlier.
+    Attributes
+    ----------
+    start, end
+        Seconds in the time of the series.
+    begins_with
+        What its start was told by, for the report.
+    """
+
+    start: float
+    end: float
+    begins_with: str
+
+
+def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
+    """Return the missions in the order of flight; empty where nothing flies.
+
+    A mission starts where the attitude set-points begin. Where they run from the start, or where
+    there are none, it starts where the reference begins to move or, without a reference, in the
+    air. What stands on the ground, take-off's first and landing's last centimetres are cut.
     """
     pose = series["position"].time
-    start, end = float(pose[0]), float(pose[-1])
-    for name in ("rate_setpoint", "thrust_setpoint"):
-        if name in series:
-            time = series[name].time
-            return max(start, float(time[0])), min(end, float(time[-1]))
-    moved = [
-        float(series[name].time[index])
-        for name in ("reference_position", "reference_velocity")
-        if name in series and (index := _first_motion(series[name])) is not None
+    first, last = float(pose[0]), float(pose[-1])
+    flying = airborne(series)
+    setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
+    missions = []
+    if setpoints is not None and len(setpoints.time) > 1:
+        spans = _bouts(setpoints.time)
+        whole = len(spans) == 1 and spans[0][0] < first + FROM_THE_START
+        if not whole:
+            for start, end in spans:
+                for up, down in flying:
+                    begin = max(start, up)
+                    missions.append(Mission(begin, min(end, down, last), "attitude set-points"))
+            return _long_enough(missions)
+        flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
+    for up, down in flying:
+        moves = _first_motion(series, up, down)
+        told_by = "the reference's motion" if moves > up else "flight"
+        end = min(down, last, _reference_end(series, last))
+        missions.append(Mission(max(moves, up), end, told_by))
+    return _long_enough(missions)
+
+
+def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
+    return tuple(m for m in missions if m.end - m.start >= SHORTEST)
+
+
+def _bouts(time: Array) -> list[tuple[float, float]]:
+    """Return the stretches of stamps between pauses."""
+    breaks = np.flatnonzero(np.diff(time) > PAUSE)
+    starts = np.concatenate([[0], breaks + 1])
+    ends = np.concatenate([breaks, [len(time) - 1]])
+    return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
+
+
+def _reference_end(series: Mapping[str, Series], last: float) -> float:
+    return float(series["reference_position"].time[-1]) if "reference_position" in series else last
+
+
+def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
+    """Return when the reference begins to move within a stretch; its start if it does not."""
+    firsts = []
+    for name in ("reference_position", "reference_velocity"):
+        if name not in series:
+            continue
+        own = series[name]
+        inside = np.flatnonzero((own.time >= start) & (own.time <= end))
+        if len(inside) == 0:
+            continue
+        values = own.values[inside]
+        known = np.isfinite(values).all(axis=1)
+        if not known.any():
+            continue
+        moving = np.abs(values - values[known][0]).max(axis=1) > AT_REST
+        if (moving & known).any():
+            firsts.append(float(own.time[inside[np.argmax(moving & known)]]))
+    return min(firsts, default=start)
+
+
+def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
+    """Return the stretches in the air.
+
+    The ground is known where motors were seen idle, or where the recording begins or ends at rest
+    and the vehicle climbs away from there; a recording that shows no ground is all in the air.
+    """
+    position = series["position"]
+    time, height = position.time, position.values[:, 2]
+    idle = _idle(series, time)
+    if idle is None:
+        idle = _resting(time, height)
+    if not idle.any():
+        return [(float(time[0]), float(time[-1]))]
+    ground = _ground(time, height, idle)
+    return _stretches(time, ~idle & (height > ground + CLEAR))
+
+
+def _idle(series: Mapping[str, Series], time: Array) -> NDArray[np.bool_] | None:
+    """Tell at which times the motors idle; None where nothing recorded tells."""
+    for name, limit in (
+        ("command", IDLE), ("rotor_speed", IDLE_SPEED), ("thrust_setpoint", IDLE),
+    ):  # fmt: skip
+        if name in series and len(series[name].time) > 1:
+            own = series[name]
+            known = np.isfinite(own.values).any(axis=1)
+            level = np.nanmean(own.values[known], axis=1)
+            at = np.interp(time, own.time[known], level)
+            inside = (time >= own.time[0] - PAUSE) & (time <= own.time[-1] + PAUSE)
+            if name == "thrust_setpoint":
+                # Set-points that pause say nothing of the motors.
+                inside = (time >= own.time[0]) & (time <= own.time[-1])
+            return np.asarray(inside & (at < limit), dtype=np.bool_)
+    return None
+
+
+def _resting(time: Array, height: Array) -> NDArray[np.bool_]:
+    """Tell when the vehicle lies on the ground from which, or to which, it flies."""
+    resting = np.zeros(len(time), dtype=np.bool_)
+    for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
+        level = float(np.median(height[near]))
+        still = float(np.ptp(height[near])) < 0.01
+        lowest = level < float(np.quantile(height, 0.02)) + 0.03
+        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * CLEAR:
+            resting |= np.abs(height - level) < 0.03
+    return resting
+
+
+def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
+    """Return the height of the ground at each time: where the vehicle last stood, or will stand."""
+    where = np.flatnonzero(idle)
+    before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
+    levels = np.array([np.median(part) for part in _runs(height, where)])
+    run_of = np.cumsum(np.concatenate([[0], np.diff(where) > 1]))
+    return np.asarray(levels[run_of[before]])
+
+
+def _runs(height: Array, where: NDArray[np.intp]) -> list[Array]:
+    return np.split(height[where], np.flatnonzero(np.diff(where) > 1) + 1)
+
+
+def _stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """Return the stretches in which a condition holds, shorter breaks than a pause bridged."""
+    index = np.flatnonzero(up)
+    if len(index) == 0:
+        return []
+    breaks = np.flatnonzero(np.diff(time[index]) > PAUSE)
+    starts = np.concatenate([[0], breaks + 1])
+    ends = np.concatenate([breaks, [len(index) - 1]])
+    return [
+        (float(time[index[a]]), float(time[index[b]])) for a, b in zip(starts, ends, strict=True)
     ]
-    if moved:
-        return max(start, min(moved)), min(end, float(series["reference_position"].time[-1]))
-    return start, end
-
-
-def _first_motion(reference: Series) -> int | None:
-    moving = np.abs(reference.values - reference.values[0]).max(axis=1) > AT_REST
-    return int(np.argmax(moving)) if moving.any() else None
 
 
 def yaw_spin(rate_setpoint: Series, start: float, end: float) -> float | None:

@@ -26,6 +26,42 @@ class Topic:
 
 
 @dataclass(frozen=True)
+class Clock:
+    """A field that tells the time of a message, or of a table's row.
+
+    Attributes
+    ----------
+    field
+        Its path or column.
+    unit
+        Key of `NANOSECONDS`.
+    """
+
+    field: str
+    unit: str = "s"
+
+
+#: Unit of time -> nanoseconds.
+NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is wanted of a topic.
+
+    Attributes
+    ----------
+    fields
+        Paths of numbers.
+    clocks
+        Fields that may tell the time, the preferred one first; none means the usual header.
+    """
+
+    fields: tuple[str, ...]
+    clocks: tuple[Clock, ...] = ()
+
+
+@dataclass(frozen=True)
 class Samples:
     """The messages of one topic, in the order of the file.
 
@@ -34,7 +70,7 @@ class Samples:
     receive
         (n,) ns, when each message was recorded.
     stamp
-        (n,) ns, the time written in each message's header; None where the type has no header.
+        (n,) ns, the time written in each message; None where it has none.
     fields
         Field path -> (n,) numbers as recorded; NaN where a message has no such element.
     """
@@ -46,10 +82,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class Usual:
-    """Where a message type holds a signal: its fields and their unit, a key of `UNITS`."""
+    """Where a message type holds a signal: its fields, their unit (of `UNITS`) and axes."""
 
     fields: tuple[str, ...]
     unit: str = "si"
+    frame: str = "enu_flu"
 
 
 @dataclass(frozen=True)
@@ -90,8 +127,18 @@ class Recording(Protocol):
         """Return where messages of this topic's type hold a signal; None if they do not."""
         ...
 
-    def read(self, wanted: Mapping[str, Sequence[str]]) -> Contents:
-        """Read some topics: topic -> paths of the wanted fields."""
+    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:
+        """Tell whether a topic can hold these fields; only tables know before reading."""
+        ...
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read some topics: topic -> what is wanted of it.
+
+        Raises
+        ------
+        RecordingError
+            A topic has no such field, or nothing can be read.
+        """
         ...
 
 

@@ -49,14 +49,25 @@ def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
 
 
 def _along_arc(series: Series, clock: Array) -> Array:
-    from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415 (slow to import)
-
+    """Turn from each sample to the next at constant speed along the shorter arc (slerp)."""
     result = np.full((len(clock), 4), np.nan)
     known = _covered(series.time, clock)
     if len(series.time) < 2 or not known.any():
         return result
-    turns = Slerp(series.time, Rotation.from_quat(series.values, scalar_first=True))
-    arc = turns(clock[known]).as_quat(scalar_first=True)
+    at = clock[known]
+    after = np.clip(np.searchsorted(series.time, at), 1, len(series.time) - 1)
+    start, end = series.values[after - 1], series.values[after]
+    part = (at - series.time[after - 1]) / (series.time[after] - series.time[after - 1])
+    cosine = (start * end).sum(axis=1)
+    end = np.where(cosine[:, None] < 0, -end, end)
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    # Below this angle the arc is a line to machine precision, and its sine divides badly.
+    tiny = angle < 1e-6
+    sine = np.where(tiny, 1.0, np.sin(angle))
+    from_start = np.where(tiny, 1 - part, np.sin((1 - part) * angle) / sine)
+    from_end = np.where(tiny, part, np.sin(part * angle) / sine)
+    arc = from_start[:, None] * start + from_end[:, None] * end
+    arc /= np.linalg.norm(arc, axis=1)[:, None]
     flips = np.where((arc[1:] * arc[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     sign = np.concatenate([[1.0], np.cumprod(flips)])
     result[known] = arc * (sign if arc[0, 0] >= 0 else -sign)[:, None]

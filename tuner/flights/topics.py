@@ -13,6 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, mo
 
 from tuner.errors import ConfigError, did_you_mean
 from tuner.flights.flight import SIGNALS
+from tuner.flights.recording import Clock
 from tuner.flights.units import UNITS
 
 #: The maps that ship with the project.
@@ -25,7 +26,8 @@ class Source(BaseModel):
     Attributes
     ----------
     topic
-        Name of the topic; empty in a table, which has one set of columns only.
+        Name of the topic, in which ``*`` stands for anything; empty in a table, which has one set
+        of columns only.
     fields
         Paths into the message (``pose.position.x``, ``channels[0]``) or column names, in the
         order of the signal's columns; None takes those that the message type usually has.
@@ -34,7 +36,8 @@ class Source(BaseModel):
     unit
         Unit of the recorded numbers, a key of `UNITS`; None is the usual one of the message type.
     frame
-        Axes of the recorded numbers: ``enu_flu`` as ROS has them, ``ned_frd`` as PX4 has them.
+        Axes of the recorded numbers: ``enu_flu`` as ROS has them, ``ned_frd`` as PX4 has them;
+        None is the usual one of the message type.
     quaternion
         Order of the recorded quaternion, as `fields` lists it.
     stamp
@@ -47,7 +50,7 @@ class Source(BaseModel):
     fields: tuple[str, ...] | None = None
     rotor: str | None = None
     unit: str | None = None
-    frame: Literal["enu_flu", "ned_frd"] = "enu_flu"
+    frame: Literal["enu_flu", "ned_frd"] | None = None
     quaternion: Literal["wxyz", "xyzw"] = "wxyz"
     stamp: Literal["header", "receive"] = "header"
 
@@ -65,8 +68,22 @@ class Source(BaseModel):
         return self
 
 
-def _as_sources(value: object) -> object:
+def _as_list(value: object) -> object:
     return value if isinstance(value, list | tuple) else [value]
+
+
+class _ClockField(BaseModel):
+    """A field that tells the time; a bare name means seconds."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    field: str
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: object) -> object:
+        return {"field": value} if isinstance(value, str) else value
 
 
 class TopicMap(BaseModel):
@@ -78,15 +95,46 @@ class TopicMap(BaseModel):
         What reports call the map.
     format
         Kind of recording that it applies to.
+    extends
+        Another map, by name or file, for all that this one does not say.
+    priority
+        Among maps that find equally many signals in a recording, the highest is taken.
+    time
+        Fields that tell the time, the preferred one first; none means the message's header.
+    messages
+        ``.msg`` files, or folders of them, for ROS types that a recording does not define.
     signals
-        Signal of `SIGNALS` to its sources.
+        Signal of `SIGNALS` to its sources. In a table, a list of columns says it all.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
     format: Literal["ros", "ulog", "table"]
-    signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_sources)]]
+    extends: str | None = None
+    priority: int = 0
+    time: Annotated[tuple[_ClockField, ...], BeforeValidator(_as_list)] = ()
+    messages: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = ()
+    signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_list)]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns(cls, value: object) -> object:
+        """Let a table's signal be a list of columns, or one column."""
+        if not (isinstance(value, dict) and value.get("format") == "table"):
+            return value
+        signals = value.get("signals")
+        if not isinstance(signals, dict):
+            return value
+
+        def as_source(columns: object) -> object:
+            if isinstance(columns, str):
+                return {"fields": [columns]}
+            if isinstance(columns, list) and all(isinstance(name, str) for name in columns):
+                return {"fields": columns}
+            return columns
+
+        return {**value, "signals": {name: as_source(of) for name, of in signals.items()}}
 
     @model_validator(mode="after")
     def _known_signals(self) -> TopicMap:
@@ -99,6 +147,11 @@ class TopicMap(BaseModel):
                 if source.rotor is None and count != columns:
                     raise ValueError(f"signal '{name}' has {columns} columns, {count} fields given")
         return self
+
+    @property
+    def clocks(self) -> tuple[Clock, ...]:
+        """The fields that tell the time."""
+        return tuple(Clock(clock.field, clock.unit) for clock in self.time)
 
     def under(self, namespace: str) -> TopicMap:
         """Return the map with every topic moved under a namespace, as ``uav1`` or ``/uav1``."""
@@ -115,7 +168,7 @@ class TopicMap(BaseModel):
         return self.model_copy(update={"signals": signals})
 
 
-def load_topic_map(path: str | Path) -> TopicMap:
+def load_topic_map(path: str | Path, *, depth: int = 0) -> TopicMap:
     """Read a topic map from a file, or a shipped one by its name.
 
     Raises
@@ -133,7 +186,7 @@ def load_topic_map(path: str | Path) -> TopicMap:
         content = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)
         if not isinstance(content, dict):
             raise ConfigError(path, "is no topic map", "see configs/topics for examples")
-        return TopicMap.model_validate(content)
+        found = TopicMap.model_validate(content)
     except OSError as err:
         raise ConfigError(path, f"cannot be read ({err.strerror})", "check the path") from None
     except (yaml.YAMLError, UnicodeDecodeError) as err:
@@ -145,6 +198,27 @@ def load_topic_map(path: str | Path) -> TopicMap:
         said = detail["msg"].removeprefix("Value error, ")
         what = f"{where}: {said}" if where else said
         raise ConfigError(path, what, "see configs/topics for examples") from None
+    messages = tuple(path.parent / file for file in found.messages)
+    found = found.model_copy(update={"messages": messages})
+    return found if found.extends is None else _extended(found, path, depth)
+
+
+def _extended(found: TopicMap, path: Path, depth: int) -> TopicMap:
+    """Fill a map from the one that it extends."""
+    name = str(found.extends)
+    if depth > 3:
+        raise ConfigError(path, f"extends '{name}', which extends it in turn", "break the circle")
+    beside = path.parent / name
+    base = load_topic_map(beside if beside.is_file() else name, depth=depth + 1)
+    if base.format != found.format:
+        raise ConfigError(path, f"extends '{name}' of another format", "extend one of its own")
+    return found.model_copy(
+        update={
+            "signals": {**base.signals, **found.signals},
+            "time": found.time or base.time,
+            "messages": (*found.messages, *base.messages),
+        }
+    )
 
 
 @cache

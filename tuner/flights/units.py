@@ -54,7 +54,9 @@ def to_enu_flu(values: Array, signal: str) -> Array:
     if signal in BODY:
         forward, right, down = values.T
         return np.column_stack([forward, -right, -down])
-    if signal == "attitude":
+    if signal in ("attitude", "attitude_setpoint"):
         w, x, y, z = values.T
         return np.column_stack([w + z, x + y, x - y, w - z]) / math.sqrt(2)
+    if signal == "thrust_setpoint":  # PX4's thrust points down
+        return -values
     return values

@@ -107,3 +107,44 @@ def test_rotors_stamped_together_share_a_row() -> None:
     assert kept.tolist() == [0.0, 0.1]
     assert left.tolist() == [[500, 501, 502, 503], [504, 505, 506, 507]]
     assert notes == ()
+
+
+def test_motion_capture_that_goes_on_sending_its_last_pose_is_dropped() -> None:
+    time = np.arange(500) * 0.01
+    position = np.column_stack([2 * time, np.sin(3 * time), np.ones(500)])
+    position += np.random.default_rng(0).normal(0, 3e-4, position.shape)
+    position[200:230] = position[199]
+    kept, _, notes = _one("position", time, position)
+    assert not np.isin(time[200:230], kept).any()
+    assert len(kept) == 470
+    assert notes[0].count == 30
+
+
+def test_a_vehicle_at_rest_in_a_simulator_is_kept() -> None:
+    time = np.arange(400) * 0.01
+    height = np.where(time < 2, 0.1, 0.1 + 0.5 * (time - 2) ** 2)
+    position = np.column_stack([0 * time, 0 * time, height])
+    kept, _, notes = _one("position", time, position)
+    assert len(kept) == 400
+    assert notes == ()
+
+
+def test_markers_swapped_for_a_while_are_dropped() -> None:
+    time = np.arange(600) * 0.01
+    position = np.column_stack([2 * np.cos(time), 2 * np.sin(time), np.ones(600)])
+    position += np.random.default_rng(0).normal(0, 3e-4, position.shape)
+    position[300:330] += [0.15, 0.0, 0.1]
+    kept, _, notes = _one("position", time, position)
+    assert not np.isin(time[300:330], kept).any()
+    assert len(kept) == 570
+    assert "away and back" in notes[0].text
+
+
+def test_a_jump_that_stays_is_only_told() -> None:
+    time = np.arange(600) * 0.01
+    position = np.column_stack([time, 0 * time, np.ones(600)])
+    position[300:] += [0.5, 0.0, 0.0]
+    kept, _, notes = _one("position", time, position)
+    assert len(kept) == 600
+    assert notes[0].kind == "warning"
+    assert notes[0].count == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 from tuner.flights.flight import Series
 from tuner.flights.resample import resample
@@ -34,6 +35,15 @@ def test_quaternions_turn_at_constant_speed_through_a_sign_flip() -> None:
     half = 9.0 * CLOCK / 2
     expected = np.column_stack([np.cos(half), 0 * half, 0 * half, np.sin(half)])
     assert np.abs(got - expected).max() < 1e-9
+
+
+def test_slerp_agrees_with_scipy() -> None:
+    random = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(np.cumsum(random.normal(0, 0.5, (12, 3)), axis=0))
+    time = np.linspace(0, 1, 12)
+    got = resample("attitude", Series(time, turns.as_quat(scalar_first=True)), CLOCK)
+    expected = Slerp(time, turns)(CLOCK).as_quat(scalar_first=True)
+    assert np.abs(np.abs((got * expected).sum(axis=1)) - 1).max() < 1e-12
 
 
 def test_setpoints_hold_until_they_are_stale() -> None:

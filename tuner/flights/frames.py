@@ -1,0 +1,188 @@
+"""Axes and orders that a topic map has wrong: noticed because the motion contradicts itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuner.flights.flight import Array, Note, Series
+from tuner.flights.motion import (
+    alike,
+    body_rate_of,
+    derivative,
+    on_clock,
+    rms,
+    rotate,
+    smooth,
+    stretch,
+)
+from tuner.flights.units import to_enu_flu
+
+GRAVITY = 9.81
+#: Motion below these, in m/s^2, rad/s and m/s, contradicts nothing.
+ENOUGH_PUSH = 0.3
+ENOUGH_TURNING = 0.1
+ENOUGH_SPEED = 0.2
+#: Agreement that is believed without a look at alternatives, and how much better one must be.
+GOOD = 0.6
+BETTER = 0.3
+#: What a further misreading must bring to be preferred.
+UNLIKELY = 0.05
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """Another way to read recorded numbers, and its name in a sentence."""
+
+    name: str
+    read: Callable[[Array], Array]
+
+
+def _scalar_last(q: Array) -> Array:
+    return q[:, [3, 0, 1, 2]]
+
+
+def _inverse(q: Array) -> Array:
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
+
+
+_ATTITUDES = (
+    _Reading("scalar-last", _scalar_last),
+    _Reading("world to body", _inverse),
+    _Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
+    _Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+)
+_DEGREES = np.pi / 180
+_RATES = (
+    _Reading("in FRD axes", lambda w: to_enu_flu(w, "body_rate")),
+    _Reading("in degrees per second", lambda w: w * _DEGREES),
+    _Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
+)
+
+
+def correct_frames(
+    series: Mapping[str, Series], topics: Mapping[str, str]
+) -> tuple[dict[str, Series], tuple[Note, ...]]:
+    """Return the series with misread attitude, body rate and velocity read rightly.
+
+    A multirotor accelerates where its thrust points, so the attitude must tilt towards the
+    acceleration of the position, and carry the accelerometer's reading upwards; its change must be
+    the body rate; the position's change the velocity. A reading that fails is exchanged for the one
+    that passes, with a warning; where none passes, a warning says so.
+    """
+    fixed = dict(series)
+    notes: list[Note] = []
+    if not {"position", "attitude"} <= set(series):
+        return fixed, ()
+    clock = stretch(series)
+    if len(clock) < 200:
+        return fixed, ()
+
+    def apply(signal: str, reading: _Reading | None, doubt: str) -> None:
+        topic = topics.get(signal, signal)
+        if reading is not None:
+            own = fixed[signal]
+            values = reading.read(own.values)
+            known = np.isfinite(values).all(axis=1)
+            fixed[signal] = Series(own.time[known], values[known])
+            text = f"{signal} is {reading.name}, which the topic map does not say: turned"
+            notes.append(Note("warning", topic, text, len(own.time)))
+        elif doubt:
+            notes.append(Note("warning", topic, doubt))
+
+    apply("attitude", *_judge_attitude(fixed, clock))
+    if "body_rate" in fixed:
+        apply("body_rate", *_judge_rate(fixed, clock))
+    if "velocity" in fixed:
+        apply("velocity", *_judge_velocity(fixed, clock))
+    return fixed, tuple(notes)
+
+
+def _judge_attitude(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+    q = on_clock(series, "attitude", clock)
+    position = smooth(on_clock(series, "position", clock), 0.2)
+    push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
+    gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
+    force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
+
+    def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
+        """Return how well a reading fits the motion, and how upright it flies."""
+        turned = reading(q)
+        up = rotate(turned, np.tile([0.0, 0.0, 1.0], (len(turned), 1)))
+        scores = []
+        if rms(push[:, :2]) > ENOUGH_PUSH:
+            scores.append(alike(smooth(up[:, :2], 0.2), push[:, :2]))
+        if gyro is not None and rms(gyro) > ENOUGH_TURNING:
+            # The gyro's own axes may be wrong too, though two errors are less likely than one.
+            own = smooth(body_rate_of(turned))
+            in_flu, in_frd = alike(own, smooth(gyro)), alike(own, smooth(_RATES[0].read(gyro)))
+            scores.append(max(in_flu, in_frd - UNLIKELY))
+        carried = up if force is None else rotate(turned, force) / GRAVITY
+        upright = float(np.nanmean(carried[:, 2]))
+        return (min(scores) if scores else 1.0), upright
+
+    fit, upright = agreement(lambda values: values)
+    if fit > GOOD and upright > 0.5:
+        return None, ""
+    # The likelier misreading comes first in the list.
+    worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(_ATTITUDES)]
+    best = _ATTITUDES[int(np.argmax(worth))]
+    best_fit, best_upright = agreement(best.read)
+    better = _worth(best_fit, best_upright) > _worth(fit, upright) + BETTER
+    if better and best_fit > GOOD and best_upright > 0.5:
+        return best, ""
+    if fit < 0.2 or upright < 0.5:
+        return None, (
+            f"the attitude does not tilt as the vehicle accelerates (agreement {fit:.2f}, "
+            f"upright {upright:.2f}): check its frame and order"
+        )
+    return None, ""
+
+
+def _worth(fit: float, upright: float) -> float:
+    return fit + min(upright, 1.0)
+
+
+def _judge_rate(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)))
+    gyro = smooth(on_clock(series, "body_rate", clock))
+    if min(rms(turning), rms(gyro)) < ENOUGH_TURNING:
+        return None, ""
+
+    def mismatch(rates: Array) -> float:
+        """Return the part of the turning that is left when a reading of the gyro is taken off."""
+        known = np.isfinite(turning).all(axis=1) & np.isfinite(rates).all(axis=1)
+        return rms((turning - rates)[known]) / rms(turning[known])
+
+    here = mismatch(gyro)
+    best = min(_RATES, key=lambda r: mismatch(r.read(gyro)))
+    there = mismatch(best.read(gyro))
+    if there < 0.7 and there < here / 2:
+        return best, ""
+    doubt = f"the body rate is not the attitude's change ({here:.1f} of it is left)"
+    return None, doubt if here > 0.9 else ""
+
+
+def _judge_velocity(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+    moving = smooth(derivative(on_clock(series, "position", clock)), 0.1)
+    velocity = smooth(on_clock(series, "velocity", clock), 0.1)
+    if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
+        return None, ""
+    fit = alike(moving, velocity)
+    if fit > 0.8:
+        return None, ""
+    own = series["velocity"]
+    at_samples = on_clock(series, "attitude", own.time)
+
+    in_body = _Reading("in body axes", lambda _: rotate(at_samples, own.values))
+    ned = _Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
+    fits = {
+        in_body: alike(moving, rotate(on_clock(series, "attitude", clock), velocity)),
+        ned: alike(moving, to_enu_flu(velocity, "velocity")),
+    }
+    best = max(fits, key=lambda r: fits[r])
+    if fits[best] > max(0.8, fit + 0.15):
+        return best, ""
+    return None, f"the velocity is not the position's change (agreement {fit:.2f})"

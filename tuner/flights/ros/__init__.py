@@ -1,0 +1,1 @@
+"""ROS recordings: ROS 1 bags, ROS 2 databases and MCAP, without ROS."""

@@ -1,0 +1,165 @@
+"""The SQLite container of ROS 2, read table by table without trusting it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import quote
+
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+
+from tuner.errors import RecordingError
+from tuner.flights.flight import Note
+from tuner.flights.ros.container import LARGEST_CHUNK, Connection, joined
+from tuner.flights.ros.wire import Block
+
+#: Messages that are decoded together, and their bytes.
+AT_ONCE = 4096
+BYTES_AT_ONCE = 16 << 20
+#: Steps of the database's machine, in millions, after which a query is no honest one.
+PATIENCE = 5_000
+#: How often reading goes on behind a damaged page, each time twice as far behind it.
+ATTEMPTS = 24
+
+_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+
+
+@dataclass
+class Db3:
+    """One ``.db3`` file of a ROS 2 recording.
+
+    Raises
+    ------
+    RecordingError
+        The file is no such database, or nothing of it can be read.
+    """
+
+    path: Path
+    aligned: bool = True
+    connections: dict[int, Connection] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        try:
+            with _opened(self.path) as database:
+                tables = {
+                    name
+                    for (name,) in database.execute(
+                        "SELECT name FROM sqlite_master WHERE type = 'table'"
+                    )
+                }
+                if not {"topics", "messages"} <= tables:
+                    raise RecordingError(
+                        self.path, "is no ROS 2 recording", "give the recording itself"
+                    )
+                self._learn(database, "message_definitions" in tables)
+        except sqlite3.Error as err:
+            raise RecordingError(
+                self.path, f"cannot be read ({err})", "try sqlite3's '.recover' on it"
+            ) from None
+        if not self.connections:
+            raise RecordingError(self.path, "holds no ROS messages", "record it again")
+
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+        """Yield the messages of some connections, some thousands at a time, in one pass.
+
+        Where a page of the database is damaged, reading goes on some messages later.
+        """
+        done, attempts, said = 0, 0, ""
+        pending = {number: _Pending() for number in wanted}
+        marks = ", ".join("?" for _ in pending)
+        while attempts < ATTEMPTS:
+            try:
+                with _opened(self.path) as database:
+                    for row, number, time, blob in database.execute(
+                        "SELECT id, topic_id, timestamp, data FROM messages "
+                        f"WHERE topic_id IN ({marks}) AND id > ? "
+                        "AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob' "
+                        f"AND length(data) < {LARGEST_CHUNK} ORDER BY id",
+                        (*pending, done),
+                    ):
+                        done = row
+                        pending[number].add(time, blob)
+                        if pending[number].full:
+                            yield number, pending[number].block()
+                break
+            except sqlite3.Error as err:
+                said = str(err)
+                attempts += 1
+                done += 1 << attempts
+        for number, rest in pending.items():
+            if rest.times:
+                yield number, rest.block()
+        if said:
+            text = f"the database is damaged ({said}), messages around the damage are lost"
+            self.notes.append(Note("warning", "", text, attempts))
+
+    def _learn(self, database: sqlite3.Connection, has_definitions: bool) -> None:
+        texts = {}
+        if has_definitions:
+            forms = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinitionFormat.IDL}
+            for kind, encoding, text in database.execute(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            ):
+                if encoding in forms and isinstance(text, str):
+                    texts[kind] = MessageDefinition(forms[encoding], text)
+        counts = dict(
+            database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
+        )
+        for number, topic, kind, encoding in database.execute(
+            "SELECT id, name, type, serialization_format FROM topics"
+        ):
+            if encoding == "cdr" and isinstance(topic, str) and isinstance(kind, str):
+                definition = texts.get(kind, _NO_DEFINITION)
+                count = counts.get(number, 0)
+                self.connections[number] = Connection(number, topic, kind, definition, count)
+
+
+class _opened:  # noqa: N801 (used like a function)
+    """A database opened for reading only, in which nothing can act or go on forever."""
+
+    def __init__(self, path: Path) -> None:
+        # A recorder that crashed leaves its last messages in a log beside the database.
+        unfinished = path.with_name(path.name + "-wal").exists()
+        how = "mode=ro" if unfinished else "mode=ro&immutable=1"
+        self._database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{how}", uri=True)
+        self._steps = 0
+
+    def __enter__(self) -> sqlite3.Connection:
+        self._database.execute("PRAGMA trusted_schema = OFF")
+        self._database.execute("PRAGMA cell_size_check = ON")
+        self._database.set_progress_handler(self._tick, 1_000_000)
+        return self._database
+
+    def __exit__(self, *_: object) -> None:
+        self._database.close()
+
+    def _tick(self) -> int:
+        self._steps += 1
+        return int(self._steps > PATIENCE)
+
+
+@dataclass
+class _Pending:
+    """Messages of one connection that wait to be decoded together."""
+
+    times: list[int] = field(default_factory=list)
+    blobs: list[bytes] = field(default_factory=list)
+    held: int = 0
+
+    def add(self, time: int, blob: bytes) -> None:
+        self.times.append(time)
+        self.blobs.append(blob)
+        self.held += len(blob)
+
+    @property
+    def full(self) -> bool:
+        return len(self.times) >= AT_ONCE or self.held >= BYTES_AT_ONCE
+
+    def block(self) -> Block:
+        """Hand over what waited."""
+        block = joined(self.times, self.blobs)
+        self.times, self.blobs, self.held = [], [], 0
+        return block

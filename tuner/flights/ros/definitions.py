@@ -1,0 +1,108 @@
+"""Message definitions: the types that a recording carries, or that ``.msg`` files add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+from tuner.errors import InputError, RecordingError
+
+#: Fields of a message type in their order: name and rosbags' description of what it holds.
+Fields = list[tuple[str, Any]]
+
+#: The longest honest definition is some 20 kB; beyond this a parser is only kept busy.
+LONGEST = 200_000
+
+
+@dataclass
+class Definitions:
+    """The message types of one recording, parsed when they are first asked for.
+
+    Parameters
+    ----------
+    path
+        The recording, named in errors.
+    texts
+        Message type -> definition as the recording carries it.
+    files
+        ``.msg`` files, or folders of them, for types that the recording does not carry.
+    """
+
+    path: Path
+    texts: dict[str, MessageDefinition]
+    files: tuple[Path, ...] = ()
+    _known: dict[str, Fields] = field(default_factory=dict)
+
+    def fields(self, kind: str) -> Fields:
+        """Return the fields of a message type.
+
+        Raises
+        ------
+        RecordingError
+            Its definition is missing or cannot be understood.
+        """
+        if kind not in self._known:
+            self._learn(kind)
+        return self._known[kind]
+
+    def _learn(self, kind: str) -> None:
+        text = self.texts.get(kind)
+        if text is not None and text.format is not MessageDefinitionFormat.NONE:
+            self._add(_parse(self.path, text, kind))
+        for path in _message_files(self.files):
+            name = _type_of(path)
+            self._add(_parse(path, _read(path), name), only_new=True)
+        if kind not in self._known:
+            self._add(get_typestore(Stores.EMPTY).fielddefs, only_new=True)
+        if kind not in self._known:
+            self._add(get_typestore(Stores.ROS2_HUMBLE).fielddefs, only_new=True)
+        if kind not in self._known:
+            raise RecordingError(
+                self.path,
+                f"the definition of message type {kind} is not in the recording",
+                "name its .msg file under 'messages' in the topic map",
+            )
+
+    def _add(self, types: Any, *, only_new: bool = False) -> None:
+        for name, (_, fields, *_) in types.items():
+            if not only_new or name not in self._known:
+                self._known[name] = fields
+
+
+def _parse(path: Path, text: MessageDefinition, kind: str) -> Any:
+    if len(text.data) > LONGEST:
+        raise RecordingError(path, f"the definition of {kind} is absurdly long", "leave it out")
+    parse = get_types_from_idl if text.format is MessageDefinitionFormat.IDL else None
+    try:
+        return parse(text.data) if parse else get_types_from_msg(text.data, kind)
+    except InputError:
+        raise
+    except Exception as err:  # the parser meets hostile text and has no common error class
+        said = " ".join(str(err).split())[:120]
+        raise RecordingError(
+            path, f"the definition of {kind} makes no sense ({said})", "record it again"
+        ) from None
+
+
+def _message_files(files: Iterable[Path]) -> Iterable[Path]:
+    for path in files:
+        yield from sorted(path.rglob("*.msg")) if path.is_dir() else [path]
+
+
+def _type_of(path: Path) -> str:
+    """Return the type that a file ``mavros_msgs/msg/RCOut.msg`` defines."""
+    package = path.parent.parent.name if path.parent.name == "msg" else path.parent.name
+    return f"{package}/msg/{path.stem}"
+
+
+def _read(path: Path) -> MessageDefinition:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise RecordingError(path, "cannot be read as a message definition", "check it") from None
+    return MessageDefinition(MessageDefinitionFormat.MSG, text)

@@ -1,0 +1,340 @@
+"""The MCAP container of ROS 2: found by its summary, or walked from the front where that is lost.
+
+rosbags reads MCAP message by message, unpacks whatever a chunk claims and refuses files that were
+never closed; here messages are located with array operations and a broken file is salvaged.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+from rosbags.typesys.msg import normalize_msgtype
+
+from tuner.errors import RecordingError
+from tuner.flights.flight import Note
+from tuner.flights.ros.container import (
+    LARGEST_CHUNK,
+    NEAR,
+    Connection,
+    DamagedError,
+    read_pieces,
+    u16,
+    u64,
+    unpack,
+)
+from tuner.flights.ros.wire import Block, Bytes, Index
+
+MAGIC = b"\x89MCAP0\r\n"
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_END = (
+    0x02, 0x03, 0x04, 0x05, 0x06, 0x07, 0x08, 0x0B, 0x0F,
+)  # fmt: skip
+
+#: Bytes of a message record before its payload: op, length, channel, sequence, two times.
+BEFORE_PAYLOAD = 9 + 22
+_FORMATS = {
+    "ros2msg": MessageDefinitionFormat.MSG,
+    "ros1msg": MessageDefinitionFormat.MSG,
+    "ros2idl": MessageDefinitionFormat.IDL,
+    "omgidl": MessageDefinitionFormat.IDL,
+}
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A chunk: where its record lies, and where the index of each of its channels does."""
+
+    position: int
+    length: int
+    indexes: dict[int, int]
+
+
+@dataclass
+class Mcap:
+    """An MCAP file with ROS messages.
+
+    Raises
+    ------
+    RecordingError
+        The file is no MCAP, or nothing of it can be read.
+    """
+
+    path: Path
+    connections: dict[int, Connection] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    aligned: bool = True
+    _chunks: list[_Chunk] = field(default_factory=list)
+    _loose: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
+    _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        with self.path.open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                raise RecordingError(self.path, "is no MCAP file", "give the recording itself")
+            try:
+                self._read_summary(stream)
+            except DamagedError as err:
+                self._walk(stream, str(err))
+        if not self.connections:
+            raise RecordingError(self.path, "holds no ROS messages", "record it again")
+
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+        """Yield the messages of some connections, chunk by chunk."""
+        lost = 0
+        with self.path.open("rb") as stream:
+            for chunk in self._chunks:
+                present = [number for number in wanted if number in chunk.indexes]
+                if not present:
+                    continue
+                try:
+                    located = list(self._locate(stream, chunk, present))
+                except DamagedError:
+                    lost += 1
+                    continue
+                yield from located
+            for number in wanted:
+                if self._loose.get(number):
+                    yield from self._loose_blocks(stream, number)
+        if lost:
+            text = f"{lost} of {len(self._chunks)} chunks are damaged, their messages lost"
+            self.notes.append(Note("warning", "", text, lost))
+
+    def _read_summary(self, stream: BinaryIO) -> None:
+        """Learn channels and chunks from the end of the file."""
+        size = self.path.stat().st_size
+        stream.seek(max(0, size - 37))
+        footer = stream.read(37)
+        if len(footer) != 37 or footer[-8:] != MAGIC or footer[:9] != b"\x02\x14" + bytes(7):
+            raise DamagedError("its end is missing")
+        (start,) = struct.unpack_from("<Q", footer, 9)
+        if not 0 < start <= size - 37:
+            raise DamagedError("it has no summary")
+        if size - start > LARGEST_CHUNK:
+            raise DamagedError("its summary is absurdly long")
+        stream.seek(start)
+        counts: dict[int, int] = {}
+        summary = stream.read(size - 37 - start)
+        for op, at, end in _records(summary):
+            content = summary[at:end]
+            if op == CHUNK_INDEX:
+                self._chunks.append(_chunk_index(content, size))
+            elif op == STATISTICS:
+                counts = _counts(content)
+            else:
+                self._learn(op, content)
+        if not self._chunks or not self.connections:
+            raise DamagedError("its summary names no chunks")
+        self._count(counts)
+
+    def _walk(self, stream: BinaryIO, why: str) -> None:
+        """Learn channels and messages from front to end, as far as records can be followed."""
+        self._chunks, self.connections = [], {}
+        counts: dict[int, int] = {}
+        size = self.path.stat().st_size
+        at = len(MAGIC)
+        while at + 9 <= size:
+            stream.seek(at)
+            op, length = struct.unpack("<BQ", stream.read(9))
+            end = at + 9 + length
+            if op in (FOOTER, DATA_END) or op == 0 or (end > size and op != CHUNK):
+                break
+            if op == CHUNK:
+                chunk = _Chunk(at, min(length, size - at - 9), {})
+                held = self._scan(stream, chunk)
+                self._chunks.append(replace(chunk, indexes=dict.fromkeys(held, 0)))
+                for number, count in held.items():
+                    counts[number] = counts.get(number, 0) + count
+            elif op == MESSAGE and length >= 22:
+                number, _, time = struct.unpack("<HIQ", stream.read(14))
+                self._loose.setdefault(number, []).append((at, end, time))
+                counts[number] = counts.get(number, 0) + 1
+            elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
+                self._learn(op, stream.read(length))
+            at = end
+        self._count(counts)
+        total = sum(counts.values())
+        text = f"{why}; {total} messages salvaged"
+        if at > size:
+            text += ", the last chunk is cut"
+        self.notes.append(Note("warning", "", text, total))
+
+    def _scan(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, int]:
+        """Learn the channels inside a chunk and count their messages."""
+        try:
+            content = self._content(stream, chunk)
+        except DamagedError:
+            return {}
+        counts: dict[int, int] = {}
+        for op, at, end in _records(content):
+            if op == MESSAGE and end - at >= 22:
+                (number,) = struct.unpack_from("<H", content, at)
+                counts[number] = counts.get(number, 0) + 1
+            elif op in (SCHEMA, CHANNEL):
+                self._learn(op, content[at:end])
+        return counts
+
+    def _learn(self, op: int, content: bytes) -> None:
+        """Take in a schema or a channel."""
+        try:
+            if op == SCHEMA:
+                (number,) = struct.unpack_from("<H", content)
+                name, at = _string(content, 2)
+                encoding, at = _string(content, at)
+                text, _ = _string(content, at)
+                form = _FORMATS.get(encoding, MessageDefinitionFormat.NONE)
+                kind = normalize_msgtype(name) if "/" in name else name
+                self._schemas[number] = (kind, MessageDefinition(form, text))
+            elif op == CHANNEL:
+                number, schema = struct.unpack_from("<HH", content)
+                topic, at = _string(content, 4)
+                encoding, _ = _string(content, at)
+                kind, definition = self._schemas.get(
+                    schema, ("", MessageDefinition(MessageDefinitionFormat.NONE, ""))
+                )
+                if encoding in ("cdr", "ros1") and kind:
+                    self.aligned = encoding == "cdr"
+                    self.connections[number] = Connection(number, topic, kind, definition, 0)
+        except (struct.error, ValueError):
+            raise DamagedError("a channel makes no sense") from None
+
+    def _count(self, counts: dict[int, int]) -> None:
+        self.connections = {
+            number: replace(known, count=counts.get(number, 0))
+            for number, known in self.connections.items()
+        }
+
+    def _content(self, stream: BinaryIO, chunk: _Chunk) -> bytes:
+        """Return the unpacked records of a chunk."""
+        compression, position, packed, size = _chunk_header(stream, chunk)
+        stream.seek(position)
+        return unpack(compression, stream.read(packed), size)
+
+    def _locate(
+        self, stream: BinaryIO, chunk: _Chunk, wanted: list[int]
+    ) -> Iterator[tuple[int, Block]]:
+        """Yield the blocks of a chunk, by the indexes behind it or by walking it."""
+        if all(chunk.indexes.values()):
+            entries = {n: _index(stream, at, n) for n, at in chunk.indexes.items()}
+            compression, position, packed, _ = _chunk_header(stream, chunk)
+            kept = {number: entries[number] for number in wanted}
+            if compression or packed < 4 * NEAR:
+                content = np.frombuffer(self._content(stream, chunk), dtype=np.uint8)
+            else:
+                offsets = [entry[1] for entry in entries.values()]
+                bounds = np.unique(np.concatenate([*offsets, [packed]]))
+                starts = np.unique(np.concatenate([entry[1] for entry in kept.values()]))
+                content, moved = read_pieces(stream, position, starts, bounds)
+                kept = {
+                    n: (time, moved[np.searchsorted(starts, at)]) for n, (time, at) in kept.items()
+                }
+            for number, (time, offset) in kept.items():
+                yield number, _block(content, number, time, offset)
+            return
+        raw = self._content(stream, chunk)
+        rows: dict[int, list[tuple[int, int]]] = {number: [] for number in wanted}
+        for op, at, end in _records(raw):
+            if op == MESSAGE and end - at >= 22:
+                number, _, time = struct.unpack_from("<HIQ", raw, at)
+                if number in rows:
+                    rows[number].append((time, at - 9))
+        content = np.frombuffer(raw, dtype=np.uint8)
+        for number, found in rows.items():
+            if found:
+                yield number, _block(content, number, *_columns(found))
+
+    def _loose_blocks(self, stream: BinaryIO, number: int) -> Iterator[tuple[int, Block]]:
+        """Yield messages that lie in no chunk."""
+        loose = np.array(self._loose[number], dtype=np.int64)
+        for rows in np.array_split(loose, max(1, len(loose) // 4096)):
+            starts, ends, time = rows.T
+            content, moved = read_pieces(stream, 0, starts, np.unique([*starts, *ends]))
+            yield number, _block(content, number, time, moved)
+
+
+def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield op, start and end of the content of each record, until one is cut."""
+    at = 0
+    while at + 9 <= len(content):
+        op, length = struct.unpack_from("<BQ", content, at)
+        if at + 9 + length > len(content):
+            return
+        yield op, at + 9, at + 9 + length
+        at += 9 + length
+
+
+def _string(content: bytes, at: int) -> tuple[str, int]:
+    (length,) = struct.unpack_from("<I", content, at)
+    if at + 4 + length > len(content):
+        raise ValueError("a string is cut")
+    return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
+
+
+def _chunk_index(content: bytes, size: int) -> _Chunk:
+    try:
+        _, _, position, length, indexes = struct.unpack_from("<QQQQI", content)
+        pairs = content[36 : 36 + indexes]
+        found = dict(struct.iter_unpack("<HQ", pairs))
+    except struct.error:
+        raise DamagedError("its summary makes no sense") from None
+    if position + length > size or length < 9 or any(at >= size for at in found.values()):
+        raise DamagedError("its summary points nowhere")
+    return _Chunk(position, length - 9, found)
+
+
+def _counts(content: bytes) -> dict[int, int]:
+    if len(content) < 46 or (len(content) - 46) % 10:
+        raise DamagedError("its statistics make no sense")
+    return dict(struct.iter_unpack("<HQ", content[46:]))
+
+
+def _chunk_header(stream: BinaryIO, chunk: _Chunk) -> tuple[str, int, int, int]:
+    """Return a chunk's compression, where its records lie, how long they are, packed and not."""
+    stream.seek(chunk.position + 9)
+    head = stream.read(40 + 16)
+    try:
+        (size,) = struct.unpack_from("<Q", head, 16)
+        compression, at = _string(head, 28)
+        (packed,) = struct.unpack_from("<Q", head, at)
+    except (struct.error, ValueError):
+        raise DamagedError("a chunk makes no sense") from None
+    position = chunk.position + 9 + at + 8
+    packed = min(packed, max(0, chunk.length - at - 8))
+    if packed > LARGEST_CHUNK:
+        raise DamagedError(f"a chunk claims {packed} bytes")
+    return compression, position, packed, size
+
+
+def _index(stream: BinaryIO, position: int, number: int) -> tuple[Index, Index]:
+    """Read the times and offsets of one channel's messages in a chunk."""
+    stream.seek(position)
+    head = stream.read(15)
+    if len(head) != 15:
+        raise DamagedError("an index is missing")
+    op, _, channel, length = struct.unpack("<BQHI", head)
+    if op != INDEX or channel != number or length > LARGEST_CHUNK // 8:
+        raise DamagedError("an index makes no sense")
+    data = stream.read(length)
+    if len(data) != length or length % 16:
+        raise DamagedError("an index is cut")
+    entries = np.frombuffer(data, dtype="<i8").reshape(-1, 2)
+    return entries[:, 0].copy(), entries[:, 1].copy()
+
+
+def _columns(rows: list[tuple[int, int]]) -> tuple[Index, Index]:
+    table = np.array(rows, dtype=np.int64)
+    return table[:, 0], table[:, 1]
+
+
+def _block(content: Bytes, number: int, time: Index, offset: Index) -> Block:
+    """Find the payloads of a channel's messages, whose records begin at some offsets."""
+    inside = (offset >= 0) & (offset + BEFORE_PAYLOAD <= len(content))
+    offset, time = offset[inside], time[inside]
+    end = offset + 9 + u64(content, offset + 1)
+    inside = (content[offset] == MESSAGE) & (u16(content, offset + 9) == number)
+    inside &= (end >= offset + BEFORE_PAYLOAD) & (end <= len(content))
+    return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])

@@ -1,0 +1,148 @@
+"""A ROS recording of any container: topics, and their wanted fields as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.errors import RecordingError
+from tuner.flights import px4
+from tuner.flights.flight import Note
+from tuner.flights.recording import (
+    NANOSECONDS,
+    Clock,
+    Contents,
+    Nanoseconds,
+    Request,
+    Samples,
+    Topic,
+    Usual,
+)
+from tuner.flights.ros.container import Connection, Container
+from tuner.flights.ros.definitions import Definitions
+from tuner.flights.ros.usual import USUAL
+from tuner.flights.ros.wire import UnknownFieldError, Walk, decode, has_field, plan
+
+_SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
+
+#: Messages beyond this, of one topic, are no flight but an attack on the memory.
+MOST_MESSAGES = 50_000_000
+
+
+class RosRecording:
+    """Topics of a ROS container.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    container
+        Its opened container.
+    messages
+        ``.msg`` files for types that the container does not define.
+    """
+
+    format = "ros"
+
+    def __init__(self, path: Path, container: Container, messages: tuple[Path, ...] = ()) -> None:
+        self.path = path
+        self._container = container
+        texts = {c.type: c.definition for c in container.connections.values()}
+        self._definitions = Definitions(path, texts, messages)
+        counts: dict[tuple[str, str], int] = {}
+        for connection in container.connections.values():
+            key = (connection.topic, connection.type)
+            counts[key] = counts.get(key, 0) + connection.count
+        self.topics = tuple(
+            Topic(name, kind, count) for (name, kind), count in sorted(counts.items())
+        )
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        """What of the container could not be read so far."""
+        return tuple(self._container.notes)
+
+    def usual(self, topic: str, signal: str) -> Usual | None:
+        """Return where messages of this topic's type hold a signal."""
+        kind = next((known.type for known in self.topics if known.name == topic), "")
+        if kind.startswith("px4_msgs/"):
+            return px4.USUAL.get(px4.log_name(kind), {}).get(signal)
+        return USUAL.get(kind, {}).get(signal)
+
+    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
+        """Fields are looked up when they are read."""
+        return True
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted fields of some topics."""
+        walks: dict[int, tuple[Walk, Clock | None]] = {}
+        for connection in self._container.connections.values():
+            if connection.topic in wanted and connection.count:
+                walks[connection.id] = self._plan(connection, wanted[connection.topic])
+        parts: dict[str, list[Samples]] = {name: [] for name in wanted}
+        broken: dict[str, int] = dict.fromkeys(wanted, 0)
+        for number, block in self._container.blocks(walks):
+            walk, clock = walks[number]
+            columns, whole = decode(walk, block)
+            topic = self._container.connections[number].topic
+            broken[topic] += int(len(whole) - whole.sum())
+            parts[topic].append(_samples(columns, whole, block.time, clock))
+        notes = [
+            Note("warning", topic, f"{count} messages are cut or damaged and were left out", count)
+            for topic, count in broken.items()
+            if count
+        ]
+        samples = {name: _joined(rows) for name, rows in parts.items() if rows}
+        return Contents(samples, (*self.notes, *notes))
+
+    def _plan(self, connection: Connection, request: Request) -> tuple[Walk, Clock | None]:
+        """Plan how to reach the wanted fields and the time."""
+        kind = connection.type
+        fields = list(request.fields)
+        clock = next(
+            (c for c in request.clocks if has_field(self._definitions, kind, c.field)), None
+        )
+        try:
+            if clock is not None:
+                fields.append(clock.field)
+            elif has_field(self._definitions, kind, _SECONDS):
+                fields += [_SECONDS, _NANOSECONDS]
+            walk = plan(self._definitions, kind, fields, aligned=self._container.aligned)
+        except UnknownFieldError as err:
+            raise RecordingError(
+                self.path, f"{connection.topic}: {err}", "correct the topic map"
+            ) from None
+        return walk, clock
+
+
+def _samples(
+    columns: dict[str, NDArray[Any]],
+    whole: NDArray[np.bool_],
+    receive: Nanoseconds,
+    clock: Clock | None,
+) -> Samples:
+    kept = {name: values[whole] for name, values in columns.items()}
+    stamp = None
+    if clock is not None:
+        stamp = kept.pop(clock.field).astype(np.int64) * NANOSECONDS[clock.unit]
+    elif _SECONDS in kept:
+        seconds = kept.pop(_SECONDS).astype(np.int64)
+        stamp = seconds * 1_000_000_000 + kept.pop(_NANOSECONDS).astype(np.int64)
+    return Samples(
+        receive[whole],
+        stamp,
+        {name: values.astype(np.float64) for name, values in kept.items()},
+    )
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    stamps = [part.stamp for part in parts if part.stamp is not None]
+    return Samples(
+        np.concatenate([part.receive for part in parts]),
+        np.concatenate(stamps) if len(stamps) == len(parts) else None,
+        {name: np.concatenate([part.fields[name] for part in parts]) for name in parts[0].fields},
+    )

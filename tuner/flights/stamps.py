@@ -1,0 +1,109 @@
+"""Which time to believe: what a message says, or when it was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from itertools import pairwise
+
+import numpy as np
+
+from tuner.flights.flight import Note
+from tuner.flights.recording import Nanoseconds, Samples
+
+SECOND = 1_000_000_000
+#: A stamp that leaves its neighbours by more than this, while its arrival does not, has jumped.
+JUMP = SECOND // 10
+#: Topics whose stamps differ by more than this from the others' are on a clock of their own.
+APART = SECOND // 2
+
+
+def believe(
+    samples: Mapping[str, Samples], receive_only: Collection[str] = ()
+) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:
+    """Return the times of every topic's messages, all on one clock.
+
+    Header stamps are when something was measured; the time of recording is later by a varying
+    delay. So stamps are used, once single wrong ones and jumps of a clock that was set while it
+    ran are repaired by the times of recording. A topic stamped by a clock that is not the others'
+    is moved onto theirs, as far as the times of recording tell.
+
+    Parameters
+    ----------
+    samples
+        Topic -> messages.
+    receive_only
+        Topics whose stamps are not to be used.
+    """
+    notes: list[Note] = []
+    times: dict[str, Nanoseconds] = {}
+    offsets: dict[str, int] = {}
+    for topic, of in samples.items():
+        if of.stamp is None or topic in receive_only or not len(of.stamp):
+            continue
+        stamp, repaired = _repair(topic, of.stamp, of.receive)
+        notes.extend(repaired)
+        times[topic] = stamp
+        offsets[topic] = int(np.median(stamp - of.receive))
+    common = int(np.median(list(offsets.values()))) if offsets else 0
+    for topic, offset in offsets.items():
+        if abs(offset - common) > APART:
+            times[topic] = times[topic] - (offset - common)
+            text = f"stamped by another clock, {(offset - common) / SECOND:.3f} s off: moved"
+            notes.append(Note("warning", topic, text, len(times[topic])))
+    for topic, of in samples.items():
+        if topic not in times:
+            # Where all stamps count from a start-up, arrivals are moved to count from there too.
+            times[topic] = of.receive + (common if abs(common) > SECOND else 0)
+            if topic not in receive_only:
+                text = "has no header: its times are those of recording"
+                notes.append(Note("info", topic, text, len(of.receive)))
+    return times, tuple(notes)
+
+
+def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanoseconds, list[Note]]:
+    """Undo jumps of a stamp that the time of recording did not make."""
+    if len(stamp) < 3:
+        return stamp, []
+    step, arrival = np.diff(stamp), np.diff(receive)
+    usual = int(np.median(step))
+    extra = step - arrival
+    # A recorder that stalls delays arrivals while stamps go on as usual: that is no jump.
+    jumped = np.flatnonzero((np.abs(extra) > JUMP) & (np.abs(step - usual) > JUMP))
+    if len(jumped) == 0:
+        return stamp, []
+    fixed = stamp.copy()
+    notes = []
+    wrong = 0
+    steps = []
+    i = 0
+    while i < len(jumped):
+        here = int(jumped[i])
+        back = int(jumped[i + 1]) if i + 1 < len(jumped) else -1
+        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < JUMP:
+            rows = np.arange(here + 1, back + 1)
+            fixed[rows] = receive[rows] + (stamp[here] - receive[here])
+            wrong += len(rows)
+            i += 2
+        elif here == 0 or here == len(step) - 1:
+            row = 0 if here == 0 else len(stamp) - 1
+            near = 1 if here == 0 else len(stamp) - 2
+            fixed[row] = receive[row] + (stamp[near] - receive[near])
+            wrong += 1
+            i += 1
+        else:
+            steps.append(here)
+            i += 1
+    if wrong:
+        text = f"{wrong} stamps far from their neighbours replaced by the time of recording"
+        notes.append(Note("warning", topic, text, wrong))
+    if steps:
+        bounds = [0, *(at + 1 for at in steps), len(stamp)]
+        parts = list(pairwise(bounds))
+        level = [int(np.median(fixed[a:b] - receive[a:b])) for a, b in parts]
+        longest = max(range(len(parts)), key=lambda k: parts[k][1] - parts[k][0])
+        for (a, b), own in zip(parts, level, strict=True):
+            fixed[a:b] -= own - level[longest]
+        largest = max(abs(own - level[longest]) for own in level) / SECOND
+        text = f"its clock jumped {len(steps)} times, by up to {largest:.3f} s: joined again"
+        notes.append(Note("warning", topic, text, len(steps)))
+    return fixed, notes

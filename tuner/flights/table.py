@@ -1,0 +1,229 @@
+"""Tables: CSV and Parquet, one row a time, one column a number."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tuner.errors import RecordingError
+from tuner.flights.flight import Array, Note
+from tuner.flights.recording import (
+    NANOSECONDS,
+    Clock,
+    Contents,
+    Nanoseconds,
+    Request,
+    Samples,
+    Topic,
+    Usual,
+)
+
+if TYPE_CHECKING:
+    import pyarrow
+
+#: The one topic of a table.
+ROWS = ""
+#: A longer line, in bytes, is no row of a table.
+LONGEST_LINE = 1 << 20
+#: Tables with more columns or cells are no flight.
+MOST_COLUMNS = 10_000
+MOST_CELLS = 500_000_000
+
+
+class Table:
+    """A CSV or Parquet file with a line of column names.
+
+    Raises
+    ------
+    RecordingError
+        It is no table.
+    """
+
+    format = "table"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._skipped = 0
+        with path.open("rb") as stream:
+            self._parquet = stream.read(4) == b"PAR1"
+        self.columns = self._parquet_columns() if self._parquet else self._csv_columns()
+        if len(set(self.columns)) < 2 or len(self.columns) > MOST_COLUMNS:
+            raise RecordingError(
+                path,
+                f"{len(self.columns)} columns are no table of a flight",
+                "check its first line",
+            )
+        self.topics = (Topic(ROWS, "table", 1),)
+
+    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
+        """Columns have no usual names."""
+        return None
+
+    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
+        """Tell whether some of the wanted columns are there."""
+        return not set(fields).isdisjoint(self.columns)
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted columns."""
+        if ROWS not in wanted:
+            return Contents({})
+        request = wanted[ROWS]
+        clock = next((c for c in request.clocks if c.field in self.columns), None)
+        if clock is None:
+            raise RecordingError(
+                self.path,
+                f"no time column among {', '.join(self.columns[:8])}, ...",
+                "name it under 'time' in the topic map",
+            )
+        for name in request.fields:
+            if name not in self.columns:
+                near = difflib.get_close_matches(name, self.columns, n=1)
+                hint = f"did you mean '{near[0]}'" if near else "correct the topic map"
+                raise RecordingError(self.path, f"no column '{name}'", hint)
+        names = list(dict.fromkeys([clock.field, *request.fields]))
+        table = self._read(names)
+        time = _nanoseconds(table.column(clock.field), clock)
+        fields = {name: _numbers(table.column(name)) for name in request.fields}
+        notes = []
+        if self._skipped:
+            text = f"{self._skipped} lines with too few or too many cells left out"
+            notes.append(Note("warning", ROWS, text, self._skipped))
+        kept = time != _NEVER
+        if not kept.all():
+            lost = int((~kept).sum())
+            notes.append(Note("warning", ROWS, f"{lost} rows without a time left out", lost))
+        fields = {name: values[kept] for name, values in fields.items()}
+        return Contents({ROWS: Samples(time[kept], time[kept], fields)}, tuple(notes))
+
+    def _csv_columns(self) -> list[str]:
+        with self.path.open("rb") as stream:
+            self._before = 0
+            line = stream.readline(LONGEST_LINE)
+            while line.startswith(b"#") and self._before < 1000:
+                self._before += 1
+                line = stream.readline(LONGEST_LINE)
+        text = line.decode(errors="replace").lstrip("\ufeff").rstrip("\r\n")
+        self._separator = max(",;\t", key=text.count)
+        return [name.strip().strip('"') for name in text.split(self._separator)]
+
+    def _parquet_columns(self) -> list[str]:
+        from pyarrow import ArrowException, parquet  # noqa: PLC0415 (a third of a second)
+
+        try:
+            with parquet.ParquetFile(self.path) as file:
+                about = file.metadata
+                if about.num_rows * about.num_columns > MOST_CELLS:
+                    raise RecordingError(self.path, "claims an absurd size", "check it")
+                return list(file.schema_arrow.names)
+        except (ArrowException, OSError, ValueError) as err:
+            raise RecordingError(self.path, _said(err), "write it again") from None
+
+    def _read(self, names: list[str]) -> pyarrow.Table:
+        try:
+            if self._parquet:
+                from pyarrow import parquet  # noqa: PLC0415
+
+                return parquet.read_table(self.path, columns=names, memory_map=False)
+            return self._read_csv(names)
+        except MemoryError:
+            raise RecordingError(self.path, "claims an absurd size", "check it") from None
+        except Exception as err:  # whatever a hostile table makes of the library
+            raise RecordingError(self.path, _said(err), "write it again") from None
+
+    def _read_csv(self, names: list[str]) -> pyarrow.Table:
+        import pyarrow  # noqa: PLC0415
+        from pyarrow import csv  # noqa: PLC0415
+
+        def skip(_: object) -> str:
+            self._skipped += 1
+            return "skip"
+
+        self._skipped = 0
+        return csv.read_csv(
+            self.path,
+            read_options=csv.ReadOptions(
+                use_threads=False,
+                block_size=4 * LONGEST_LINE,
+                skip_rows=self._before + 1,
+                column_names=self.columns,
+                encoding="latin-1",
+            ),
+            parse_options=csv.ParseOptions(
+                delimiter=self._separator, invalid_row_handler=skip, newlines_in_values=False
+            ),
+            # As text first: a stray word must not cost a column, nor a float a time's last digits.
+            convert_options=csv.ConvertOptions(
+                include_columns=names,
+                column_types=dict.fromkeys(names, pyarrow.string()),
+                strings_can_be_null=False,
+            ),
+        )
+
+
+#: Stands for a row without a time.
+_NEVER = np.iinfo(np.int64).min
+
+
+def _said(err: Exception) -> str:
+    return f"is no readable table ({' '.join(str(err).split())[:120]})"
+
+
+def _numbers(column: pyarrow.ChunkedArray) -> Array:
+    """Return a column as floats, NaN where a cell holds no number."""
+    from pyarrow import ArrowInvalid, ArrowNotImplementedError, compute, float64  # noqa: PLC0415
+
+    try:
+        if _is_text(column):
+            blank = compute.equal(column, "")
+            column = compute.if_else(blank, "nan", column)
+        numbers = compute.cast(column, float64())
+        return np.asarray(numbers.to_numpy(), dtype=np.float64)
+    except (ArrowInvalid, ArrowNotImplementedError):
+        return np.array([_number(cell) for cell in column.to_pylist()], dtype=np.float64)
+
+
+def _number(cell: object) -> float:
+    try:
+        return float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+def _is_text(column: pyarrow.ChunkedArray) -> bool:
+    from pyarrow import types  # noqa: PLC0415
+
+    return bool(types.is_string(column.type))
+
+
+def _nanoseconds(column: pyarrow.ChunkedArray, clock: Clock) -> Nanoseconds:
+    """Return a time column in whole ns, with every digit that a text holds."""
+    from pyarrow import ArrowInvalid, compute, int64, types  # noqa: PLC0415
+
+    unit = NANOSECONDS[clock.unit]
+    if types.is_integer(column.type):
+        return np.asarray(column.to_numpy(), dtype=np.int64) * unit
+    if types.is_timestamp(column.type):
+        whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
+        return np.asarray(compute.fill_null(whole, _NEVER).to_numpy(), dtype=np.int64)
+    seconds = _numbers(column)
+    known = np.isfinite(seconds) & (np.abs(seconds) < 9e18 / unit)
+    result = np.full(len(seconds), _NEVER, dtype=np.int64)
+    result[known] = np.rint(seconds[known] * unit)
+    if _is_text(column) and known.any() and np.abs(seconds[known]).max() > 1e6:
+        # A float has some 16 digits, too few for nanoseconds since 1970.
+        try:
+            parts = compute.split_pattern(column.combine_chunks(), ".", max_splits=1)
+            whole = compute.list_element(parts, 0)
+            start = np.asarray(compute.cast(whole, int64()).to_numpy(zero_copy_only=False))
+        except ArrowInvalid:
+            return result
+        rest = np.zeros(len(seconds))
+        for i, text in enumerate(column.to_pylist()):
+            rest[i] = _number(f"0.{text.partition('.')[2]}") if "." in text else 0.0
+        exact = known & np.isfinite(rest) & (start >= 0)
+        result[exact] = start[exact] * unit + np.rint(rest[exact] * unit).astype(np.int64)
+    return result

@@ -1,0 +1,174 @@
+"""PX4 ULog files: the wanted messages, in PX4's own frames until the topic map turns them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tuner.errors import RecordingError
+from tuner.flights.flight import Note
+from tuner.flights.px4 import USUAL
+from tuner.flights.recording import NANOSECONDS, Clock, Contents, Request, Samples, Topic, Usual
+
+#: A ULog message cannot be longer; a format that claims so is no honest one.
+LONGEST_MESSAGE = 65_535
+#: Logs are read into memory; PX4 writes some 10 MB a minute.
+LARGEST = 4 << 30
+
+
+class ULogRecording:
+    """A PX4 log.
+
+    A further instance of a message is the topic ``name[1]``.
+
+    Raises
+    ------
+    RecordingError
+        The file is no readable log.
+    """
+
+    format = "ulog"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if path.stat().st_size > LARGEST:
+            raise RecordingError(path, "is larger than any log of a flight", "cut it")
+        self._formats, self._data_start = _formats(path)
+        counts, ids = _count(path, self._data_start)
+        self.topics = tuple(
+            sorted(
+                (Topic(name, ids[number], count) for number, (name, count) in counts.items()),
+                key=lambda topic: topic.name,
+            )
+        )
+
+    def usual(self, topic: str, signal: str) -> Usual | None:
+        """Return where a message holds a signal."""
+        return USUAL.get(topic.partition("[")[0], {}).get(signal)
+
+    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
+        """Fields are looked up when they are read."""
+        return True
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted fields of some messages."""
+        names = sorted({topic.partition("[")[0] for topic in wanted})
+        log, said = _parse(self.path, names)
+        samples = {}
+        for data in log.data_list:
+            topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
+            if topic in wanted:
+                samples[topic] = self._samples(topic, data.data, wanted[topic])
+        notes = []
+        if log.dropouts:
+            lost = sum(dropout.duration for dropout in log.dropouts)
+            text = f"the logger dropped messages {len(log.dropouts)} times, {lost} ms in all"
+            notes.append(Note("warning", "", text, len(log.dropouts)))
+        if log.file_corruption or said:
+            notes.append(Note("warning", "", "parts of the log are damaged and were left out", 1))
+        return Contents(samples, tuple(notes))
+
+    def _samples(self, topic: str, data: Mapping[str, Any], request: Request) -> Samples:
+        if "timestamp" not in data:
+            raise RecordingError(self.path, f"{topic} has no timestamp", "leave it out of the map")
+        receive = data["timestamp"].astype(np.int64) * NANOSECONDS["us"]
+        clocks = (*request.clocks, Clock("timestamp_sample", "us"))
+        stamp = receive
+        for clock in clocks:
+            if clock.field in data:
+                own = data[clock.field].astype(np.int64) * NANOSECONDS[clock.unit]
+                stamp = np.where(own > 0, own, receive)
+                break
+        missing = [name for name in request.fields if name not in data]
+        if missing:
+            raise RecordingError(
+                self.path,
+                f"{topic} has no field '{missing[0]}', it has {', '.join(list(data)[:12])}",
+                "correct the topic map",
+            )
+        fields = {name: data[name].astype(np.float64) for name in request.fields}
+        return Samples(receive, stamp, fields)
+
+
+def _records(path: Path, at: int) -> Iterator[tuple[int, int, bytes, int]]:
+    """Yield type, length, first bytes and position of the messages of a log, until one is cut."""
+    size = path.stat().st_size
+    with path.open("rb", buffering=1 << 20) as stream:
+        stream.seek(at)
+        while len(head := stream.read(3)) == 3:
+            length, kind = struct.unpack("<HB", head)
+            content = stream.read(length)
+            if len(content) < length:
+                return
+            yield kind, length, content, min(at, size)
+            at += 3 + length
+
+
+def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
+    """Return the fields of each message format, and where the data begin; check their size."""
+    with path.open("rb") as stream:
+        if len(head := stream.read(16)) < 16 or head[:7] != b"ULog\x01\x12\x35":
+            raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
+    formats: dict[str, list[tuple[str, int, str]]] = {}
+    start = 16
+    for kind, _, content, at in _records(path, 16):
+        start = at
+        if kind == ord("F"):
+            name, _, fields = content.decode(errors="replace").partition(":")
+            found = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
+            formats[name] = [(what, int(count or 1), field) for what, count, field in found]
+        elif kind in (ord("A"), ord("L"), ord("C"), ord("D")):
+            break
+    for name in formats:
+        if _size(formats, name, 0) > LONGEST_MESSAGE:
+            raise RecordingError(path, f"the format of {name} is absurd", "record it again")
+    return formats, start
+
+
+def _size(formats: Mapping[str, list[tuple[str, int, str]]], name: str, depth: int) -> int:
+    """Return the numbers in a format, at most a little more than a message can hold."""
+    if depth > 8:
+        return LONGEST_MESSAGE + 1
+    total = 0
+    for what, count, _ in formats[name]:
+        inner = _size(formats, what, depth + 1) if what in formats else 1
+        total += max(1, inner) * count
+        if total > LONGEST_MESSAGE:
+            break
+    return total
+
+
+def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int, str]]:
+    """Count the messages of each subscription."""
+    names: dict[int, str] = {}
+    kinds: dict[int, str] = {}
+    counts: dict[int, int] = {}
+    for kind, length, content, _ in _records(path, start):
+        if kind == ord("D") and length >= 2:
+            number = content[0] | content[1] << 8
+            counts[number] = counts.get(number, 0) + 1
+        elif kind == ord("A") and length >= 4:
+            instance, number = struct.unpack_from("<BH", content)
+            kinds[number] = content[3:].decode(errors="replace")
+            names[number] = kinds[number] if instance == 0 else f"{kinds[number]}[{instance}]"
+    return {number: (name, counts.get(number, 0)) for number, name in names.items()}, kinds
+
+
+def _parse(path: Path, names: list[str]) -> tuple[Any, str]:
+    """Parse a log with pyulog, which prints what it finds wrong."""
+    from pyulog import ULog  # noqa: PLC0415 (slow to import)
+
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            return ULog(str(path), names), printed.getvalue()
+    except Exception as err:  # pyulog's own and whatever a hostile log makes of it
+        said = " ".join(str(err).split())[:120]
+        raise RecordingError(path, f"is no readable PX4 log ({said})", "record it again") from None
