@@ -46,6 +46,8 @@ class RateGains(eqx.Module):
     ff: Vec3
     k: Vec3
     integrator_limit: Vec3
+    saturation_feedback: Scalar
+    """1: the mixer's saturation stops the integral, as in PX4; 0: it does not; between: a share."""
 
 
 class Filters(eqx.Module):

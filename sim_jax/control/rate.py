@@ -54,10 +54,11 @@ def _integrate(
     limit: Scalar,
     positive: Flag,
     negative: Flag,
+    feedback: Scalar,
     step: float,
 ) -> Scalar:
-    error = jnp.where(positive & (error > 0), 0.0, error)
-    error = jnp.where(negative & (error < 0), 0.0, error)
+    stopped = (positive & (error > 0)) | (negative & (error < 0))
+    error = jnp.where(stopped, (1.0 - feedback) * error, error)
     share = error / INTEGRAL_FADE
     fade = 1.0 - share * share
     fade = jnp.where(fade < 0, 0.0, fade)
@@ -76,7 +77,8 @@ def next_integral(
     """Return the integrator after one step of ``step`` seconds.
 
     The error counts less the larger it is, nothing above 400°/s, and not at all in a direction in
-    which the mixer reports saturation; the state is clamped to ±integrator_limit.
+    which the mixer reports saturation (unless that feedback is off); the state is clamped to
+    ±integrator_limit.
     """
     error = setpoint - rate
     gain = gains.k.scaled_by(gains.i)
@@ -90,7 +92,16 @@ def next_integral(
         strict=True,
     )
     x, y, z = (
-        _integrate(e, i, gain=g, limit=m, positive=p, negative=n, step=step)
+        _integrate(
+            e,
+            i,
+            gain=g,
+            limit=m,
+            positive=p,
+            negative=n,
+            feedback=gains.saturation_feedback,
+            step=step,
+        )
         for e, i, g, m, p, n in axes
     )
     return Vec3(x, y, z)

@@ -133,11 +133,14 @@ class Mixer(Section):
         ``THR_MDL_FAC``.
     pwm_quantisation
         Truncate the output to whole microseconds of PWM, as PX4 does; stops gradients.
+    saturation_feedback
+        The rate integrator stops in a direction in which rotors are clipped low, as in PX4.
     """
 
     airmode: Literal[0, 1, 2] = 0
     thrust_factor: Annotated[Number, Interval(ge=0, le=1)] = 0.0
     pwm_quantisation: Flag = False
+    saturation_feedback: Flag = True
 
 
 class Physics(Section):

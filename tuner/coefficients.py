@@ -1,0 +1,253 @@
+"""Which coefficients are free, how far they may go, and the vector that the search moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, nn
+from numpy.typing import NDArray
+
+from tuner.config import COEFFICIENTS, JobFile, VehicleFile, values_of
+from tuner.errors import ConfigError
+from tuner.model import LONGEST_ACTUATOR_LATENCY, LONGEST_ESTIMATE_LATENCY
+
+
+@dataclass(frozen=True)
+class Habit:
+    """How a coefficient is searched unless the job says otherwise.
+
+    Attributes
+    ----------
+    free
+        Whether it is fitted by default.
+    scale
+        ``log`` moves the logarithm, ``linear`` the number.
+    reach
+        Bounds: a factor either side of the start for ``log``, absolute limits for ``linear``.
+    sd
+        Of the weak default prior around the start: of the logarithm for ``log``, else in its unit.
+    unit_step
+        A step of one in the search's coordinate, in the scaled coordinate, mid-range.
+    """
+
+    free: bool
+    scale: Literal["log", "linear"]
+    reach: float | tuple[float, float]
+    sd: float
+    unit_step: float = 1.0
+
+
+HABITS: Mapping[str, Habit] = {
+    "mass": Habit(False, "log", 3.0, 0.3),
+    "inertia_xx": Habit(True, "log", 8.0, 0.5),
+    "inertia_yy": Habit(True, "log", 8.0, 0.5),
+    "inertia_zz": Habit(True, "log", 8.0, 0.5),
+    "input_scaling": Habit(True, "log", 4.0, 0.1),
+    "zero_position_armed": Habit(True, "log", 8.0, 0.5),
+    "input_offset": Habit(False, "linear", (-0.5, 0.5), 0.05, 0.1),
+    "quadratic": Habit(False, "linear", (-1000.0, 1000.0), 200.0, 100.0),
+    "time_constant_up": Habit(True, "log", 20.0, 0.7),
+    "time_constant_down": Habit(True, "log", 20.0, 0.7),
+    "motor_constant": Habit(True, "log", 8.0, 0.5),
+    "moment_constant": Habit(True, "log", 12.0, 0.7),
+    "rotor_drag_coefficient": Habit(True, "log", 40.0, 1.5),
+    "rolling_moment_coefficient": Habit(False, "log", 1000.0, 2.0),
+    "max_relative_airspeed": Habit(False, "log", 10.0, 1.0),
+    "estimate_latency": Habit(True, "linear", (0.0, LONGEST_ESTIMATE_LATENCY), 0.02, 0.01),
+    "actuator_latency": Habit(True, "linear", (0.0, LONGEST_ACTUATOR_LATENCY), 0.005, 0.01),
+    "gyro_cutoff": Habit(False, "log", 4.0, 0.5),
+}
+
+OFF_BOUND = 0.05
+"""A start on a bound is moved inside by this share of the range."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One coordinate of the search: a coefficient, or several that are tied to it.
+
+    Attributes
+    ----------
+    name
+        The coefficient; for a tie, the first of the group.
+    ratios
+        Coefficient -> multiple of this parameter's value (1 for itself).
+    initial, lower, upper
+        In the coefficient's unit; the initial value is strictly inside.
+    scale
+        ``log`` or ``linear``.
+    prior_mean, prior_sd
+        In the scaled coordinate (logarithm or number).
+    prior_given
+        Whether the user gave the prior, or it is the weak default that only steadies the search.
+    unit_step
+        See `Habit`.
+    moved
+        Set where the start lay on or outside a bound and was moved: the value that it had.
+    """
+
+    name: str
+    ratios: Mapping[str, float]
+    initial: float
+    lower: float
+    upper: float
+    scale: Literal["log", "linear"]
+    prior_mean: float
+    prior_sd: float
+    prior_given: bool
+    unit_step: float
+    moved: float | None = None
+
+    def scaled(self, value: float) -> float:
+        """Return the scaled coordinate of a value."""
+        return float(np.log(value)) if self.scale == "log" else value
+
+
+class Space:
+    """The free coefficients and the map between them and an unbounded vector.
+
+    The scaled coordinate x (logarithm or number) of each parameter lies between its bounds by a
+    logistic map of the search's z, so that no step can leave them.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter], fixed: Mapping[str, float]) -> None:
+        self.parameters = tuple(parameters)
+        self.fixed = dict(fixed)
+        self.names = tuple(parameter.name for parameter in self.parameters)
+        self._lower = np.array([p.scaled(p.lower) for p in self.parameters])
+        self._range = np.array([p.scaled(p.upper) for p in self.parameters]) - self._lower
+        self._stretch = self._range / 4.0 / np.array([p.unit_step for p in self.parameters])
+        self._is_log = np.array([p.scale == "log" for p in self.parameters])
+        self.prior_mean = np.array([p.prior_mean for p in self.parameters])
+        self.prior_sd = np.array([p.prior_sd for p in self.parameters])
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def initial(self) -> NDArray[np.float64]:
+        """The start as a search vector, shape (K,)."""
+        return self.vector_of({p.name: p.initial for p in self.parameters})
+
+    def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
+        scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
+        share = np.clip((scaled - self._lower) / self._range, 1e-6, 1 - 1e-6)
+        return np.asarray(np.log(share / (1 - share)) * self._stretch)
+
+    def scaled(self, vector: Array) -> Array:
+        """Return the scaled coordinates (K,) of a search vector; traceable."""
+        return self._lower + self._range * nn.sigmoid(vector / self._stretch)
+
+    def values(self, vector: Array) -> dict[str, Array]:
+        """Return every free coefficient's value, tied ones too; traceable."""
+        scaled = self.scaled(vector)
+        numbers = jnp.where(self._is_log, jnp.exp(jnp.where(self._is_log, scaled, 0.0)), scaled)
+        return {
+            name: numbers[index] * ratio
+            for index, parameter in enumerate(self.parameters)
+            for name, ratio in parameter.ratios.items()
+        }
+
+    def from_scaled(self, index: int, scaled: float) -> float:
+        """Return a parameter's value from its scaled coordinate."""
+        return float(np.exp(scaled)) if self._is_log[index] else float(scaled)
+
+    def slope(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
+        share = 1.0 / (1.0 + np.exp(-vector / self._stretch))
+        return np.asarray(self._range * share * (1 - share) / self._stretch)
+
+
+def space_of(vehicle: VehicleFile, job: JobFile) -> Space:
+    """Return what a job fits.
+
+    Raises
+    ------
+    ConfigError
+        Nothing is free, bounds exclude or pin the start, or a tie names a fixed coefficient.
+    """
+    values = values_of(vehicle)
+    values.setdefault("gyro_cutoff", 40.0)
+    free = _free_names(job)
+    groups = {name: (name,) for name in free}
+    for group in job.ties:
+        tied = [name for name in group if name in free]
+        if not tied:
+            continue
+        if len(tied) < len(group):
+            missing = next(name for name in group if name not in free)
+            raise ConfigError(
+                "ties", f"'{missing}' is tied to a free coefficient but fixed", "free it"
+            )
+        for name in group[1:]:
+            groups.pop(name)
+        groups[group[0]] = tuple(group)
+    parameters = [_parameter(names, values, job) for names in groups.values()]
+    return Space(parameters, {n: v for n, v in values.items() if n not in free})
+
+
+def _free_names(job: JobFile) -> tuple[str, ...]:
+    if job.free is not None:
+        return tuple(name for name in COEFFICIENTS if name in job.free)
+    free = tuple(name for name, habit in HABITS.items() if habit.free and name not in job.fixed)
+    if not free:
+        raise ConfigError("fixed", "leaves no coefficient free", "free at least one")
+    return free
+
+
+def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:
+    name = names[0]
+    habit, said, start = HABITS[name], job.coefficients.get(name), values[name]
+    scale = said.scale if said is not None and said.scale is not None else habit.scale
+    lower, upper = _default_bounds(habit, scale, start, name)
+    lower = said.lower if said is not None and said.lower is not None else lower
+    upper = said.upper if said is not None and said.upper is not None else upper
+    if scale == "log" and lower <= 0:
+        raise ConfigError(name, f"lower bound {lower:g} has no logarithm", "use scale: linear")
+    if lower >= upper:
+        raise ConfigError(name, f"bounds {lower:g} to {upper:g} leave no room", "widen them")
+
+    def scaled(value: float) -> float:
+        return float(np.log(value)) if scale == "log" else value
+
+    moved, initial = None, start
+    room = OFF_BOUND * (scaled(upper) - scaled(lower))
+    inner = float(np.clip(scaled(max(start, 1e-300)), scaled(lower) + room, scaled(upper) - room))
+    if not lower * (1 + 1e-9) < start < upper * (1 - 1e-9):
+        moved, initial = start, float(np.exp(inner)) if scale == "log" else inner
+    mean, sd, given = scaled(initial), habit.sd, False
+    if scale != habit.scale:
+        sd = habit.sd * (1.0 / abs(initial) if scale == "log" else abs(initial))
+    if said is not None and said.prior is not None:
+        mean = scaled(said.prior.mean)
+        sd = said.prior.sd / said.prior.mean if scale == "log" else said.prior.sd
+        given = True
+    unit = habit.unit_step if scale == habit.scale else (upper - lower) / 4
+    return Parameter(
+        name=name,
+        ratios={other: values[other] / start if start else 1.0 for other in names},
+        initial=initial,
+        lower=lower,
+        upper=upper,
+        scale=scale,
+        prior_mean=mean,
+        prior_sd=sd,
+        prior_given=given,
+        unit_step=unit,
+        moved=moved,
+    )
+
+
+def _default_bounds(habit: Habit, scale: str, start: float, name: str) -> tuple[float, float]:
+    if isinstance(habit.reach, tuple):
+        return habit.reach
+    if start <= 0:
+        raise ConfigError(
+            name, f"starts at {start:g}, which has no logarithm", "give bounds and scale: linear"
+        )
+    return (start / habit.reach, start * habit.reach)

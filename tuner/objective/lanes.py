@@ -1,0 +1,229 @@
+"""Flights as arrays of one shape: what is flown, what was measured, and how much it weighs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from sim_jax.control.position import ReferencePoint
+from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.state import Start
+from sim_jax.vector import Vec3
+from tuner.errors import RecordingError
+from tuner.flights.flight import Flight, InitialState
+from tuner.objective.noise import CHANNELS, channel_noise
+
+#: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
+CLOCKS = ("pose", "flight_controller")
+_CLOCK_OF = {
+    "position": 0,
+    "attitude": 0,
+    "body_rate": 1,
+    "rotor_speed": 1,
+    "command": 1,
+}
+
+#: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
+REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
+
+
+class Measured(eqx.Module):
+    """One channel of every lane, padded to one length.
+
+    Attributes
+    ----------
+    time
+        (n, F) s since the lane's start.
+    values
+        (n, c, F); attitude has four columns.
+    weight
+        (n, c, F) one over the standard deviation, zero where nothing was measured; attitude has
+        three columns, in 1/rad.
+    """
+
+    time: Float[Array, "n F"]
+    values: Float[Array, "n c F"]
+    weight: Float[Array, "n k F"]
+
+
+class Lanes(eqx.Module):
+    """Everything of the data that a fit needs; lanes lie along the last axis.
+
+    A lane is a flight, or a window of one.
+    """
+
+    inlet: Inlet
+    start: Start
+    measured: dict[str, Measured]
+    flight: Int[Array, " F"]
+    """Number of the flight that a lane belongs to."""
+
+    @property
+    def count(self) -> int:
+        """How many lanes there are."""
+        return self.flight.shape[0]
+
+
+def lanes_of(
+    flights: Sequence[Flight],
+    *,
+    noise: Mapping[str, float],
+    weights: Mapping[str, Mapping[str, float]] | None = None,
+) -> Lanes:
+    """Lay flights side by side for the ``reference`` inlet.
+
+    Parameters
+    ----------
+    flights
+        F flights with a recorded or named reference.
+    noise
+        Channel -> standard deviation in its unit (attitude: rad). Channels not named are left out.
+    weights
+        Flight name -> channel -> factor on the residuals.
+
+    Raises
+    ------
+    RecordingError
+        A flight holds no reference.
+    """
+    for flight in flights:
+        if not flight.has("reference_position"):
+            raise RecordingError(
+                flight.path,
+                "holds no reference and none is named",
+                "name its trajectory in the job file, or fit through another inlet",
+            )
+    length = max(len(flight.time) for flight in flights)
+    columns = [_reference(flight, length) for flight in flights]
+    position, velocity, acceleration = (
+        Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
+    )
+    spins = [flight.yaw_rate_setpoint for flight in flights]
+    return Lanes(
+        inlet=ReferenceInlet(
+            ReferencePoint(position, velocity, acceleration),
+            spins=jnp.asarray([spin is not None for spin in spins]),
+            yaw_rate=jnp.asarray([spin or 0.0 for spin in spins]),
+        ),
+        start=start_of([flight.initial for flight in flights]),
+        measured={
+            channel: _measured(flights, channel, sigma, weights or {})
+            for channel, sigma in noise.items()
+        },
+        flight=jnp.arange(len(flights)),
+    )
+
+
+def noise_of(flights: Sequence[Flight], channels: Sequence[str] = CHANNELS) -> dict[str, float]:
+    """Return the measurement noise of every channel that some flight recorded."""
+    recorded = [c for c in channels if any(flight.has(c) for flight in flights)]
+    return {channel: channel_noise(list(flights), channel) for channel in recorded}
+
+
+def start_of(initial: Sequence[InitialState]) -> Start:
+    """Return the starts of F lanes; a hover starts at rest and level, heading as recorded.
+
+    Rotors that were not measured turn as fast as those that were; the rate integrator holds what
+    the recorded commands differ by.
+    """
+    rows = [_start(one) for one in initial]
+    stacked = {key: jnp.asarray(np.stack([row[key] for row in rows], axis=-1)) for key in rows[0]}
+    speed, command = stacked["rotor_speed"], stacked["command"]
+    return Start(
+        motion=Motion(
+            Vec3.of(stacked["position"]),
+            Vec3.of(stacked["velocity"]),
+            Quaternion.of(stacked["attitude"]),
+            Vec3.of(stacked["body_rate"]),
+        ),
+        rotor_speed=(speed[0], speed[1], speed[2], speed[3]),
+        command=(command[0], command[1], command[2], command[3]),
+        rate_integral=Vec3.of(stacked["integral"]),
+    )
+
+
+def _start(initial: InitialState) -> dict[str, NDArray[np.float64]]:
+    attitude, velocity, rate = initial.attitude, initial.velocity, initial.body_rate
+    tilt = 2.0 * np.hypot(attitude[1], attitude[2])
+    resting = (
+        np.linalg.norm(velocity) < REST_SPEED
+        and np.linalg.norm(rate) < REST_RATE
+        and tilt < REST_TILT
+    )
+    if resting:
+        heading = np.array([attitude[0], 0.0, 0.0, attitude[3]])
+        attitude, velocity, rate = heading / np.linalg.norm(heading), np.zeros(3), np.zeros(3)
+    known = initial.rotor_speed[np.isfinite(initial.rotor_speed)]
+    speed = np.where(
+        np.isfinite(initial.rotor_speed), initial.rotor_speed, known.mean() if len(known) else 600.0
+    )
+    command = np.where(np.isfinite(initial.command), initial.command, 0.5)
+    return {
+        "position": initial.position,
+        "velocity": velocity,
+        "attitude": attitude,
+        "body_rate": rate,
+        "rotor_speed": speed,
+        "command": command,
+        "integral": np.zeros(3),
+    }
+
+
+def _reference(flight: Flight, length: int) -> list[NDArray[np.float64]]:
+    """Return position, velocity and acceleration, each (3, length), the last point held."""
+    parts = []
+    for name in ("reference_position", "reference_velocity", "reference_acceleration"):
+        values = flight.signals.get(name)
+        rows = np.zeros((len(flight.time), 3)) if values is None else np.nan_to_num(values)
+        parts.append(np.pad(rows, ((0, length - len(rows)), (0, 0)), mode="edge").T)
+    return parts
+
+
+def _measured(
+    flights: Sequence[Flight],
+    channel: str,
+    sigma: float,
+    weights: Mapping[str, Mapping[str, float]],
+) -> Measured:
+    picked = []
+    for flight in flights:
+        series = flight.series.get(channel)
+        inside = np.zeros(0, bool) if series is None else _inside(flight, series.time)
+        width = 4 if channel in ("attitude", "rotor_speed", "command") else 3
+        time = np.zeros(0) if series is None else series.time[inside]
+        values = np.zeros((0, width)) if series is None else series.values[inside]
+        picked.append((time, values))
+    length = max(len(time) for time, _ in picked)
+    times, tables, scales = [], [], []
+    for flight, (time, values) in zip(flights, picked, strict=True):
+        room = length - len(time)
+        factor = weights.get(flight.name, {}).get(channel, 1.0)
+        finite = np.isfinite(values)
+        scale = finite * (factor / sigma)
+        times.append(np.pad(time, (0, room)))
+        filled = np.where(finite, values, 0.0)
+        if channel == "attitude":
+            scale = scale[:, 1:]
+            filled = np.pad(filled, ((0, room), (0, 0)))
+            filled[len(time) :, 0] = 1.0
+        else:
+            filled = np.pad(filled, ((0, room), (0, 0)))
+        tables.append(filled)
+        scales.append(np.pad(scale, ((0, room), (0, 0))))
+    return Measured(
+        time=jnp.asarray(np.stack(times, axis=-1)),
+        values=jnp.asarray(np.stack(tables, axis=-1)),
+        weight=jnp.asarray(np.stack(scales, axis=-1)),
+    )
+
+
+def _inside(flight: Flight, time: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return (time >= 0.0) & (time <= flight.time[-1])

@@ -1,0 +1,90 @@
+"""How noisy each recorded signal is, told from the recording itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.flights.flight import Flight, Series
+
+#: The channels that a fit compares, in this order everywhere.
+CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
+
+#: Smallest believable standard deviation, in the channel's unit (attitude: rad).
+FLOOR = {
+    "position": 1e-4,
+    "attitude": 1e-4,
+    "body_rate": 1e-3,
+    "rotor_speed": 0.3,
+    "command": 2e-4,
+}
+
+
+def white_noise(series: Series) -> NDArray[np.float64]:
+    """Return each column's standard deviation of the noise between neighbouring samples.
+
+    Every sample is compared with the parabola through its neighbours at their own times, which a
+    smooth signal meets however its stamps jitter; the median makes it deaf to jumps.
+
+    Parameters
+    ----------
+    series
+        (n, k) samples.
+
+    Returns
+    -------
+    array
+        (k,), NaN where a column was not measured.
+    """
+    spread = np.full(series.values.shape[1], np.nan)
+    for column in range(series.values.shape[1]):
+        measured = np.isfinite(series.values[:, column])
+        time, values = series.time[measured], series.values[measured, column]
+        if len(values) > 8:
+            error = _third_difference(time, values)
+            spread[column] = 1.4826 * np.median(np.abs(error))
+    return spread
+
+
+def _third_difference(
+    time: NDArray[np.float64], values: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return divided third differences, scaled so that white noise keeps its variance."""
+    stamps = np.stack([time[i : len(time) - 3 + i] for i in range(4)])
+    samples = np.stack([values[i : len(values) - 3 + i] for i in range(4)])
+    gaps = stamps[:, None] - stamps[None]
+    gaps[np.arange(4), np.arange(4)] = 1.0
+    weights = 1.0 / gaps.prod(axis=1)
+    scaled = (weights * samples).sum(axis=0) / np.sqrt((weights**2).sum(axis=0))
+    return np.asarray(scaled)
+
+
+def channel_noise(flights: Sequence[Flight], channel: str) -> float:
+    """Return one standard deviation for a channel over all flights, in its unit (attitude: rad).
+
+    Commands come in steps and are smooth between them, so that only rounding counts: their noise
+    is the step's share.
+    """
+    found = []
+    for flight in flights:
+        series = flight.series.get(channel)
+        if series is None or not np.isfinite(series.values).any():
+            continue
+        if channel == "command":
+            found.append(_step(series) / np.sqrt(12.0))
+        elif channel == "attitude":
+            found.append(2.0 * float(np.nanmedian(white_noise(series)[1:])))
+        else:
+            found.append(float(np.nanmedian(white_noise(series))))
+    known = [value for value in found if np.isfinite(value)]
+    return max(float(np.median(known)) if known else 0.0, FLOOR[channel])
+
+
+def _step(series: Series) -> float:
+    """Return the smallest step between different values of a quantised signal."""
+    values = np.unique(series.values[np.isfinite(series.values)])
+    gaps = np.diff(values)
+    gaps = gaps[gaps > 1e-9]
+    return float(np.min(gaps)) if len(gaps) else 0.0

@@ -1,0 +1,133 @@
+"""What a search hands on: where it ended, how it got there, and what it noticed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.normal import Objective, Point, Stage
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a user should know before believing a number.
+
+    Attributes
+    ----------
+    kind
+        ``failure`` stops a run unless forced, ``warning`` does not, ``info`` explains.
+    subject
+        The flight, coefficient or channel concerned.
+    text
+        What was found, with its number.
+    remedy
+        What to do about it.
+    """
+
+    kind: Literal["failure", "warning", "info"]
+    subject: str
+    text: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One step of a search.
+
+    Attributes
+    ----------
+    stage
+        What was being done, in words.
+    number
+        Counts all iterations of the search.
+    loss
+        Half the mean squared residual after the step, in (scaled) standard deviations.
+    position_rmse
+        m, over all fitted flights up to the horizon, at the point tried.
+    accepted
+        Whether the step was kept.
+    horizon
+        s.
+    """
+
+    stage: str
+    number: int
+    loss: float
+    position_rmse: float
+    accepted: bool
+    horizon: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where one start ended.
+
+    Attributes
+    ----------
+    vector
+        (K,) search vector at the end.
+    start
+        (K,) search vector at the beginning.
+    loss
+        At the end, on whole flights, in the final weights.
+    origin
+        ``vehicle file``, ``random`` or ``cma``.
+    """
+
+    vector: NDArray[np.float64]
+    start: NDArray[np.float64]
+    loss: float
+    origin: str
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A search's result.
+
+    Attributes
+    ----------
+    objective
+        The problem.
+    point
+        The best point.
+    stage
+        Horizon, scales and robust limit of the final problem, in which ``point`` is the minimum.
+    noise
+        Channel -> standard deviation of the measurement in its unit (attitude: rad).
+    scales
+        Flight name -> channel -> how much larger than the noise the residuals are.
+    iterations, outcomes
+        The trace of the search, and each start's end.
+    method
+        ``gradient``, ``cma`` or ``hybrid``.
+    evaluations
+        Simulated batches, Jacobians included.
+    wall_time
+        s.
+    loss_initial, loss_best
+        In the final weights.
+    converged, message
+        Whether the last stage stopped by itself, and why.
+    findings
+        Everything noticed on the way.
+    """
+
+    objective: Objective
+    point: Point
+    stage: Stage
+    noise: Mapping[str, float]
+    scales: Mapping[str, Mapping[str, float]]
+    iterations: tuple[Iteration, ...]
+    outcomes: tuple[Outcome, ...]
+    method: str
+    evaluations: int
+    wall_time: float
+    loss_initial: float
+    loss_best: float
+    converged: bool
+    message: str
+    findings: tuple[Finding, ...] = field(default=())
