@@ -18,7 +18,7 @@ class Lag(eqx.Module):
     mean_down: Scalar
 
     @staticmethod
-    def over(motor: Motor, step: float) -> Lag:
+    def over(motor: Motor, step: Scalar | float) -> Lag:
         """Prepare the filter α = exp(-step/τ), and the mean of the decay over the step.
 
         Parameters

@@ -20,8 +20,8 @@ from sim_jax.control.position import (
 from sim_jax.crash import Limits
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
 from sim_jax.motor import Lag, reference_speed
-from sim_jax.numeric import Scalar
-from sim_jax.rigid_body import Motion, step_midpoint, step_semi_implicit
+from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
@@ -58,6 +58,13 @@ class Rollout(eqx.Module):
         return jnp.isfinite(self.crash_time)
 
 
+_INTEGRATORS = {
+    "midpoint": step_midpoint,
+    "semi_implicit": step_semi_implicit,
+    "rk4": step_rk4,
+}
+
+
 class _Plant(eqx.Module):
     """The vehicle and its controllers with everything that is computed once a rollout."""
 
@@ -65,6 +72,7 @@ class _Plant(eqx.Module):
     controller: Controller
     schedule: Schedule = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
+    gravity: float = eqx.field(static=True)
     inlet: Inlet
     lag: Lag
     gyro: GyroFilter
@@ -77,8 +85,9 @@ class _Plant(eqx.Module):
         reference = _row(points, tick)
         position, velocity, estimate = self._estimate(state, step)
         gains = self.controller
-        wanted = wanted_acceleration(gains.position, reference, position, velocity)
-        goal = attitude_from_acceleration(wanted, heading_of(gains.position, velocity))
+        heading = heading_of(gains.position, velocity)
+        wanted = wanted_acceleration(gains.position, reference, position, velocity, heading)
+        goal = attitude_from_acceleration(wanted, heading)
         turn = attitude.rate_setpoint(gains.attitude, estimate, goal)
         spins, still = self.inlet.spins, jnp.zeros_like(turn.x)
         return Setpoints(
@@ -194,8 +203,10 @@ class _Plant(eqx.Module):
                 world_up=Vec3(rotation.x_axis.z, rotation.y_axis.z, rotation.z_axis.z),
             )
 
-        advance = step_midpoint if self.schedule.integrator == "midpoint" else step_semi_implicit
-        motion = advance(self.vehicle.body, state.motion, wrench_at, self.schedule.step)
+        advance = _INTEGRATORS[self.schedule.integrator]
+        motion = advance(
+            self.vehicle.body, state.motion, wrench_at, self.schedule.step, gravity=self.gravity
+        )
         broken = self.limits.broken_by(motion) | jnp.isfinite(state.crash_time)
 
         def frozen(old: Array, new: Array) -> Array:
@@ -264,6 +275,7 @@ def rollout(
     samples: int,
     horizon: Int[Array, ""] | None = None,
     limits: Limits | None = None,
+    gravity: float = GRAVITY,
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
 
@@ -285,6 +297,8 @@ def rollout(
         one compiled function serves every horizon; derivatives are then forward-mode only.
     limits
         The space in which a flight counts as flying.
+    gravity
+        m/s², acting on the vehicle. (PX4's Gazebo worlds have 9.8066.)
 
     Returns
     -------
@@ -297,6 +311,7 @@ def rollout(
         controller=controller,
         schedule=schedule,
         limits=Limits() if limits is None else limits,
+        gravity=gravity,
         inlet=inlet,
         lag=Lag.over(vehicle.motor, schedule.step),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),

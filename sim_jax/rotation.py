@@ -50,6 +50,15 @@ class Quaternion(eqx.Module):
             self.w * other.z + self.x * other.y - self.y * other.x + self.z * other.w,
         )
 
+    def times_vector(self, vector: Vec3) -> Quaternion:
+        """Return self ⊗ (0, v); with v = ½ω this is the derivative q̇ at body rate ω."""
+        return Quaternion(
+            -(self.x * vector.x + self.y * vector.y + self.z * vector.z),
+            self.w * vector.x + self.y * vector.z - self.z * vector.y,
+            self.w * vector.y + self.z * vector.x - self.x * vector.z,
+            self.w * vector.z + self.x * vector.y - self.y * vector.x,
+        )
+
     def conjugate(self) -> Quaternion:
         """Return the inverse rotation."""
         return Quaternion(self.w, -self.x, -self.y, -self.z)
@@ -71,12 +80,9 @@ class Quaternion(eqx.Module):
         duration
             s.
         """
-        half = body_rate * (0.5 * duration)
+        turn = along.times_vector(body_rate * (0.5 * duration))
         return Quaternion(
-            self.w - (along.x * half.x + along.y * half.y + along.z * half.z),
-            self.x + (along.w * half.x + along.y * half.z - along.z * half.y),
-            self.y + (along.w * half.y + along.z * half.x - along.x * half.z),
-            self.z + (along.w * half.z + along.x * half.y - along.y * half.x),
+            self.w + turn.w, self.x + turn.x, self.y + turn.y, self.z + turn.z
         ).normalized()
 
     def matrix(self) -> Matrix3:

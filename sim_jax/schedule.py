@@ -20,8 +20,11 @@ class Schedule(eqx.Module):
     """Hz of position and attitude control, and of the reference."""
     log_rate: int = eqx.field(static=True, default=100)
     """Hz of the logged samples; divides physics_rate."""
-    integrator: Literal["midpoint", "semi_implicit"] = eqx.field(static=True, default="midpoint")
-    """Second order, or first order as Gazebo's engine."""
+    integrator: Literal["midpoint", "semi_implicit", "rk4"] = eqx.field(
+        static=True, default="midpoint"
+    )
+    """Second order with the rotors' mean speed over the step; first order as Gazebo's engine; or
+    fourth order. The last two hold the rotor speed of before the step, as Gazebo does."""
     pose_rate: float | None = eqx.field(static=True, default=None)
     """Hz at which poses reach the controller, held in between; None: every tick."""
     longest_estimate_latency: float = eqx.field(static=True, default=0.0)

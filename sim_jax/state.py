@@ -54,9 +54,9 @@ class State(eqx.Module):
     """s, infinite while flying."""
 
 
-def hover(vehicle: Vehicle, position: Vec3) -> Start:
+def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Start:
     """Return a level vehicle at rest at a position in m, its rotors carrying its weight."""
-    thrust = vehicle.body.mass * GRAVITY / 4.0
+    thrust = vehicle.body.mass * gravity / 4.0
     speed = jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
     command = (speed - vehicle.motor.zero_position_armed) / vehicle.motor.input_scaling
     rest = Vec3.zeros(position.x)

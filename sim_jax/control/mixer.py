@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import jax
@@ -15,78 +16,107 @@ from sim_jax.vector import Vec3
 #: One value per rotor, PX4 order: front right, rear left, front left, rear right.
 PerRotor: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 _Scales: TypeAlias = tuple[float, float, float, float]
+_Rounding: TypeAlias = Callable[[Scalar], Scalar]
 
-HALF_SQRT2 = 0.707107
-"""PX4's own rounding in its generated mixer table."""
+HALF_SQRT2 = 0.7071070075035095
+"""PX4's own rounding in its generated mixer table: 0.707107 in single precision."""
 ROLL: _Scales = (-HALF_SQRT2, HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
 PITCH: _Scales = (HALF_SQRT2, -HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
 YAW: _Scales = (1.0, 1.0, -1.0, -1.0)
 THRUST: _Scales = (1.0, 1.0, 1.0, 1.0)
 
-YAW_HEADROOM = 1.15
-"""Upper limit while yaw is mixed in: some yaw response is left at full thrust."""
-LOW_CLIP = 0.005
-"""A command below this counts as clipped low (-0.99 on PX4's -1..1 scale)."""
+YAW_HEADROOM = 1.149999976158142
+"""Upper limit while yaw is mixed in, 1.15 in single precision: some yaw response is left at full
+thrust."""
+LOW_CLIP = 0.00499998
+"""A command below this counts as clipped low. PX4 asks for output < -0.99 on its -1..1 scale in
+single precision, where a command of exactly 0.005 comes out as -0.99 and does not count."""
 
 
-def _add(outputs: PerRotor, amount: Scalar, scales: _Scales) -> PerRotor:
-    a, b, c, d = (out + amount * scale for out, scale in zip(outputs, scales, strict=True))
+def _single(value: Scalar) -> Scalar:
+    """Round to single precision, whatever precision the rollout runs in."""
+    return jax.lax.reduce_precision(value, exponent_bits=8, mantissa_bits=23)
+
+
+def _exact(value: Scalar) -> Scalar:
+    return value
+
+
+def _add(rounded: _Rounding, outputs: PerRotor, amount: Scalar, scales: _Scales) -> PerRotor:
+    a, b, c, d = (
+        rounded(out + rounded(amount * scale)) for out, scale in zip(outputs, scales, strict=True)
+    )
     return a, b, c, d
 
 
-def _gain_to_unsaturate(outputs: PerRotor, scales: _Scales, upper: float) -> Scalar:
+def _gain_to_unsaturate(
+    rounded: _Rounding, outputs: PerRotor, scales: _Scales, upper: float
+) -> Scalar:
     least = most = jnp.zeros_like(outputs[0])
     for out, scale in zip(outputs, scales, strict=True):
-        needed = (saturate(out, 0.0, upper) - out) * (1.0 / scale)
+        needed = rounded(rounded(saturate(out, 0.0, upper) - out) / scale)
         least = jnp.where(needed < least, needed, least)
         most = jnp.where(needed > most, needed, most)
-    return least + most
+    return rounded(least + most)
 
 
 def _unsaturate(
-    outputs: PerRotor, scales: _Scales, upper: float = 1.0, *, reduce_only: bool = False
+    rounded: _Rounding,
+    outputs: PerRotor,
+    scales: _Scales,
+    upper: float = 1.0,
+    *,
+    reduce_only: bool = False,
 ) -> PerRotor:
     """Shift the outputs along a direction until the saturation on both sides is balanced."""
-    first = _gain_to_unsaturate(outputs, scales, upper)
-    shifted = _add(outputs, first, scales)
-    second = 0.5 * _gain_to_unsaturate(shifted, scales, upper)
+    first = _gain_to_unsaturate(rounded, outputs, scales, upper)
+    shifted = _add(rounded, outputs, first, scales)
+    second = 0.5 * _gain_to_unsaturate(rounded, shifted, scales, upper)
+    balanced = _add(rounded, shifted, second, scales)
     if not reduce_only:
-        return _add(shifted, second, scales)
-    return _add(outputs, jnp.where(first > 0, 0.0, first + second), scales)
+        return balanced
+    a, b, c, d = (
+        jnp.where(first > 0, out, new) for out, new in zip(outputs, balanced, strict=True)
+    )
+    return a, b, c, d
 
 
-def _mix_yaw(outputs: PerRotor, yaw: Scalar) -> PerRotor:
-    outputs = _unsaturate(_add(outputs, yaw, YAW), YAW, YAW_HEADROOM)
-    return _unsaturate(outputs, THRUST, reduce_only=True)
+def _mix_yaw(rounded: _Rounding, outputs: PerRotor, yaw: Scalar) -> PerRotor:
+    outputs = _unsaturate(rounded, _add(rounded, outputs, yaw, YAW), YAW, YAW_HEADROOM)
+    return _unsaturate(rounded, outputs, THRUST, reduce_only=True)
 
 
-def _without_yaw(torque: Vec3, thrust: Scalar) -> PerRotor:
-    outputs = (thrust, thrust, thrust, thrust)
-    return _add(_add(outputs, torque.x, ROLL), torque.y, PITCH)
-
-
-def _desaturated(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
-    if airmode == 0:  # thrust may only be reduced; then roll, then pitch give way
-        outputs = _unsaturate(_without_yaw(torque, thrust), THRUST, reduce_only=True)
-        outputs = _unsaturate(_unsaturate(outputs, ROLL), PITCH)
-        return _mix_yaw(outputs, torque.z)
+def _desaturated(rounded: _Rounding, airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
+    roll, pitch, yaw = torque.x, torque.y, torque.z
+    still = jnp.zeros_like(roll)
+    tilting = _add(rounded, (still, still, still, still), roll, ROLL)
+    tilting = _add(rounded, tilting, pitch, PITCH)
+    if airmode == 2:  # thrust may rise to keep all three, then yaw gives way
+        outputs = _add(rounded, _add(rounded, tilting, yaw, YAW), thrust, THRUST)
+        return _unsaturate(rounded, _unsaturate(rounded, outputs, THRUST), YAW)
+    outputs = _add(rounded, tilting, thrust, THRUST)
     if airmode == 1:  # thrust may rise to keep roll and pitch
-        return _mix_yaw(_unsaturate(_without_yaw(torque, thrust), THRUST), torque.z)
-    outputs = _add(_without_yaw(torque, thrust), torque.z, YAW)
-    return _unsaturate(_unsaturate(outputs, THRUST), YAW)
+        return _mix_yaw(rounded, _unsaturate(rounded, outputs, THRUST), yaw)
+    # thrust may only be reduced; then roll, then pitch give way
+    outputs = _unsaturate(rounded, outputs, THRUST, reduce_only=True)
+    outputs = _unsaturate(rounded, _unsaturate(rounded, outputs, ROLL), PITCH)
+    return _mix_yaw(rounded, outputs, yaw)
 
 
-def _linearised(output: Scalar, thrust_factor: float) -> Scalar:
+def _linearised(rounded: _Rounding, output: Scalar, thrust_factor: float) -> Scalar:
     """Invert thrust = (1 - f)·u + f·u², PX4's model of the command's curve."""
-    ahead = (1.0 - thrust_factor) / (2.0 * thrust_factor)
+    factor = jnp.asarray(thrust_factor, output.dtype)
+    linear = rounded(1.0 - factor)
+    square = rounded(rounded(linear * linear) / rounded(4.0 * factor * factor))
     positive = jnp.where(output < 0, 0.0, output)
-    return safe_sqrt(ahead * ahead + positive / thrust_factor) - ahead
+    root = rounded(safe_sqrt(rounded(square + rounded(positive / factor))))
+    return rounded(root - rounded(linear / (2.0 * factor)))
 
 
 def _quantised(command: Scalar) -> Scalar:
     """Truncate to whole microseconds of a 1000..2000 pulse; the derivative passes straight."""
-    steps = jnp.floor(command * 1000.0 + 1e-4) * 1e-3
-    return command + jax.lax.stop_gradient(steps - command)
+    pulse = jnp.floor(_single(1500.0 + _single(500.0 * _single(2.0 * command - 1.0))))
+    return command + jax.lax.stop_gradient((pulse - 1000.0) * 1e-3 - command)
 
 
 def mix(settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
@@ -95,15 +125,17 @@ def mix(settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
     Parameters
     ----------
     settings
-        Airmode, thrust factor and whether commands move in PWM steps.
+        Airmode, thrust factor, and whether commands move in PWM steps.
     torque
-        Normalised torque set-point, FRD.
+        Normalised torque set-point, FRD; each axis counts up to ±1.
     thrust
-        Normalised collective thrust, 0..1.
+        Normalised collective thrust; counts from 0 to 1.
     """
-    outputs = _desaturated(settings.airmode, torque, thrust)
+    rounded = _single if settings.single_precision else _exact
+    within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
+    outputs = _desaturated(rounded, settings.airmode, within, saturate(thrust, 0.0, 1.0))
     if settings.thrust_factor > 0:
-        a, b, c, d = (_linearised(out, settings.thrust_factor) for out in outputs)
+        a, b, c, d = (_linearised(rounded, out, settings.thrust_factor) for out in outputs)
         outputs = (a, b, c, d)
     a, b, c, d = (saturate(out, 0.0, 1.0) for out in outputs)
     if settings.pwm_quantisation:

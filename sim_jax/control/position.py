@@ -22,12 +22,15 @@ class ReferencePoint(eqx.Module):
     acceleration: Vec3
 
 
-def _unit(vector: Vec3) -> Vec3:
+def _unit(vector: Vec3, otherwise: Vec3) -> Vec3:
+    """Return the direction of a vector, or another one where it has none."""
     length = vector.norm()
+    has = length > 0
+    scale = 1.0 / jnp.where(has, length, 1.0)
     return Vec3(
-        safe_divide(vector.x, length),
-        safe_divide(vector.y, length),
-        safe_divide(vector.z, length),
+        jnp.where(has, vector.x * scale, otherwise.x),
+        jnp.where(has, vector.y * scale, otherwise.y),
+        jnp.where(has, vector.z * scale, otherwise.z),
     )
 
 
@@ -40,10 +43,13 @@ def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
         Wanted specific force, world, any length.
     heading
         World vector (cos ψ, sin ψ, 0).
+
+    Where there is no acceleration the attitude is upright; where it lies along the heading, the y
+    axis stays level, left of the heading. (The original gives not-a-number in both.)
     """
-    z_axis = _unit(acceleration)
-    y_axis = _unit(z_axis.cross(heading))
-    x_axis = _unit(y_axis.cross(z_axis))
+    z_axis = _unit(acceleration, Vec3(0.0, 0.0, 1.0))  # type: ignore[arg-type]
+    y_axis = _unit(z_axis.cross(heading), Vec3(-heading.y, heading.x, heading.z))
+    x_axis = y_axis.cross(z_axis)
     return Quaternion.from_matrix(Matrix3(x_axis, y_axis, z_axis))
 
 
@@ -73,7 +79,11 @@ def heading_of(gains: PositionGains, velocity: Vec3) -> Vec3:
 
 
 def wanted_acceleration(
-    gains: PositionGains, reference: ReferencePoint, position: Vec3, velocity: Vec3
+    gains: PositionGains,
+    reference: ReferencePoint,
+    position: Vec3,
+    velocity: Vec3,
+    heading: Vec3,
 ) -> Vec3:
     """Return a_fb + a_ref - R_ref D R_refᵀ v_ref + (0, 0, 9.8) in m/s², world.
 
@@ -85,11 +95,11 @@ def wanted_acceleration(
         Where the vehicle should be.
     position, velocity
         Where the controller believes it is: m, m/s, world.
+    heading
+        World vector (cos ψ, sin ψ, 0), which turns the axes of the reference's drag.
     """
     up = Vec3.zeros(position.x) + Vec3(0.0, 0.0, CONTROLLER_GRAVITY)  # type: ignore[arg-type]
-    along_reference = attitude_from_acceleration(
-        reference.acceleration + up, heading_of(gains, velocity)
-    ).matrix()
+    along_reference = attitude_from_acceleration(reference.acceleration + up, heading).matrix()
     drag = along_reference.to_world(
         gains.reference_drag.scaled_by(along_reference.to_body(reference.velocity))
     )

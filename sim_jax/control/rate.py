@@ -55,7 +55,7 @@ def _integrate(
     positive: Flag,
     negative: Flag,
     feedback: Scalar,
-    step: float,
+    step: Scalar | float,
 ) -> Scalar:
     stopped = (positive & (error > 0)) | (negative & (error < 0))
     error = jnp.where(stopped, (1.0 - feedback) * error, error)
@@ -72,7 +72,7 @@ def next_integral(
     setpoint: Vec3,
     integral: Vec3,
     saturation: Saturation,
-    step: float,
+    step: Scalar | float,
 ) -> Vec3:
     """Return the integrator after one step of ``step`` seconds.
 
