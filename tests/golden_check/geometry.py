@@ -1,0 +1,118 @@
+"""Rotations, attitude laws and the position controller against mavros_controllers."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from sim_jax.control import attitude, position
+from sim_jax.control.gains import AttitudeGains, PositionGains
+from sim_jax.rotation import Matrix3, Quaternion
+from sim_jax.vector import Vec3
+from tests.golden_check.table import Deviation, Table, deviation, merged
+
+EXACT = 1e-12
+SINGLE = 1e-6
+
+
+def quaternion_operations(table: Table) -> list[Deviation]:
+    one, other = table.quaternion("q"), table.quaternion("p")
+    rows = [Vec3(*(table.column(f"R{row}{column}") for column in range(3))) for row in range(3)]
+    columns = [Vec3(*(getattr(row, axis) for row in rows)) for axis in "xyz"]
+    # Ours is made for unit quaternions; the original's grows with the squared norm of others.
+    square = one.w**2 + one.x**2 + one.y**2 + one.z**2
+    matrix = one.normalized().matrix()
+    scaled = [axis * square for axis in (matrix.x_axis, matrix.y_axis, matrix.z_axis)]
+    return [
+        deviation("product", one.product(other), table.quaternion("qp"), EXACT),
+        deviation("matrix", scaled, columns, EXACT),
+        deviation("from matrix", _of_matrix(columns), table.quaternion("r"), EXACT),
+    ]
+
+
+def _of_matrix(columns: list[Vec3]) -> Quaternion:
+    return Quaternion.from_matrix(Matrix3(*columns))
+
+
+def attitude_of_acceleration(table: Table) -> list[Deviation]:
+    yaw = table.column("yaw")
+    heading = Vec3(jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw))
+    got = position.attitude_from_acceleration(table.vector("a"), heading)
+    return [deviation("attitude", got, table.quaternion("q"), EXACT)]
+
+
+def attitude_laws(table: Table) -> list[Deviation]:
+    now, wanted = table.quaternion("q"), table.quaternion("ref")
+    constant = table.column("attctrl_tau")
+    thrust = position.thrust_setpoint(_attitude_gains(table), table.vector("acc_"), now)
+    return [
+        deviation(
+            "quaternion law",
+            attitude.quaternion_law(now, wanted, constant),
+            table.vector("bres_w"),
+            EXACT,
+        ),
+        deviation(
+            "rotation-matrix law",
+            attitude.rotation_matrix_law(now, wanted, constant),
+            table.vector("lee_w"),
+            EXACT,
+        ),
+        deviation("thrust", thrust, table.column("bres_thrust"), EXACT),
+    ]
+
+
+def position_controller(table: Table) -> list[Deviation]:
+    return merged([_position_controller(part) for part in table.split("velocity_yaw")])
+
+
+def _position_controller(table: Table) -> list[Deviation]:
+    follows_velocity = bool(table.only("velocity_yaw"))
+    gains = PositionGains(
+        kp=table.vector("Kp_"),
+        kv=table.vector("Kv_"),
+        max_feedback_acceleration=table.column("max_acc"),
+        reference_drag=table.vector("drag_"),
+        velocity_yaw=follows_velocity,
+    )
+    reference = position.ReferencePoint(
+        table.vector("tp_"), table.vector("tv_"), table.vector("ta_")
+    )
+    place, velocity, now = table.vector("p_"), table.vector("v_"), table.quaternion("q")
+    yaw = table.column("yaw_in")
+    given = Vec3(jnp.cos(yaw), jnp.sin(yaw), jnp.zeros_like(yaw))
+    heading = position.heading_of(gains, velocity) if follows_velocity else given
+    used = table.column("yaw_used")
+    feedback = position.feedback_acceleration(gains, reference, place, velocity)
+    wanted = position.wanted_acceleration(gains, reference, place, velocity, heading)
+    goal = position.attitude_from_acceleration(wanted, heading)
+    attitude_gains = _attitude_gains(table)
+    constant = attitude_gains.time_constant
+    thrust = position.thrust_setpoint(attitude_gains, wanted, now)
+    return [
+        deviation("heading", [heading.x, heading.y], [jnp.cos(used), jnp.sin(used)], EXACT),
+        deviation("feedback acceleration", feedback, table.vector("afb_"), EXACT),
+        deviation("wanted acceleration", wanted, table.vector("ades_"), EXACT),
+        deviation("wanted attitude", goal, table.quaternion("qdes_"), EXACT),
+        deviation(
+            "rate, quaternion law",
+            attitude.quaternion_law(now, goal, constant),
+            table.vector("bres_w"),
+            EXACT,
+        ),
+        deviation(
+            "rate, rotation-matrix law",
+            attitude.rotation_matrix_law(now, goal, constant),
+            table.vector("lee_w"),
+            EXACT,
+        ),
+        deviation("thrust", thrust, table.column("bres_thrust"), EXACT),
+        deviation("published thrust", thrust, table.column("pub_thrust_f32"), SINGLE),
+    ]
+
+
+def _attitude_gains(table: Table) -> AttitudeGains:
+    return AttitudeGains(
+        time_constant=table.column("attctrl_tau"),
+        normalized_constant=table.column("thrust_const"),
+        normalized_offset=table.column("thrust_offset"),
+    )

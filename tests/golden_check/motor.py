@@ -1,0 +1,139 @@
+"""Motor and rotor against the Gazebo motor model: the thesis's branch (hg) and upstream (up)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from sim_jax.motor import Lag, reference_speed
+from sim_jax.rotation import Matrix3
+from sim_jax.rotor import Wrench, rotor_wrench
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Aerodynamics, Motor
+from tests.golden_check.table import Deviation, Table, deviation, merged
+
+EXACT = 1e-12
+SINGLE = 1e-6
+
+
+def command_map(table: Table) -> list[Deviation]:
+    table = table.where(table.frame["armed"] > 0)  # the simulated motors are always armed
+    motor = _motor(
+        input_scaling=table.column("scaling"),
+        zero_position_armed=table.column("zero_armed"),
+        max_rotor_velocity=table.column("max_rot_vel"),
+        input_offset=table.column("offset"),
+    )
+    got = tuple(reference_speed(motor, command) for command in table.four("ctl"))
+    limited = [
+        jnp.minimum(table.column(f"ref{rotor}"), table.column("max_rot_vel")) for rotor in range(4)
+    ]
+    single = [table.column(f"ref{rotor}_f32_min") for rotor in range(4)]
+    return [
+        deviation("reference speed", got, limited, SINGLE),
+        deviation("reference speed, single precision", got, single, SINGLE),
+    ]
+
+
+def rotor_filter(table: Table) -> list[Deviation]:
+    return merged([_filter_sequence(part) for part in table.split("seq")])
+
+
+def _filter_sequence(table: Table) -> list[Deviation]:
+    motor = _motor(
+        time_constant_up=jnp.asarray(table.only("tau_up")),
+        time_constant_down=jnp.asarray(table.only("tau_down")),
+    )
+    lag = Lag.over(motor, table.only("dt"))
+
+    def step(speed: Array, command: Array) -> tuple[Array, Array]:
+        speed, _ = lag.advance(speed, command)
+        return speed, speed
+
+    _, speeds = jax.lax.scan(step, jnp.zeros(()), table.column("cmd"))
+    return [deviation("rotor speed", speeds, table.column("state"), EXACT)]
+
+
+def motor_model(table: Table) -> list[Deviation]:
+    return merged([_motor_model(part) for part in table.split("variant", "dir")])
+
+
+def _motor_model(table: Table) -> list[Deviation]:
+    spin = int(table.only("dir"))
+    axes = table.quaternion("rotor_q").matrix()
+    air = axes.to_body(table.vector("v") - table.vector("wind_"))
+    speed = table.column("omega_signed")
+    # A reversible rotor pushes the other way when it turns backwards; all else is the same.
+    backwards = table.flag("reversible") & (speed < 0)
+    thrust = jnp.where(backwards, -1.0, 1.0) * table.column("motor_constant")
+    zero = jnp.zeros_like(speed)
+
+    def wrench(**coefficients: Array) -> Wrench:
+        names = (
+            "motor_constant",
+            "moment_constant",
+            "rotor_drag_coefficient",
+            "rolling_moment_coefficient",
+        )
+        aerodynamics = Aerodynamics(*(coefficients.get(name, zero) for name in names))
+        return rotor_wrench(
+            aerodynamics,
+            spin=spin,
+            speed=jnp.abs(speed),
+            air_velocity=air,
+            world_up=Vec3(axes.x_axis.z, axes.y_axis.z, axes.z_axis.z)
+            if table.frame["variant"].iloc[0] == "hg"
+            else None,
+        )
+
+    drag = {"rotor_drag_coefficient": table.column("rotor_drag")}
+    rolling = {"rolling_moment_coefficient": table.column("rolling_moment")}
+    push = {"motor_constant": thrust, "moment_constant": table.column("moment_constant")}
+    pushed, dragged = wrench(**push), wrench(**drag)
+    rolled, everything = wrench(**rolling), wrench(**push, **drag, **rolling)
+    lag = Lag.over(
+        _motor(
+            time_constant_up=table.column("tau_up"), time_constant_down=table.column("tau_down")
+        ),
+        table.column("dt"),
+    )
+    after, _ = lag.advance(table.column("filter_prev"), table.column("cmd_f32_clamped"))
+
+    return [
+        deviation("thrust, rotor axes", pushed.force, table.vector("rel_force_"), EXACT),
+        deviation("thrust", _world(axes, pushed.force), table.vector("thrust_world_"), EXACT),
+        deviation("rotor drag", _world(axes, dragged.force), table.vector("drag_world_"), EXACT),
+        deviation(
+            "rolling moment", _world(axes, rolled.moment), table.vector("rolling_world_"), EXACT
+        ),
+        deviation(
+            "all moments",
+            _world(axes, everything.moment),
+            table.vector("torque_world_total_"),
+            EXACT,
+        ),
+        deviation("rotor speed after the step", after, table.column("filter_new"), EXACT),
+        deviation(
+            "joint speed",
+            spin * after / table.column("slowdown"),
+            table.column("joint_vel_new"),
+            EXACT,
+        ),
+    ]
+
+
+def _world(axes: Matrix3, vector: Vec3) -> Vec3:
+    return axes.to_world(vector)
+
+
+def _motor(**known: Array) -> Motor:
+    zero = jnp.zeros(())
+    names = (
+        "input_scaling",
+        "zero_position_armed",
+        "max_rotor_velocity",
+        "time_constant_up",
+        "time_constant_down",
+    )
+    return Motor(**dict.fromkeys(names, zero) | known)

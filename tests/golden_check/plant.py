@@ -1,0 +1,114 @@
+"""The whole vehicle's wrench, its derivatives, and open-loop flights of a second."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.control.gains import Filters, MixerSettings
+from sim_jax.inlet import ActuatorInlet
+from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
+from sim_jax.rollout import rollout
+from sim_jax.rotation import Matrix3
+from sim_jax.rotor import Wrench, vehicle_wrench
+from sim_jax.schedule import Schedule
+from sim_jax.state import Start
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
+from tests.golden_check.controllers import golden_controller
+from tests.golden_check.table import Deviation, Table, deviation, merged
+
+WRENCH = 1e-9
+POSITION = 1e-4
+"""m, against an independent integrator; the other quantities to the same share of their size."""
+RATE = 1000
+"""Hz of the integration."""
+HELD = 20
+"""Steps for which a reference speed is held."""
+_rollout = eqx.filter_jit(rollout)
+
+SETS = {0: "old", 1: "new"}
+KINDS = ("param_set", "torque_frame_world", "z_rotor")
+
+
+def _vehicle(table: Table) -> Vehicle:
+    return golden_vehicle(
+        SETS[int(table.only("param_set"))],
+        rotor_height=table.only("z_rotor"),
+        world_torque=bool(table.only("torque_frame_world")),
+    )
+
+
+def _wrench_of(
+    vehicle: Vehicle, speeds: tuple[jax.Array, ...], rotation: Matrix3, velocity: Vec3, rate: Vec3
+) -> Wrench:
+    return vehicle_wrench(
+        vehicle.aerodynamics,
+        vehicle.rotors,
+        speeds=speeds,
+        air_velocity=rotation.to_body(velocity),
+        body_rate=rate,
+        world_up=Vec3(rotation.x_axis.z, rotation.y_axis.z, rotation.z_axis.z),
+    )
+
+
+def wrench(table: Table) -> list[Deviation]:
+    return merged([_wrench(part) for part in table.split(*KINDS)])
+
+
+def _wrench(table: Table) -> list[Deviation]:
+    vehicle = _vehicle(table)
+    attitude, body_rate = table.quaternion("q"), table.vector("w")
+    rotation = attitude.matrix()
+    acting = _wrench_of(vehicle, table.four("Om"), rotation, table.vector("v"), body_rate)
+    fall = acceleration(vehicle.body, rotation, acting.force, gravity=GOLDEN_GRAVITY)
+    now = jnp.zeros(len(table))
+    turning = jax.jvp(
+        lambda time: attitude.advanced(attitude, body_rate, time), (now,), (jnp.ones_like(now),)
+    )[1]
+    rolling = angular_acceleration(vehicle.body, body_rate, acting.moment)
+    return [
+        deviation("force", rotation.to_world(acting.force), table.vector("F"), WRENCH),
+        deviation("moment", rotation.to_world(acting.moment), table.vector("tau"), WRENCH),
+        deviation("acceleration", fall, table.vector("dv"), WRENCH),
+        deviation("attitude derivative", turning, table.quaternion("dq"), WRENCH),
+        deviation("angular acceleration", rolling, table.vector("dw"), WRENCH),
+    ]
+
+
+def open_loop(table: Table) -> list[Deviation]:
+    return merged([_open_loop(part) for part in table.split("roll", *KINDS)])
+
+
+def _open_loop(table: Table) -> list[Deviation]:
+    vehicle = _vehicle(table)
+    motor = vehicle.motor
+    logged = table.frame["k"].to_numpy()
+    held = np.arange(logged[-1] + 1) // HELD * HELD
+    rows = np.searchsorted(logged, held)
+    a, b, c, d = (
+        (reference[rows] - motor.zero_position_armed) / motor.input_scaling
+        for reference in table.four("ref")
+    )
+    there = Motion(table.vector("p"), table.vector("v"), table.quaternion("q"), table.vector("w"))
+    motion, speeds = jax.tree.map(lambda leaf: leaf[0], (there, table.four("Om")))
+    flown = _rollout(
+        vehicle,
+        golden_controller(Filters(None, None), MixerSettings()),
+        Schedule(physics_rate=RATE, rate_control_rate=RATE, log_rate=RATE, integrator="rk4"),
+        ActuatorInlet((a, b, c, d)),
+        Start(motion, speeds, (a[0], b[0], c[0], d[0]), Vec3.zeros(a[0])),
+        samples=len(held),
+        gravity=GOLDEN_GRAVITY,
+    )
+    at = jax.tree.map(lambda leaf: leaf[logged], flown.log)
+    return [
+        deviation("position", at.motion.position, there.position, POSITION, absolute=True),
+        deviation("velocity", at.motion.velocity, there.velocity, POSITION),
+        deviation("attitude", at.motion.attitude, there.attitude, POSITION),
+        deviation("body rate", at.motion.body_rate, there.body_rate, POSITION),
+        deviation("rotor speed", at.rotor_speed, table.four("Om"), WRENCH),
+    ]
