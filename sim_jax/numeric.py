@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-#: One number per vehicle of the batch; shape () for a single vehicle.
-Scalar: TypeAlias = Float[Array, "*batch"]
+#: One number per vehicle of the batch; shape () for a single vehicle or one that all share.
+Scalar: TypeAlias = Float[Array, "*#batch"]
 #: One truth value per vehicle of the batch.
-Flag: TypeAlias = Bool[Array, "*batch"]
+Flag: TypeAlias = Bool[Array, "*#batch"]
 
 GRAVITY = 9.81
 """m/s², acting on the plant."""

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from sim_jax.control.position import ReferencePoint
 from sim_jax.numeric import Scalar
@@ -80,14 +80,14 @@ class Shape(eqx.Module):
 
 
 class Publication(eqx.Module):
-    """What the publisher sent, one row a tick; leaves are (ticks, \\*batch)."""
+    """What the publisher sent at one tick; as `publish` returns it, leaves are (ticks, \\*batch)."""
 
     points: ReferencePoint
-    shape_time: Float[Array, "ticks *batch"]
+    shape_time: Scalar
     """s, the time at which the shape was asked."""
-    windup: Float[Array, "ticks *batch"]
+    windup: Scalar
     """0..1."""
-    lap: Int[Array, "ticks *batch"]
+    lap: Int[Array, "*#batch"]
     """Laps completed."""
 
 

@@ -68,6 +68,12 @@ class Vec3(eqx.Module):
         return Vec3(zero, zero, zero)
 
     @staticmethod
+    def upward(like: Scalar, length: float = 1.0) -> Vec3:
+        """Return the vector along z of a given length, shape and precision of a scalar."""
+        zero = jnp.zeros_like(like)
+        return Vec3(zero, zero, jnp.full_like(like, length))
+
+    @staticmethod
     def of(values: Float[Array, "3 *batch"]) -> Vec3:
         """Take the components from the first axis of an array."""
         return Vec3(values[0], values[1], values[2])

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
-from sim_jax.numeric import Scalar, safe_sqrt, saturate
+from sim_jax.numeric import Flag, Scalar, safe_sqrt, saturate
 from sim_jax.vector import Vec3
 
 #: One value per rotor, PX4 order: front right, rear left, front left, rear right.
@@ -152,7 +152,7 @@ def saturation(settings: MixerSettings, commands: PerRotor) -> Saturation:
     low = [command < LOW_CLIP for command in commands]
     none = jnp.zeros_like(low[0])
 
-    def any_low(scales: _Scales, sign: int, counts: bool) -> Scalar:
+    def any_low(scales: _Scales, sign: int, counts: bool) -> Flag:
         flag = none
         if counts:
             for clipped, scale in zip(low, scales, strict=True):

@@ -47,7 +47,7 @@ def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
     Where there is no acceleration the attitude is upright; where it lies along the heading, the y
     axis stays level, left of the heading. (The original gives not-a-number in both.)
     """
-    z_axis = _unit(acceleration, Vec3(0.0, 0.0, 1.0))  # type: ignore[arg-type]
+    z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
     y_axis = _unit(z_axis.cross(heading), Vec3(-heading.y, heading.x, heading.z))
     x_axis = y_axis.cross(z_axis)
     return Quaternion.from_matrix(Matrix3(x_axis, y_axis, z_axis))
@@ -98,7 +98,7 @@ def wanted_acceleration(
     heading
         World vector (cos ψ, sin ψ, 0), which turns the axes of the reference's drag.
     """
-    up = Vec3.zeros(position.x) + Vec3(0.0, 0.0, CONTROLLER_GRAVITY)  # type: ignore[arg-type]
+    up = Vec3.upward(position.z, CONTROLLER_GRAVITY)
     along_reference = attitude_from_acceleration(reference.acceleration + up, heading).matrix()
     drag = along_reference.to_world(
         gains.reference_drag.scaled_by(along_reference.to_body(reference.velocity))

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from sim_jax.trajectory import Shape, ShapeName, publish
 from sim_jax.vector import Vec3
 from tests.golden_check.table import Deviation, Table, deviation, merged
@@ -44,7 +42,7 @@ def publisher(name: ShapeName) -> Callable[[Table], list[Deviation]]:
         points = sent.points
 
         def rows(vector: Vec3) -> Vec3:
-            return Vec3(*(np.asarray(getattr(vector, axis))[ticks] for axis in "xyz"))
+            return Vec3(vector.x[ticks], vector.y[ticks], vector.z[ticks])
 
         return [
             deviation("position", rows(points.position), table.vector("p"), UPDATE),
