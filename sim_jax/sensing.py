@@ -42,7 +42,8 @@ def push(
     step: Int[Array, ""],
 ) -> Float[Array, "length rows *batch"]:
     """Write the newest values of a delay line at physics step number ``step``."""
-    return lax.dynamic_update_index_in_dim(history, values, step % history.shape[0], 0)
+    written: Array = lax.dynamic_update_index_in_dim(history, values, step % history.shape[0], 0)
+    return written
 
 
 def look_back(

@@ -80,7 +80,7 @@ class Shape(eqx.Module):
 
 
 class Publication(eqx.Module):
-    """What the publisher sent at one tick; as `publish` returns it, leaves are (ticks, \\*batch)."""
+    """What the publisher sent at a tick; from `publish`, leaves are (ticks, \\*batch)."""
 
     points: ReferencePoint
     shape_time: Scalar

@@ -38,7 +38,7 @@ class Parameter:
 
 def rotor_speed(vehicle: VehicleFile, command: float) -> float:
     """Return the steady rotor speed in rad/s at a command 0..1."""
-    return float(reference_speed(Motor(**vehicle.motor.model_dump()), jnp.asarray(command)))
+    return float(reference_speed(Motor(**vehicle.motor.model_dump()), jnp.asarray(command, float)))
 
 
 def hover_speed(vehicle: VehicleFile) -> float:

@@ -1,0 +1,125 @@
+"""Rotations form a group, and every view of one agrees with the others."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sim_jax.rotation import Matrix3, Quaternion
+from sim_jax.vector import Vec3
+
+component = st.floats(-1.0, 1.0, allow_subnormal=False)
+
+
+@st.composite
+def rotations(draw: st.DrawFn) -> Quaternion:
+    four = np.array([draw(component) for _ in range(4)])
+    norm = float(np.linalg.norm(four))
+    four = four / norm if norm > 1e-3 else np.array([1.0, 0.0, 0.0, 0.0])
+    return Quaternion.of(jnp.asarray(four))
+
+
+@st.composite
+def vectors(draw: st.DrawFn) -> Vec3:
+    return Vec3.of(jnp.asarray([10.0 * draw(component) for _ in range(3)]))
+
+
+def apart(one: Quaternion | Vec3, other: Quaternion | Vec3) -> float:
+    return float(jnp.abs(one.stacked() - other.stacked()).max())
+
+
+def same_rotation(one: Quaternion, other: Quaternion) -> bool:
+    opposite = Quaternion.of(-other.stacked())
+    return min(apart(one, other), apart(one, opposite)) < 1e-7
+
+
+@given(rotations(), rotations(), rotations())
+def test_product_is_associative_and_keeps_the_norm(
+    a: Quaternion, b: Quaternion, c: Quaternion
+) -> None:
+    assert apart(a.product(b).product(c), a.product(b.product(c))) < 1e-14
+    assert abs(float(jnp.sum(a.product(b).stacked() ** 2)) - 1.0) < 1e-14
+
+
+@given(rotations())
+def test_identity_and_inverse(a: Quaternion) -> None:
+    one = Quaternion.identity(a.w)
+    assert apart(a.product(one), a) == 0.0
+    assert apart(a.product(a.conjugate()), one) < 1e-15
+
+
+@given(rotations(), rotations(), vectors())
+def test_matrix_of_a_product_turns_first_by_the_second(
+    a: Quaternion, b: Quaternion, v: Vec3
+) -> None:
+    both = a.product(b).matrix().to_world(v)
+    assert apart(both, a.matrix().to_world(b.matrix().to_world(v))) < 1e-13
+
+
+@given(rotations(), vectors())
+def test_to_body_undoes_to_world_and_lengths_stay(a: Quaternion, v: Vec3) -> None:
+    turned = a.matrix().to_world(v)
+    assert apart(a.matrix().to_body(turned), v) < 1e-13
+    assert abs(float(turned.norm() - v.norm())) < 1e-13
+
+
+@given(rotations(), vectors())
+def test_matrix_is_the_sandwich_product(a: Quaternion, v: Vec3) -> None:
+    sandwich = a.times_vector(v).product(a.conjugate())
+    assert abs(float(sandwich.w)) < 1e-13
+    assert apart(Vec3(sandwich.x, sandwich.y, sandwich.z), a.matrix().to_world(v)) < 1e-13
+
+
+@given(rotations())
+def test_quaternion_comes_back_from_its_matrix(a: Quaternion) -> None:
+    assert same_rotation(Quaternion.from_matrix(a.matrix()), a)
+
+
+@given(rotations())
+def test_z_axis_is_the_third_column(a: Quaternion) -> None:
+    assert apart(a.z_axis(), a.matrix().z_axis) < 1e-15
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_roll_pitch_yaw_come_back(roll: float, pitch: float, yaw: float) -> None:
+    def about(angle: float, axis: str) -> Quaternion:
+        parts = dict.fromkeys("xyz", jnp.asarray(0.0)) | {axis: jnp.asarray(np.sin(angle / 2))}
+        return Quaternion(jnp.asarray(np.cos(angle / 2)), **parts)
+
+    attitude = about(yaw, "z").product(about(pitch, "y")).product(about(roll, "x"))
+    wanted = Vec3.of(jnp.asarray([roll, pitch, yaw]))
+    assert apart(attitude.roll_pitch_yaw(), wanted) < 1e-12
+
+
+@given(rotations(), vectors())
+def test_rotation_vector_leads_from_one_to_the_other(a: Quaternion, v: Vec3) -> None:
+    small = v * 1e-4
+    half = small.norm() / 2
+    scale = float(jnp.sinc(half / jnp.pi)) / 2
+    turn = Quaternion(jnp.cos(half), small.x * scale, small.y * scale, small.z * scale)
+    assert apart(a.rotation_vector_to(a.product(turn)), small) < 1e-9
+    assert apart(a.rotation_vector_to(Quaternion.of(-a.product(turn).stacked())), small) < 1e-9
+
+
+@given(rotations(), vectors())
+def test_advanced_keeps_the_norm_and_follows_the_rate(a: Quaternion, rate: Vec3) -> None:
+    step = 1e-4
+    after = a.advanced(a, rate, step)
+    assert abs(float(jnp.sum(after.stacked() ** 2)) - 1.0) < 1e-14
+    assert apart(a.rotation_vector_to(after), rate * step) < 1e-8
+
+
+def test_from_matrix_takes_every_branch() -> None:
+    half_turns = [(0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)]
+    for four in [(1.0, 0.0, 0.0, 0.0), *half_turns]:
+        rotation = Quaternion.of(jnp.asarray(four))
+        assert same_rotation(Quaternion.from_matrix(rotation.matrix()), rotation)
+
+
+def test_matrix_rows_and_columns() -> None:
+    quarter = Quaternion.of(jnp.asarray([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
+    matrix: Matrix3 = quarter.matrix()
+    assert apart(matrix.x_axis, Vec3.of(jnp.asarray([0.0, 1.0, 0.0]))) < 1e-15
+    assert apart(matrix.y_axis, Vec3.of(jnp.asarray([-1.0, 0.0, 0.0]))) < 1e-15
