@@ -28,6 +28,7 @@ def hovergames_rates() -> RateGains:
         ff=_axes(0.0, 0.0, 0.0),
         k=_axes(1.0, 1.0, 1.0),
         integrator_limit=_axes(0.3, 0.3, 0.3),
+        saturation_feedback=jnp.asarray(1.0),
     )
 
 

@@ -23,7 +23,10 @@ def rate_control(table: Table) -> list[Deviation]:
 
 
 def _rate_sequence(table: Table) -> list[Deviation]:
-    gains = RateGains(*(table.vector(f"{name}_") for name in ("P", "I", "D", "FF", "K", "lim")))
+    gains = RateGains(
+        *(table.vector(f"{name}_") for name in ("P", "I", "D", "FF", "K", "lim")),
+        saturation_feedback=jnp.ones(len(table)),
+    )
     saturation = rate.Saturation(
         *(
             tuple(table.flag(f"sat_{sign}_{axis}") for axis in "xyz")  # type: ignore[arg-type]
