@@ -23,7 +23,7 @@ from tuner.objective.noise import CHANNELS, channel_noise
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = ("pose", "flight_controller")
-_CLOCK_OF = {
+CLOCK_OF = {
     "position": 0,
     "attitude": 0,
     "body_rate": 1,

@@ -51,6 +51,8 @@ class Stage(eqx.Module):
     scale
         Channel -> (F,) factor on the standard deviations: loosened at first, more for a lane that
         the model cannot match.
+    held
+        (clocks, F) s of clock offset for the signals that jump between samples.
     huber
         Residuals beyond so many (scaled) standard deviations count linearly; infinite for plain
         squares.
@@ -60,6 +62,7 @@ class Stage(eqx.Module):
 
     horizon: Int[Array, ""]
     scale: dict[str, Float[Array, " F"]]
+    held: Float[Array, "clocks F"]
     huber: Float[Array, ""]
     prior: Float[Array, ""]
 
@@ -125,7 +128,7 @@ class Objective(eqx.Module):
         """Return every lane's contribution, computed on all devices."""
         flier = _Flier(self.space, self.schedule, self.samples, self.limits)
         return _shared_sums(flier, derivatives)(
-            (self.lanes, point.offsets, stage.scale),
+            (self.lanes, point.offsets, stage.scale, stage.held),
             self.model,
             point.coefficients,
             stage.horizon,
@@ -164,7 +167,7 @@ class _Flier:
 
     def sums(
         self,
-        data: tuple[Lanes, Array, dict[str, Array]],
+        data: tuple[Lanes, Array, dict[str, Array], Array],
         model: Model,
         coefficients: Array,
         horizon: Array,
@@ -172,14 +175,14 @@ class _Flier:
         *,
         derivatives: bool,
     ) -> LaneSums:
-        lanes, offsets, scale = data
+        lanes, offsets, scale, held = data
         rate = float(self.schedule.log_rate)
 
         def simulate(vector: Array) -> Trace:
             return self.fly(model, lanes, vector, horizon)
 
         def compare(trace: Trace, clocks: Array) -> dict[str, Array]:
-            return residuals(trace, lanes, clocks * OFFSET_UNIT, rate=rate, horizon=horizon)
+            return residuals(trace, lanes, clocks * OFFSET_UNIT, held, rate=rate, horizon=horizon)
 
         if derivatives:
             trace, moved = _jacobian_forward(simulate, coefficients)

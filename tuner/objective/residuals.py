@@ -14,7 +14,7 @@ from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
-from tuner.objective.lanes import _CLOCK_OF, Lanes, Measured
+from tuner.objective.lanes import CLOCK_OF, Lanes, Measured
 
 
 class Trace(eqx.Module):
@@ -69,6 +69,7 @@ def residuals(
     trace: Trace,
     lanes: Lanes,
     offsets: Float[Array, "clocks F"],
+    held: Float[Array, "clocks F"],
     *,
     rate: float,
     horizon: Int[Array, ""],
@@ -83,6 +84,9 @@ def residuals(
         The recording.
     offsets
         s by which each clock's stamps are late: a sample stamped t was taken at t - offset.
+    held
+        Offsets at which signals that jump between samples are read exactly; from there to
+        ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
     rate
         Hz of the trace.
     horizon
@@ -90,8 +94,13 @@ def residuals(
     """
     found = {}
     for name, measured in lanes.measured.items():
-        time = measured.time - offsets[_CLOCK_OF[name]]
-        simulated = _at(trace.channels[name], time * rate, hold=name == "command")
+        clock = CLOCK_OF[name]
+        place = (measured.time - offsets[clock]) * rate
+        if name == "command":
+            before = (measured.time - held[clock]) * rate
+            simulated = _held_then_moved(trace.channels[name], before, place)
+        else:
+            simulated = _between(trace.channels[name], place)
         if name == "attitude":
             error = _attitude_error(measured, simulated)
         else:
@@ -101,18 +110,31 @@ def residuals(
     return found
 
 
-def _at(
-    series: Float[Array, "samples c F"], place: Float[Array, "n F"], *, hold: bool
-) -> Float[Array, "n c F"]:
-    """Read a series at fractional sample numbers: held, or interpolated linearly."""
+def _below(series: Array, place: Float[Array, "n F"]) -> Int[Array, "n 1 F"]:
     last = series.shape[0] - 2
-    below = jnp.clip(jnp.floor(lax.stop_gradient(place) + 1e-6), 0, last).astype(jnp.int32)
-    first = jnp.take_along_axis(series, below[:, None], axis=0)
-    if hold:
-        return first
-    second = jnp.take_along_axis(series, below[:, None] + 1, axis=0)
-    share = (place - below)[:, None]
-    return first + share * (second - first)
+    below = jnp.floor(lax.stop_gradient(place) + 1e-6).astype(jnp.int32)
+    return jnp.clip(below, 0, last)[:, None]
+
+
+def _between(
+    series: Float[Array, "samples c F"], place: Float[Array, "n F"]
+) -> Float[Array, "n c F"]:
+    """Read a series at fractional sample numbers by linear interpolation."""
+    below = _below(series, place)
+    first = jnp.take_along_axis(series, below, axis=0)
+    second = jnp.take_along_axis(series, below + 1, axis=0)
+    return first + (place[:, None] - below) * (second - first)
+
+
+def _held_then_moved(
+    series: Float[Array, "samples c F"], before: Float[Array, "n F"], place: Float[Array, "n F"]
+) -> Float[Array, "n c F"]:
+    """Read a series that is held between samples, moved a little along its interpolation.
+
+    Half a sample earlier the interpolation of a held signal is its mean.
+    """
+    held = jnp.take_along_axis(series, _below(series, before), axis=0)
+    return held + (_between(series, place - 0.5) - _between(series, before - 0.5))
 
 
 def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Float[Array, "n 3 F"]:

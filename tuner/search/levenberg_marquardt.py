@@ -18,7 +18,7 @@ RIDGE = 1e-13
 
 
 class Step(eqx.Module):
-    """Where a solver stands after a step.
+    """Where a solver stands after a step; with S starts, every leaf has S first.
 
     Attributes
     ----------
@@ -139,31 +139,66 @@ def _without_derivatives(sums: LaneSums) -> LaneSums:
     return eqx.tree_at(lambda s: (s.gradient, s.hessian), sums, empty)
 
 
-_SOLVER = optimistix.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):
+    """Levenberg-Marquardt that takes longer steps as soon as the model predicts well."""
+
+    rtol: float = 1e-9
+    atol: float = 1e-9
+    norm: Any = optimistix.max_norm
+    descent: Any = optimistix.DampedNewtonDescent()
+    search: Any = optimistix.ClassicalTrustRegion(
+        high_cutoff=0.7, low_cutoff=0.05, high_constant=5.0, low_constant=0.2
+    )
+    verbose: Any = eqx.field(static=True, default=lambda **_: None)
 
 
-@eqx.filter_jit
-def begin(objective: Objective, point: Point, stage: Stage, free: Array) -> Step:
-    """Set a stage up at a point; the first step evaluates it."""
+_SOLVER = _Solver()
+
+
+def _fresh(objective: Objective, point: Point, stage: Stage, free: Array) -> tuple[Any, Any, Any]:
+    """Return the function, the solver's first state, and the shape of what it reports."""
     fn = _square_problem(objective, stage, free)
     packed = _pack(point)
-    shape, aux = jax.eval_shape(lambda p: fn(p, None), packed)
-    state = _SOLVER.init(fn, packed, None, {}, shape, aux, frozenset())
-    arrays, _ = eqx.partition(state, eqx.is_array)
-    sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux)
+    shape, report = jax.eval_shape(lambda p: fn(p, None), packed)
+    return fn, _SOLVER.init(fn, packed, None, {}, shape, report, frozenset()), report
+
+
+def _begin(objective: Objective, point: Point, stage: Stage, free: Array) -> Step:
+    _, state, report = _fresh(objective, point, stage, free)
+    sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), report)
+    arrays = eqx.filter(state, eqx.is_array)
     return Step(point, arrays, sums, jnp.asarray(jnp.inf), jnp.asarray(True))
 
 
-@eqx.filter_jit
-def step(objective: Objective, before: Step, stage: Stage, free: Array) -> Step:
-    """Try one point: keep it if it is better, and propose the next."""
-    fn = _square_problem(objective, stage, free)
+def _advance(objective: Objective, before: Step, stage: Stage, free: Array) -> Step:
+    fn, template, _ = _fresh(objective, before.point, stage, free)
+    state = eqx.combine(before.solver, eqx.filter(template, eqx.is_array, inverse=True))
     packed = _pack(before.point)
-    shape, aux = jax.eval_shape(lambda p: fn(p, None), packed)
-    template = _SOLVER.init(fn, packed, None, {}, shape, aux, frozenset())
-    _, static = eqx.partition(template, eqx.is_array)
-    state = eqx.combine(before.solver, static)
     new, state, sums = _SOLVER.step(fn, packed, None, {}, state, frozenset())
-    arrays, _ = eqx.partition(state, eqx.is_array)
+    arrays = eqx.filter(state, eqx.is_array)
     accepted = state.num_steps_since_acceptance == 0
     return Step(_unpack(objective, new), arrays, sums, state.f_info.as_min(), accepted)
+
+
+@eqx.filter_jit
+def begin(objective: Objective, points: Point, stage: Stage, free: Array) -> Step:
+    """Set a stage up at S points; their leaves have S first, and so has every leaf returned."""
+    return eqx.filter_vmap(lambda point: _begin(objective, point, stage, free))(points)
+
+
+@eqx.filter_jit
+def advance(objective: Objective, before: Step, stage: Stage, free: Array) -> Step:
+    """Try one point for every start: keep those that are better, and propose the next.
+
+    Parameters
+    ----------
+    objective
+        The problem.
+    before
+        What `begin` or the last call returned.
+    stage
+        Horizon, scales, robust limit: may change without compiling again, but only at `begin`.
+    free
+        (K + clocks·F,) one for what may move, zero for what stays.
+    """
+    return eqx.filter_vmap(lambda step: _advance(objective, step, stage, free))(before)

@@ -1,0 +1,348 @@
+"""The growing horizon: fit the gentle beginning first, then more and more of every flight.
+
+A flight begins gently, where the problem is nearly linear; each stage starts from where the last
+ended, so that the simulation never strays far enough from the recording to fall into a false
+minimum. Noise is loosened at first, since the model is still wrong by more than noise.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
+from tuner.search.fitted import Iteration
+from tuner.search.levenberg_marquardt import Step, advance, begin
+
+HORIZONS = (1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
+"""s; the whole flights follow."""
+LOOSENING = (20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
+"""Factor on every standard deviation, stage by stage; 1 on whole flights."""
+OFFSETS_FROM = 5.0
+"""s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
+STRAY = 3.0
+"""A flight this many times worse than the others is weighed down, channel by channel."""
+FEEDBACK_AT = 3.0
+"""s of horizon at which the mixer's saturation feedback is tried both ways."""
+FEEDBACK_GAIN = 1.2
+"""The set-up's own choice is given up only for one that lowers the loss by this factor."""
+NO_OFFSET = 0.0005
+"""s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
+differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia."""
+HUBER = 4.0
+"""Standard deviations beyond which a residual counts linearly, in the polish."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """One stage of the schedule.
+
+    Attributes
+    ----------
+    name
+        For people.
+    horizon
+        Samples of the simulation.
+    loosening
+        Factor on the standard deviations.
+    robust
+        Whether large residuals count linearly.
+    offsets
+        Whether clock offsets are free; in the polish, those that matter.
+    steps
+        At most so many iterations.
+    tolerance
+        The stage ends when no start's loss falls by more than this share.
+    rescale
+        Whether scales are estimated from the residuals before it.
+    """
+
+    name: str
+    horizon: int
+    loosening: float
+    robust: bool
+    offsets: bool
+    steps: int
+    tolerance: float
+    rescale: bool
+
+
+def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Leg, ...]:
+    """Return the legs for flights of at most so many samples at a rate in Hz."""
+    legs = []
+    for seconds, loosening in zip(HORIZONS, LOOSENING, strict=True):
+        horizon = round(seconds * rate)
+        if horizon < samples:
+            legs.append(
+                Leg(
+                    name=f"first {seconds:g} s",
+                    horizon=horizon,
+                    loosening=loosening,
+                    robust=False,
+                    offsets=seconds >= OFFSETS_FROM,
+                    steps=min(8, steps),
+                    tolerance=0.02,
+                    rescale=False,
+                )
+            )
+    whole = Leg("whole flights", samples, 1.0, False, True, min(10, steps), 1e-3, False)
+    legs.append(whole)
+    polish = replace(whole, robust=robust, tolerance=1e-5, rescale=True, steps=min(15, steps))
+    legs += [replace(polish, name="polish"), replace(polish, name="polish again")]
+    return tuple(legs)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a growing-horizon search stands: all that is needed to go on.
+
+    Attributes
+    ----------
+    leg
+        Number of the leg that comes next, or that is under way where ``step`` is not None.
+    points
+        S points.
+    scales
+        Channel -> (F,) how much larger than the noise the residuals are taken to be.
+    losses
+        (S,) at the end of the last leg.
+    iterations
+        The trace so far.
+    evaluations
+        Jacobians so far.
+    converged
+        Whether the last leg ended by itself.
+    feedback
+        The mixer's saturation feedback that is flown: 1 as in PX4.
+    """
+
+    leg: int
+    points: Point
+    scales: dict[str, NDArray[np.float64]]
+    losses: NDArray[np.float64]
+    iterations: tuple[Iteration, ...]
+    evaluations: int
+    converged: bool = False
+    feedback: float = 1.0
+
+
+def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
+    """Return the state before the first leg for S start vectors (S, K)."""
+    offsets = jnp.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
+    lanes = objective.lanes.count
+    return Progress(
+        leg=0,
+        points=Point(jnp.asarray(vectors), offsets),
+        scales={name: np.ones(lanes) for name in objective.lanes.measured},
+        losses=np.full(len(vectors), np.inf),
+        iterations=(),
+        evaluations=0,
+    )
+
+
+def grow(
+    objective: Objective,
+    legs: tuple[Leg, ...],
+    progress: Progress,
+    *,
+    free_offsets: bool,
+    clipped: bool,
+    tell: Callable[[Iteration], None],
+) -> Iterator[Progress]:
+    """Run the remaining legs, yielding the state after each.
+
+    Parameters
+    ----------
+    objective
+        The problem.
+    legs
+        The schedule.
+    progress
+        Where to begin: `beginning`, or what an earlier call yielded.
+    free_offsets
+        Whether clock offsets may be fitted at all.
+    clipped
+        Whether rotors were clipped low in a recording: whether the rate integrator then stops is
+        tried both ways, for set-ups differ in it and a saturated yaw step shows it.
+    tell
+        Called after every iteration.
+    """
+    while progress.leg < len(legs):
+        leg = legs[progress.leg]
+        after = run_leg(objective, leg, progress, free_offsets, tell)
+        if leg.horizon / objective.schedule.log_rate == FEEDBACK_AT and clipped:
+            other = replace(progress, feedback=1.0 - progress.feedback)
+            rival = run_leg(objective, leg, other, free_offsets, tell)
+            spent = after.evaluations + rival.evaluations - progress.evaluations
+            better = after if after.losses.min() <= FEEDBACK_GAIN * rival.losses.min() else rival
+            after = replace(better, evaluations=spent)
+        progress = after
+        yield progress
+
+
+def run_leg(
+    objective: Objective,
+    leg: Leg,
+    progress: Progress,
+    free_offsets: bool,
+    tell: Callable[[Iteration], None],
+) -> Progress:
+    """Run one leg to its end for every start at once."""
+    objective = with_feedback(objective, progress.feedback)
+    best = int(np.argmin(progress.losses))
+    points, kept = progress.points, np.ones_like(np.asarray(progress.points.offsets[0]))
+    if leg.rescale:
+        kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET).astype(float)
+        points = Point(points.coefficients, points.offsets * kept)
+    stage = stage_of(leg, progress.scales, np.asarray(points.offsets[best]))
+    count = len(objective.space)
+    free = np.concatenate([np.ones(count), kept.ravel() * float(leg.offsets and free_offsets)])
+    step = on_host(begin(objective, on_host(points), on_host(stage), free))
+    iterations = list(progress.iterations)
+    trail: list[NDArray[np.float64]] = []
+    converged = False
+    for _ in range(leg.steps):
+        step = on_host(advance(objective, step, on_host(stage), free))
+        trail.append(np.asarray(step.loss))
+        iterations.append(_iteration(objective, leg, step, len(iterations)))
+        tell(iterations[-1])
+        if _settled(trail, np.asarray(step.accepted), leg.tolerance):
+            converged = True
+            break
+    scales = strays(step, progress.scales, leg.loosening)
+    if leg.rescale or leg.name == "whole flights":
+        scales = misfit(step)
+    return replace(
+        progress,
+        leg=progress.leg + 1,
+        points=step.point,
+        scales=scales,
+        losses=trail[-1],
+        iterations=tuple(iterations),
+        evaluations=progress.evaluations + len(trail),
+        converged=converged,
+    )
+
+
+def stage_of(
+    leg: Leg, scales: dict[str, NDArray[np.float64]], offsets: NDArray[np.float64]
+) -> Stage:
+    """Return what the solver needs to know of a leg; offsets (clocks, F) in units of 10 ms."""
+    return Stage(
+        horizon=jnp.asarray(leg.horizon),
+        scale={name: jnp.asarray(leg.loosening * scale) for name, scale in scales.items()},
+        held=jnp.asarray(offsets * OFFSET_UNIT),
+        huber=jnp.asarray(HUBER if leg.robust else np.inf),
+        prior=jnp.asarray(1.0),
+    )
+
+
+def on_host(tree: Any) -> Any:
+    """Return a pytree with numpy leaves: the same compiled step then serves every iteration.
+
+    What comes back from several devices would otherwise count as another kind of argument.
+    """
+    return jax.tree.map(np.asarray, tree)
+
+
+def _settled(
+    trail: list[NDArray[np.float64]], accepted: NDArray[np.bool_], tolerance: float
+) -> bool:
+    """Tell whether no start gains any more: not by its last step, nor by its last three tries."""
+    if len(trail) < 2:
+        return False
+    last = trail[-1]
+
+    def still(before: NDArray[np.float64]) -> NDArray[np.bool_]:
+        return np.asarray(before - last <= tolerance * np.abs(last))
+
+    stuck = still(trail[-4]) if len(trail) > 3 else np.zeros(len(last), bool)
+    return bool(np.all((accepted & still(trail[-2])) | stuck))
+
+
+def root_mean_squares(step: Step, start: int) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (F,) root mean square residual in σ at the point tried, NaN if none."""
+    found = {}
+    for name, squares in step.sums.squares.items():
+        counts = np.asarray(step.sums.counts[name][start])
+        mean = np.asarray(squares[start]) / np.maximum(counts, 1.0)
+        found[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
+    return found
+
+
+def strays(
+    step: Step, scales: dict[str, NDArray[np.float64]], loosening: float
+) -> dict[str, NDArray[np.float64]]:
+    """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
+    found = root_mean_squares(step, int(np.argmin(np.asarray(step.loss))))
+    table = np.stack(list(found.values())) / loosening
+    with np.errstate(all="ignore"):
+        per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
+    typical = max(float(np.median(per_flight)), 1.0)
+    stray = per_flight > STRAY * typical
+    return {
+        name: np.where(stray & np.isfinite(values), np.maximum(values / loosening, 1.0), 1.0)
+        for name, values in found.items()
+    }
+
+
+def misfit(step: Step) -> dict[str, NDArray[np.float64]]:
+    """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
+    found = root_mean_squares(step, int(np.argmin(np.asarray(step.loss))))
+    return {name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in found.items()}
+
+
+def _iteration(objective: Objective, leg: Leg, step: Step, number: int) -> Iteration:
+    best = int(np.argmin(np.asarray(step.loss)))
+    rate = float(objective.schedule.log_rate)
+    return Iteration(
+        stage=leg.name,
+        number=number,
+        loss=float(step.loss[best]),
+        position_rmse=_position_rmse(objective, step, best),
+        accepted=bool(step.accepted[best]),
+        horizon=leg.horizon / rate,
+    )
+
+
+def _position_rmse(objective: Objective, step: Step, start: int) -> float:
+    if "position" not in objective.lanes.measured:
+        return float("nan")
+    weight = np.asarray(objective.lanes.measured["position"].weight)
+    sigma = 1.0 / weight.max(initial=1e-30)
+    counts = float(jnp.sum(step.sums.counts["position"][start]))
+    squares = float(jnp.sum(step.sums.squares["position"][start]))
+    return sigma * float(np.sqrt(3.0 * squares / max(counts, 1.0)))
+
+
+def point_of(points: Point, start: int) -> Point:
+    """Return one of S points."""
+    picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
+    return picked
+
+
+def one(point: Point) -> Point:
+    """Return a point as the only one of S = 1."""
+    alone: Point = jax.tree.map(lambda leaf: leaf[None], point)
+    return alone
+
+
+def with_feedback(objective: Objective, feedback: float) -> Objective:
+    """Return the objective with the mixer's saturation feedback set: 1 as in PX4, 0 without."""
+    changed: Objective = eqx.tree_at(
+        lambda o: o.model.controller.rate.saturation_feedback, objective, jnp.asarray(feedback)
+    )
+    return changed
+
+
+def seconds_since(start: float) -> float:
+    """Return the wall time since a `time.perf_counter` reading."""
+    return time.perf_counter() - start
