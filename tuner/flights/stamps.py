@@ -35,10 +35,14 @@ def believe(
         Topics whose stamps are not to be used.
     """
     notes: list[Note] = []
+    unset: list[str] = []
     times: dict[str, Nanoseconds] = {}
     offsets: dict[str, int] = {}
     for topic, of in samples.items():
         if of.stamp is None or topic in receive_only or not len(of.stamp):
+            continue
+        if _unset(of.stamp, of.receive):
+            unset.append(topic)
             continue
         stamp, repaired = _repair(topic, of.stamp, of.receive)
         notes.extend(repaired)
@@ -54,10 +58,20 @@ def believe(
         if topic not in times:
             # Where all stamps count from a start-up, arrivals are moved to count from there too.
             times[topic] = of.receive + (common if abs(common) > SECOND else 0)
-            if topic not in receive_only:
+            if topic in unset:
+                text = "its stamps are not set: its times are those of recording"
+                notes.append(Note("warning", topic, text, len(of.receive)))
+            elif topic not in receive_only:
                 text = "has no header: its times are those of recording"
                 notes.append(Note("info", topic, text, len(of.receive)))
     return times, tuple(notes)
+
+
+def _unset(stamp: Nanoseconds, receive: Nanoseconds) -> bool:
+    """Tell whether stamps do not go on as their arrivals do."""
+    passed = np.quantile(receive, 0.9) - np.quantile(receive, 0.1)
+    went_on = np.quantile(stamp, 0.9) - np.quantile(stamp, 0.1)
+    return bool(passed > SECOND and went_on < passed / 2)
 
 
 def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanoseconds, list[Note]]:

@@ -6,6 +6,7 @@ import sqlite3
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
@@ -63,38 +64,60 @@ class Db3:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
-        """Yield the messages of some connections, some thousands at a time, in one pass.
-
-        Where a page of the database is damaged, reading goes on some messages later.
-        """
-        done, attempts, said = 0, 0, ""
+        """Yield the messages of some connections, some thousands at a time, in one pass."""
         pending = {number: _Pending() for number in wanted}
         marks = ", ".join("?" for _ in pending)
+        rows = self._rows(
+            f"topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) AND "
+            "typeof(timestamp) = 'integer' AND typeof(data) = 'blob' "
+            f"AND length(data) < {LARGEST_CHUNK} AND",
+            tuple(pending),
+        )
+        for number, time, blob in rows:
+            pending[number].add(time, blob)
+            if pending[number].full:
+                yield number, pending[number].block()
+        for number, rest in pending.items():
+            if rest.times:
+                yield number, rest.block()
+
+    def _rows(self, query: str, values: tuple[int, ...]) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query in the order of their number.
+
+        Where a page of the database is damaged, reading goes on some rows later, each time twice
+        as many.
+        """
+        done, attempts, said = 0, 0, ""
         while attempts < ATTEMPTS:
             try:
                 with _opened(self.path) as database:
-                    for row, number, time, blob in database.execute(
-                        "SELECT id, topic_id, timestamp, data FROM messages "
-                        f"WHERE topic_id IN ({marks}) AND id > ? "
-                        "AND typeof(timestamp) = 'integer' AND typeof(data) = 'blob' "
-                        f"AND length(data) < {LARGEST_CHUNK} ORDER BY id",
-                        (*pending, done),
+                    for row in database.execute(
+                        f"SELECT id, {query} id > ? ORDER BY id", (*values, done)
                     ):
-                        done = row
-                        pending[number].add(time, blob)
-                        if pending[number].full:
-                            yield number, pending[number].block()
+                        done = row[0]
+                        yield row[1:]
                 break
             except sqlite3.Error as err:
                 said = str(err)
                 attempts += 1
                 done += 1 << attempts
-        for number, rest in pending.items():
-            if rest.times:
-                yield number, rest.block()
-        if said:
-            text = f"the database is damaged ({said}), messages around the damage are lost"
+        if said and not self.notes:
+            text = f"the database is damaged ({said}); what lies around the damage is lost"
             self.notes.append(Note("warning", "", text, attempts))
+
+    def _counts(self, database: sqlite3.Connection) -> dict[int, int]:
+        """Count the messages of each connection; row by row where the database is damaged."""
+        try:
+            return dict(
+                database.execute(
+                    "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
+                ).fetchall()
+            )
+        except sqlite3.DatabaseError:
+            counts: dict[int, int] = {}
+            for (number,) in self._rows("topic_id FROM messages WHERE", ()):
+                counts[number] = counts.get(number, 0) + 1
+            return counts
 
     def _learn(self, database: sqlite3.Connection, has_definitions: bool) -> None:
         texts = {}
@@ -105,9 +128,7 @@ class Db3:
             ):
                 if encoding in forms and isinstance(text, str):
                     texts[kind] = MessageDefinition(forms[encoding], text)
-        counts = dict(
-            database.execute("SELECT topic_id, count(*) FROM messages GROUP BY topic_id").fetchall()
-        )
+        counts = self._counts(database)
         for number, topic, kind, encoding in database.execute(
             "SELECT id, name, type, serialization_format FROM topics"
         ):
@@ -125,11 +146,14 @@ class _opened:  # noqa: N801 (used like a function)
         unfinished = path.with_name(path.name + "-wal").exists()
         how = "mode=ro" if unfinished else "mode=ro&immutable=1"
         self._database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{how}", uri=True)
+        self._cut = _is_cut(path)
         self._steps = 0
 
     def __enter__(self) -> sqlite3.Connection:
         self._database.execute("PRAGMA trusted_schema = OFF")
         self._database.execute("PRAGMA cell_size_check = ON")
+        if self._cut:  # else SQLite refuses a file that is shorter than it says
+            self._database.execute("PRAGMA writable_schema = ON")
         self._database.set_progress_handler(self._tick, 1_000_000)
         return self._database
 
@@ -139,6 +163,17 @@ class _opened:  # noqa: N801 (used like a function)
     def _tick(self) -> int:
         self._steps += 1
         return int(self._steps > PATIENCE)
+
+
+def _is_cut(path: Path) -> bool:
+    """Tell whether a database is shorter than its header says."""
+    with path.open("rb") as stream:
+        header = stream.read(32)
+    if len(header) < 32:
+        return False
+    page = int.from_bytes(header[16:18], "big")
+    pages = int.from_bytes(header[28:32], "big")
+    return path.stat().st_size < pages * (page if page > 1 else 65_536)
 
 
 @dataclass

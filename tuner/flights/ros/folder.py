@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+import weakref
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 
 import yaml
 
@@ -47,7 +49,7 @@ class Folder:
     _files: list[Container] = field(default_factory=list)
     _numbers: dict[int, tuple[int, int]] = field(default_factory=dict)
     _compressed: bool = False
-    _unpacked: TemporaryDirectory[str] | None = None
+    _unpacked: Path | None = None
 
     def __post_init__(self) -> None:
         names, mode = self._metadata()
@@ -114,8 +116,9 @@ class Folder:
     def _unpack(self, path: Path) -> Path:
         """Unpack a file that was compressed as a whole."""
         if self._unpacked is None:
-            self._unpacked = TemporaryDirectory(prefix="tune-")
-        target = Path(self._unpacked.name) / path.stem
+            self._unpacked = Path(mkdtemp(prefix="tune-"))
+            weakref.finalize(self, shutil.rmtree, self._unpacked, True)
+        target = self._unpacked / path.stem
         written = 0
         try:
             with zstd().open(path, "rb") as packed, target.open("wb") as stream:

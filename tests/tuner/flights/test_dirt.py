@@ -1,0 +1,282 @@
+"""What goes wrong in real recordings: each defect is survived, and told."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.tuner.flights import making
+from tuner.errors import RecordingError
+from tuner.flights import Flight, load_flight, load_flights
+
+POSE = "/optitrack/pose"
+GYRO = "/mavros/imu/data"
+Change = Callable[[str, int, Any], list[tuple[int, Any]]]
+
+
+@pytest.fixture(scope="module")
+def clean(short: Path) -> Flight:
+    return load_flight(short)
+
+
+@pytest.fixture
+def dirty(short: Path, tmp_path: Path) -> Callable[[Change], Flight]:
+    """Load the short bag after each message went through a change."""
+    return lambda change: load_flight(making.rewrite(short, tmp_path / "dirty.bag", change))
+
+
+def told(flight: Flight, text: str, topic: str = "") -> int:
+    """Return the count of the one note with a text."""
+    (note,) = [n for n in flight.notes if text in n.text and topic in n.topic]
+    return note.count
+
+
+def near(
+    got: Flight, expected: Flight, *, position: float = 1e-3, signal: str = "position"
+) -> None:
+    count = min(len(got.time), len(expected.time)) - 20
+    difference = np.abs(got.signals[signal][:count] - expected.signals[signal][:count])
+    assert np.nanmax(difference) < position
+    assert np.isfinite(got.signals[signal][:count]).mean() > 0.9
+
+
+def test_dropped_duplicated_and_late_messages(clean: Flight, dirty: Any) -> None:
+    random = np.random.default_rng(0)
+    held: list[tuple[int, Any]] = []
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic != POSE:
+            return [(time, message)]
+        chance = random.random()
+        if chance < 0.05:
+            return []
+        if chance < 0.10:
+            return [(time, message), (time + 1000, copy.deepcopy(message))]
+        if chance < 0.15 and not held:
+            held.append((time, message))
+            return []
+        late = [(time + 2000, held.pop()[1])] if held else []
+        return [(time, message), *late]
+
+    got = dirty(change)
+    near(got, clean, position=5e-3)
+    assert told(got, "position samples with a stamp seen before dropped") > 30
+    assert told(got, "position samples out of order") > 30
+
+
+def test_nan_and_quaternion_dirt(clean: Flight, dirty: Any) -> None:
+    random = np.random.default_rng(0)
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            chance = random.random()
+            q = message.pose.orientation
+            if chance < 0.02:
+                message.pose.position.y = float("nan")
+            elif chance < 0.4:
+                q.w, q.x, q.y, q.z = -q.w, -q.x, -q.y, -q.z
+            elif chance < 0.5:
+                q.w, q.x, q.y, q.z = 1.3 * q.w, 1.3 * q.x, 1.3 * q.y, 1.3 * q.z
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=5e-3)
+    near(got, clean, signal="attitude")
+    assert told(got, "position samples without a number dropped") > 10
+    assert told(got, "no unit quaternion") > 100
+
+
+def test_single_wrong_stamps_and_a_clock_that_was_set(clean: Flight, dirty: Any) -> None:
+    random = np.random.default_rng(0)
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            stamp = making.stamp_of(message)
+            if random.random() < 0.01:
+                making.stamped(message, 0)
+            elif stamp > 1_664_800_009_000_000_000:
+                making.stamped(message, stamp + 3_600_000_000_000)
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=5e-3)
+    assert told(got, "stamps far from their neighbours", POSE) > 5
+    assert "3600.0" in next(n.text for n in got.notes if "its clock jumped" in n.text)
+
+
+def test_a_topic_on_another_clock_is_moved(clean: Flight, dirty: Any) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            making.stamped(message, making.stamp_of(message) - 7_300_000_000)
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=5e-3)
+    assert told(got, "stamped by another clock", POSE) > 1000
+
+
+def test_motion_capture_behind_the_gyro_is_found_by_correlation(clean: Flight, dirty: Any) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            making.stamped(message, making.stamp_of(message) + 80_000_000)
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=5e-3)
+    text = next(n.text for n in got.notes if "by correlation: moved" in n.text)
+    assert float(text.split("+")[1].split(" ")[0]) == pytest.approx(80, abs=1.5)
+
+
+def test_unset_header_stamps_give_way_to_receive_times(clean: Flight, dirty: Any) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == GYRO:
+            making.stamped(message, 0)
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=0.2, signal="body_rate")
+    assert [n for n in got.notes if n.topic == GYRO and n.kind == "warning"]
+
+
+def test_wrong_frame_and_order_are_turned(clean: Flight, dirty: Any) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            q = message.pose.orientation
+            q.w, q.x, q.y, q.z = q.x, q.y, q.z, q.w
+        if topic == GYRO:
+            w = message.angular_velocity
+            w.x, w.y, w.z = w.x, -w.y, -w.z
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=1e-9, signal="attitude")
+    near(got, clean, position=1e-9, signal="body_rate")
+    assert told(got, "attitude is scalar-last") > 1000
+    assert told(got, "body_rate is in FRD axes") > 1000
+
+
+def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:
+    lost = range(1_664_800_008_000_000_000, 1_664_800_008_600_000_000)
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        return [] if topic == POSE and time in lost else [(time, message)]
+
+    got = dirty(change)
+    near(got, clean)
+    gap = np.isnan(got.signals["position"][:, 0])
+    assert 55 <= gap.sum() <= 62
+    assert not np.isnan(got.signals["body_rate"]).any()
+
+
+def test_several_missions_in_one_bag(short: Path, tmp_path: Path) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        pause = 1_664_800_009_000_000_000 <= time < 1_664_800_011_000_000_000
+        return [] if pause and topic == "/mavros/setpoint_raw/attitude" else [(time, message)]
+
+    path = making.rewrite(short, tmp_path / "two.bag", change)
+    first, second = load_flights(path)
+    assert (first.name, second.name) == ("two", "two-2")
+    assert first.duration == pytest.approx(4.99, abs=0.02)
+    assert second.duration == pytest.approx(4.99, abs=0.02)
+    assert second.series["position"].time[0] == pytest.approx(-2, abs=0.02)
+    assert load_flight(path, mission=2).duration == second.duration
+    with pytest.raises(RecordingError, match="holds 2 missions, not 3"):
+        load_flight(path, mission=3)
+
+
+def test_take_off_and_landing_are_cut(short: Path, tmp_path: Path) -> None:
+    """Set-points run from the ground on; the mission begins when the reference moves in the air."""
+    start, stop = 1_664_800_000_000_000_000, 1_664_800_016_000_000_000
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        since, until = (time - start) * 1e-9, (stop - time) * 1e-9
+        up = min(1.0, max(0.0, since - 1.0), max(0.0, until - 1.0))
+        if topic == POSE:
+            message.pose.position.z *= up
+        if topic == "/mavros/rc/out":
+            message.channels = np.full(4, 1000, np.uint16) if up == 0 else message.channels
+        return [(time, message)]
+
+    got = load_flight(making.rewrite(short, tmp_path / "whole.bag", change))
+    assert got.time[0] == 0
+    assert got.signals["position"][:-1, 2].min() > 0.1
+    assert got.duration == pytest.approx(12.0 - 1.1, abs=0.15)
+    no_setpoints = making.rewrite(
+        tmp_path / "whole.bag",
+        tmp_path / "reference.bag",
+        lambda topic, time, message: [] if "setpoint_raw" in topic else [(time, message)],
+    )
+    got = load_flight(no_setpoints)
+    assert got.signals["reference_velocity"][0, 1] == pytest.approx(0.0014)
+    assert got.duration == pytest.approx(12.0 - 1.1, abs=0.15)
+
+
+def test_bag_cut_off_in_the_middle(short: Path, tmp_path: Path, clean: Flight) -> None:
+    path = tmp_path / "cut.bag"
+    path.write_bytes(short.read_bytes()[: int(short.stat().st_size * 0.7)])
+    got = load_flight(path)
+    near(got, clean, position=1e-5)
+    assert 6 < got.duration < 10
+    assert told(got, "salvaged") > 4000
+
+
+def test_bag_that_was_never_closed(short: Path, tmp_path: Path, clean: Flight) -> None:
+    raw = short.read_bytes()
+    at = raw.index(b"index_pos=") + len(b"index_pos=")
+    path = tmp_path / "active.bag"
+    path.write_bytes(raw[:at] + bytes(8) + raw[at + 8 :])
+    got = load_flight(path)
+    near(got, clean, position=1e-5)
+    assert got.duration == clean.duration
+    assert told(got, "never closed") > 8000
+
+
+def test_damaged_chunk_costs_that_chunk_only(short: Path, tmp_path: Path, clean: Flight) -> None:
+    path = tmp_path / "holed.bag"
+    raw = bytearray(making.rewrite(short, path, chunk=1 << 16).read_bytes())
+    size = raw.index(b"compression=", len(raw) // 2)
+    raw[size : size + 16] = b"compression=zzzz"
+    path.write_bytes(raw)
+    got = load_flight(path)
+    near(got, clean, position=1e-5)
+    assert told(got, "chunks are damaged") == 1
+
+
+@pytest.mark.parametrize("storage", making.StoragePlugin, ids=lambda storage: storage.name)
+def test_ros2_cut_off(storage: Any, short: Path, tmp_path: Path, clean: Flight) -> None:
+    folder = making.to_ros2(short, tmp_path / "whole", storage)
+    (file,) = (path for path in folder.iterdir() if path.suffix != ".yaml")
+    cut = tmp_path / f"cut{file.suffix}"
+    cut.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.7)])
+    got = load_flight(cut)
+    near(got, clean, position=1e-5)
+    assert [n for n in got.notes if n.kind == "warning"]
+
+
+def test_namespace_is_suggested_and_works(short: Path, tmp_path: Path, clean: Flight) -> None:
+    path = making.rewrite(short, tmp_path / "uav.bag", rename=lambda topic: f"/uav1{topic}")
+    with pytest.raises(RecordingError) as caught:
+        load_flight(path, topics="mavros")
+    said = str(caught.value)
+    assert "no topic /mavros/local_position/pose; found /uav1/mavros/local_position/pose" in said
+    assert said.endswith("use --namespace uav1")
+    near(load_flight(path, namespace="uav1"), clean, position=1e-12)
+
+
+def test_side_car_names_the_trajectory_and_the_mission(short: Path, tmp_path: Path) -> None:
+    path = making.rewrite(short, tmp_path / "side.bag")
+    (tmp_path / "side.yaml").write_text(
+        "trajectory: {name: circle, radius: 2.0, speed_scale: 2.1}\nstart: 6.0\nend: 11\n"
+    )
+    got = load_flight(path)
+    assert got.trajectory == {"name": "circle", "radius": 2.0, "speed_scale": 2.1}
+    assert got.duration == pytest.approx(5.0, abs=0.02)
+    (tmp_path / "side.yaml").write_text("trajectory: {name: cirlce}")
+    with pytest.raises(Exception, match="did you mean 'circle'") as caught:
+        load_flight(path)
+    assert "\n" not in str(caught.value)
