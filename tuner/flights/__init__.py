@@ -1,6 +1,40 @@
-"""Recordings in, `Flight` out: nothing downstream of this room knows what a bag is."""
+"""Recordings in, `Flight` out: nothing downstream of this room knows what a bag is.
 
-from tuner.flights.flight import SIGNALS, Flight, InitialState, Note, Series
-from tuner.flights.load import load_flight, load_flights
+Names are imported when they are first used, so that `tune inspect` answers from its cache before
+numpy is loaded.
+"""
 
-__all__ = ["SIGNALS", "Flight", "InitialState", "Note", "Series", "load_flight", "load_flights"]
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tuner.flights.flight import SIGNALS, Flight, InitialState, Note, Series
+    from tuner.flights.inspection import Inspection, inspect_recordings
+    from tuner.flights.load import load_flight, load_flights
+
+__all__ = [
+    "SIGNALS",
+    "Flight",
+    "InitialState",
+    "Inspection",
+    "Note",
+    "Series",
+    "inspect_recordings",
+    "load_flight",
+    "load_flights",
+]
+
+_HOMES = {
+    "Inspection": "inspection",
+    "inspect_recordings": "inspection",
+    "load_flight": "load",
+    "load_flights": "load",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES.get(name, 'flight')}"), name)

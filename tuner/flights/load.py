@@ -1,166 +1,32 @@
-"""A recording file into `Flight`s: read, map, clean, synchronise, find the missions, resample."""
+"""A recording file into `Flight`s: each mission on its uniform clock, kept in the cache."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tuner.errors import RecordingError
-from tuner.flights.clean import clean
+from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.clock import Grid, fit_grid
-from tuner.flights.extract import Raw, extract
+from tuner.flights.content import Content, Settings, given_map, read_content
 from tuner.flights.flight import SIGNALS, Array, Flight, Note, Series
-from tuner.flights.frames import correct_frames
+from tuner.flights.flight_cache import from_parquet, to_parquet
 from tuner.flights.initial import initial_state
-from tuner.flights.locate import Place, choose_map, locate, require_pose
-from tuner.flights.mission import Mission, find_missions, yaw_spin
-from tuner.flights.opening import open_recording
-from tuner.flights.recording import Recording, Samples, digest
+from tuner.flights.mission import Mission, yaw_spin
 from tuner.flights.resample import resample
 from tuner.flights.sidecar import Sidecar, read_sidecar
-from tuner.flights.sync import align_pose
-from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
+from tuner.flights.topics import TopicMap
 
 #: Seconds before the mission that the series keep.
 BEFORE = 2.0
 #: Seconds after it within which samples still help to interpolate its end.
 AFTER = 0.2
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How a recording is to be read.
-
-    Attributes
-    ----------
-    topics
-        Topic map, its file, or the name of a shipped one; None takes the shipped map that finds
-        most signals.
-    namespace
-        Prefix of the recorded topics that the map does not have, as ``uav1``.
-    rate
-        Hz of the uniform clock.
-    """
-
-    topics: str | Path | TopicMap | None = None
-    namespace: str = ""
-    rate: float = 100.0
-
-
-@dataclass(frozen=True)
-class Content:
-    """A recording once read: its signals cleaned, on one clock, and the missions in them.
-
-    Attributes
-    ----------
-    recording
-        The file.
-    topic_map
-        The map that was used.
-    places
-        Signal -> where it was found.
-    samples
-        Topic -> its messages as recorded.
-    series
-        Signal -> cleaned samples, in seconds since the first pose.
-    epoch
-        Nanoseconds of that first pose, by the recording's clock.
-    missions
-        What was flown.
-    notes
-        What was dropped, repaired or doubted.
-    """
-
-    recording: Recording
-    topic_map: TopicMap
-    places: Mapping[str, Place]
-    samples: Mapping[str, Samples]
-    series: Mapping[str, Series]
-    epoch: int
-    missions: tuple[Mission, ...]
-    notes: tuple[Note, ...]
-
-
-def read_content(path: Path, settings: Settings, sidecar: Sidecar) -> Content:
-    """Read a recording up to its missions.
-
-    Raises
-    ------
-    RecordingError
-        The file cannot be read or holds no pose.
-    ConfigError
-        The topic map is wrong.
-    """
-    topics = settings.topics or sidecar.topics
-    given = load_topic_map(topics) if isinstance(topics, str | Path) else topics
-    recording = open_recording(path, given.messages if given is not None else ())
-    namespace = settings.namespace or sidecar.namespace
-    candidates = [given] if given is not None else list(shipped_maps())
-    candidates = [one.under(namespace) for one in candidates]
-    if all(one.format != recording.format for one in candidates):
-        raise RecordingError(
-            path,
-            f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
-            f"'{candidates[0].format}'",
-            "give a map for this format",
-        )
-    chosen = choose_map(recording, candidates)
-    places, notes = locate(recording, chosen)
-    require_pose(recording, chosen, places)
-    raw, samples, noticed = extract(recording, places, chosen.clocks)
-    said = [
-        Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
-        *notes,
-        *noticed,
-    ]
-    series, epoch = _clean(path, raw, said)
-    topics_of = {signal: data.topic for signal, data in raw.items()}
-    series, noticed = align_pose(series, topics_of)
-    said.extend(noticed)
-    series, noticed = correct_frames(series, topics_of)
-    said.extend(noticed)
-    said.extend(_unmeasured(series, topics_of))
-    missions = _missions(series, sidecar)
-    return Content(recording, chosen, places, samples, series, epoch, missions, tuple(said))
-
-
-def _clean(path: Path, raw: Mapping[str, Raw], said: list[Note]) -> tuple[dict[str, Series], int]:
-    epoch = min((int(raw[name].time.min()) for name in ("position",) if name in raw), default=0)
-    series = {}
-    for signal, data in raw.items():
-        seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
-        time, values, found = clean(signal, data.topic, seconds, data.values)
-        said.extend(found)
-        if len(time):
-            series[signal] = Series(time, values)
-    for needed in ("position", "attitude"):
-        if needed not in series:
-            topic = raw[needed].topic if needed in raw else needed
-            raise RecordingError(path, f"no usable {needed} in {topic}", "inspect the recording")
-    return series, epoch
-
-
-def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:
-    """Say which rotors have no tachometer."""
-    if "rotor_speed" not in series:
-        return []
-    missing = np.flatnonzero(np.isnan(series["rotor_speed"].values).all(axis=0))
-    if len(missing) == 0:
-        return []
-    text = f"rotors {', '.join(str(rotor) for rotor in missing)} have no tachometer"
-    return [Note("info", topics["rotor_speed"], text, len(missing))]
-
-
-def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
-    if sidecar.start is None and sidecar.end is None:
-        return find_missions(series)
-    end = float(series["position"].time[-1])
-    start = sidecar.start if sidecar.start is not None else 0.0
-    return (Mission(start, min(end, sidecar.end or end), "the side-car"),)
+#: Longer missions, on the uniform clock, come of broken stamps.
+MOST_TICKS = 2_000_000
 
 
 def make_flight(
@@ -180,6 +46,9 @@ def make_flight(
     count = math.floor((mission.end - start) * rate + 1e-6) + 1
     if count < 2:
         raise RecordingError(path, "its mission ends where it starts", "inspect the recording")
+    if count > MOST_TICKS:
+        said = f"its mission lasts {(mission.end - start) / 3600:.0f} h"
+        raise RecordingError(path, said, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
     around = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
@@ -204,7 +73,7 @@ def make_flight(
         series=own,
         initial=initial_state(around),
         yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
-        trajectory=sidecar.trajectory,
+        trajectory=sidecar.trajectory.model_dump() if sidecar.trajectory else None,
         notes=tuple(notes),
     )
 
@@ -237,18 +106,48 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
     return resample(signal, series, clock)
 
 
+def reading_key(
+    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
+) -> tuple[str, ...]:
+    """Return what a recording's reading depends on, beside the readers themselves."""
+    messages = [digest(file) for file in given.messages if file.exists()] if given else []
+    told = (settings.namespace, settings.rate, sidecar, given, messages)
+    return (digest(path), path.name, *(repr(one) for one in told))
+
+
 def load_flights(
     path: str | Path,
     *,
     topics: str | Path | TopicMap | None = None,
     namespace: str = "",
     rate: float = 100.0,
+    cache: bool = True,
 ) -> tuple[Flight, ...]:
     """Read every mission of a recording; see `load_flight`."""
     path = Path(path)
     settings = Settings(topics, namespace, rate)
+    if not path.exists():
+        raise RecordingError(path, "no such file", "check the path")
     sidecar = read_sidecar(path)
-    content = read_content(path, settings, sidecar)
+    given = given_map(path, settings, sidecar)
+    kept = None
+    if cache:
+        kept = cached("flights", *reading_key(path, settings, sidecar, given))
+        content = load(kept)
+        flights = from_parquet(content) if content is not None else None
+        if flights is not None:
+            # The same content may lie elsewhere now.
+            return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
+    flights = _read_flights(path, settings, sidecar, given)
+    if kept is not None:
+        store(kept, to_parquet(flights))
+    return flights
+
+
+def _read_flights(
+    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
+) -> tuple[Flight, ...]:
+    content = read_content(path, settings, sidecar, given)
     if not content.missions:
         raise RecordingError(
             path,
@@ -257,8 +156,8 @@ def load_flights(
         )
     sha256 = digest(path)
     return tuple(
-        make_flight(path, content, index, sha256=sha256, sidecar=sidecar, rate=rate)
-        for index in range(len(content.missions))
+        make_flight(path, content, i, sha256=sha256, sidecar=sidecar, rate=settings.rate)
+        for i in range(len(content.missions))
     )
 
 
@@ -269,6 +168,7 @@ def load_flight(
     namespace: str = "",
     rate: float = 100.0,
     mission: int = 1,
+    cache: bool = True,
 ) -> Flight:
     """Read one mission of a recording.
 
@@ -285,6 +185,8 @@ def load_flight(
         Hz of the uniform clock.
     mission
         Which mission, from 1, of a recording that holds several.
+    cache
+        Keep what was read in the user's cache, and take it from there.
 
     Raises
     ------
@@ -293,7 +195,7 @@ def load_flight(
     ConfigError
         The topic map or the side-car is wrong.
     """
-    flights = load_flights(path, topics=topics, namespace=namespace, rate=rate)
+    flights = load_flights(path, topics=topics, namespace=namespace, rate=rate, cache=cache)
     if not 1 <= mission <= len(flights):
         raise RecordingError(
             path, f"holds {len(flights)} missions, not {mission}", "name one of those"

@@ -14,6 +14,8 @@ from tuner.flights.flight import Array, Series
 AT_REST = 1e-5
 #: Set-points that pause for longer, in s, begin another mission.
 PAUSE = 1.0
+#: A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer.
+MOMENT = 0.2
 #: A shorter stretch, in s, is no mission.
 SHORTEST = 2.0
 #: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s.
@@ -169,11 +171,11 @@ def _runs(height: Array, where: NDArray[np.intp]) -> list[Array]:
 
 
 def _stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return the stretches in which a condition holds, shorter breaks than a pause bridged."""
+    """Return the stretches in which a condition holds, breaks of a moment bridged."""
     index = np.flatnonzero(up)
     if len(index) == 0:
         return []
-    breaks = np.flatnonzero(np.diff(time[index]) > PAUSE)
+    breaks = np.flatnonzero(np.diff(time[index]) > MOMENT)
     starts = np.concatenate([[0], breaks + 1])
     ends = np.concatenate([breaks, [len(index) - 1]])
     return [

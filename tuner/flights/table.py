@@ -5,9 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.errors import RecordingError
 from tuner.flights.flight import Array, Note
@@ -178,12 +179,18 @@ def _numbers(column: pyarrow.ChunkedArray) -> Array:
 
     try:
         if _is_text(column):
-            blank = compute.equal(column, "")
-            column = compute.if_else(blank, "nan", column)
-        numbers = compute.cast(column, float64())
-        return np.asarray(numbers.to_numpy(), dtype=np.float64)
+            column = compute.replace_substring_regex(column, pattern=r"^\s*$", replacement="nan")
+        return np.asarray(_array(compute.cast(column, float64())), dtype=np.float64)
     except (ArrowInvalid, ArrowNotImplementedError):
         return np.array([_number(cell) for cell in column.to_pylist()], dtype=np.float64)
+
+
+def _array(column: pyarrow.ChunkedArray) -> NDArray[Any]:
+    """Return a column's numbers, in a way that leaves pandas asleep (half a second) if it can."""
+    whole = column.combine_chunks()
+    if whole.null_count:
+        return np.asarray(whole.to_numpy(zero_copy_only=False))
+    return np.from_dlpack(whole)
 
 
 def _number(cell: object) -> float:
@@ -205,10 +212,10 @@ def _nanoseconds(column: pyarrow.ChunkedArray, clock: Clock) -> Nanoseconds:
 
     unit = NANOSECONDS[clock.unit]
     if types.is_integer(column.type):
-        return np.asarray(column.to_numpy(), dtype=np.int64) * unit
+        return np.asarray(_array(column), dtype=np.int64) * unit
     if types.is_timestamp(column.type):
         whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
-        return np.asarray(compute.fill_null(whole, _NEVER).to_numpy(), dtype=np.int64)
+        return np.asarray(_array(compute.fill_null(whole, _NEVER)), dtype=np.int64)
     seconds = _numbers(column)
     known = np.isfinite(seconds) & (np.abs(seconds) < 9e18 / unit)
     result = np.full(len(seconds), _NEVER, dtype=np.int64)
@@ -218,7 +225,7 @@ def _nanoseconds(column: pyarrow.ChunkedArray, clock: Clock) -> Nanoseconds:
         try:
             parts = compute.split_pattern(column.combine_chunks(), ".", max_splits=1)
             whole = compute.list_element(parts, 0)
-            start = np.asarray(compute.cast(whole, int64()).to_numpy(zero_copy_only=False))
+            start = np.from_dlpack(compute.cast(whole, int64()))
         except ArrowInvalid:
             return result
         rest = np.zeros(len(seconds))

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, Self
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import BeforeValidator, model_validator
 
+from tuner.config.model import Section, Whole, read_model, refuse
+from tuner.config.shipped import configs_folder, find_config
 from tuner.errors import ConfigError, did_you_mean
 from tuner.flights.flight import SIGNALS
 from tuner.flights.recording import Clock
 from tuner.flights.units import UNITS
 
-#: The maps that ship with the project.
-SHIPPED = Path(__file__).resolve().parents[2] / "configs" / "topics"
+#: Maps may extend maps this often.
+DEEPEST = 3
 
 
-class Source(BaseModel):
+def _as_list(value: object) -> object:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+class Source(Section):
     """Where one signal is recorded.
 
     Attributes
@@ -44,8 +48,6 @@ class Source(BaseModel):
         ``header`` prefers the time in the message, ``receive`` the time of recording.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     topic: str = ""
     fields: tuple[str, ...] | None = None
     rotor: str | None = None
@@ -56,37 +58,31 @@ class Source(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _from_name(cls, value: object) -> object:
+    def _from_name(cls, value: Any) -> Any:
         return {"topic": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _known_unit(self) -> Source:
+    def _makes_sense(self) -> Self:
         if self.unit is not None and self.unit not in UNITS:
-            raise ValueError(f"unknown unit '{self.unit}', {did_you_mean(self.unit, UNITS)}")
+            raise refuse(f"unknown unit '{self.unit}'", did_you_mean(self.unit, UNITS))
         if self.rotor is not None and (self.fields is None or len(self.fields) != 1):
-            raise ValueError("a source with 'rotor' needs exactly one entry in 'fields'")
+            raise refuse("a source with 'rotor' has one number a message", "name one in 'fields'")
         return self
 
 
-def _as_list(value: object) -> object:
-    return value if isinstance(value, list | tuple) else [value]
-
-
-class _ClockField(BaseModel):
+class ClockField(Section):
     """A field that tells the time; a bare name means seconds."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     field: str
     unit: Literal["s", "ms", "us", "ns"] = "s"
 
     @model_validator(mode="before")
     @classmethod
-    def _from_name(cls, value: object) -> object:
+    def _from_name(cls, value: Any) -> Any:
         return {"field": value} if isinstance(value, str) else value
 
 
-class TopicMap(BaseModel):
+class TopicMap(Section):
     """Signals and the sources that may hold them, the preferred one first.
 
     Attributes
@@ -107,24 +103,22 @@ class TopicMap(BaseModel):
         Signal of `SIGNALS` to its sources. In a table, a list of columns says it all.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     name: str
     format: Literal["ros", "ulog", "table"]
     extends: str | None = None
-    priority: int = 0
-    time: Annotated[tuple[_ClockField, ...], BeforeValidator(_as_list)] = ()
+    priority: Whole = 0
+    time: Annotated[tuple[ClockField, ...], BeforeValidator(_as_list)] = ()
     messages: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = ()
     signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_list)]]
 
     @model_validator(mode="before")
     @classmethod
-    def _columns(cls, value: object) -> object:
+    def _columns(cls, value: Any) -> Any:
         """Let a table's signal be a list of columns, or one column."""
-        if not (isinstance(value, dict) and value.get("format") == "table"):
+        if not (isinstance(value, Mapping) and value.get("format") == "table"):
             return value
         signals = value.get("signals")
-        if not isinstance(signals, dict):
+        if not isinstance(signals, Mapping):
             return value
 
         def as_source(columns: object) -> object:
@@ -137,15 +131,15 @@ class TopicMap(BaseModel):
         return {**value, "signals": {name: as_source(of) for name, of in signals.items()}}
 
     @model_validator(mode="after")
-    def _known_signals(self) -> TopicMap:
+    def _know_every_signal(self) -> Self:
         for name, sources in self.signals.items():
             if name not in SIGNALS:
-                raise ValueError(f"unknown signal '{name}', {did_you_mean(name, SIGNALS)}")
+                raise refuse(f"unknown signal '{name}'", did_you_mean(name, SIGNALS))
             columns = SIGNALS[name][0]
             for source in sources:
                 count = columns if source.fields is None else len(source.fields)
                 if source.rotor is None and count != columns:
-                    raise ValueError(f"signal '{name}' has {columns} columns, {count} fields given")
+                    raise refuse(f"signal '{name}' has {count} fields", f"name all {columns}")
         return self
 
     @property
@@ -160,71 +154,52 @@ class TopicMap(BaseModel):
             return self
         signals = {
             name: tuple(
-                source.model_copy(update={"topic": f"/{prefix}/{source.topic.lstrip('/')}"})
-                for source in sources
+                source.replace(topic=f"/{prefix}/{source.topic.lstrip('/')}") for source in sources
             )
             for name, sources in self.signals.items()
         }
-        return self.model_copy(update={"signals": signals})
+        return self.replace(signals=signals)
 
 
-def load_topic_map(path: str | Path, *, depth: int = 0) -> TopicMap:
+def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: int = 0) -> TopicMap:
     """Read a topic map from a file, or a shipped one by its name.
+
+    Parameters
+    ----------
+    reference
+        A path, or the bare name of a shipped map.
+    base
+        Folder from which relative paths count; None is the working folder.
+    depth
+        How many maps this one is extended by.
 
     Raises
     ------
     ConfigError
         The file is missing, no YAML, or says something that no map can say.
     """
-    path = Path(path)
-    if path.suffix not in {".yaml", ".yml"} and not path.exists():
-        names = {file.stem: file for file in SHIPPED.glob("*.yaml")}
-        if str(path) not in names:
-            raise ConfigError(path, "no such topic map", did_you_mean(str(path), names))
-        path = names[str(path)]
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_LOADER)
-        if not isinstance(content, dict):
-            raise ConfigError(path, "is no topic map", "see configs/topics for examples")
-        found = TopicMap.model_validate(content)
-    except OSError as err:
-        raise ConfigError(path, f"cannot be read ({err.strerror})", "check the path") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as err:
-        first = re.sub(r"\s+", " ", str(err))[:200]
-        raise ConfigError(path, f"is no valid YAML ({first})", "correct it") from None
-    except ValidationError as err:
-        detail = err.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in detail["loc"])
-        said = detail["msg"].removeprefix("Value error, ")
-        what = f"{where}: {said}" if where else said
-        raise ConfigError(path, what, "see configs/topics for examples") from None
-    messages = tuple(path.parent / file for file in found.messages)
-    found = found.model_copy(update={"messages": messages})
-    return found if found.extends is None else _extended(found, path, depth)
-
-
-def _extended(found: TopicMap, path: Path, depth: int) -> TopicMap:
-    """Fill a map from the one that it extends."""
-    name = str(found.extends)
-    if depth > 3:
-        raise ConfigError(path, f"extends '{name}', which extends it in turn", "break the circle")
-    beside = path.parent / name
-    base = load_topic_map(beside if beside.is_file() else name, depth=depth + 1)
-    if base.format != found.format:
-        raise ConfigError(path, f"extends '{name}' of another format", "extend one of its own")
-    return found.model_copy(
-        update={
-            "signals": {**base.signals, **found.signals},
-            "time": found.time or base.time,
-            "messages": (*found.messages, *base.messages),
-        }
+    path = find_config("topics", str(reference), base or Path())
+    found = read_model(TopicMap, path)
+    if found.messages:
+        found = found.replace(messages=tuple(path.parent / file for file in found.messages))
+    if found.extends is None:
+        return found
+    if depth >= DEEPEST:
+        raise ConfigError(path, f"extends '{found.extends}' in a circle", "break it")
+    under = load_topic_map(found.extends, base=path.parent, depth=depth + 1)
+    if under.format != found.format:
+        raise ConfigError(
+            path, f"extends '{under.name}' of another format", "extend one of its own"
+        )
+    return found.replace(
+        signals={**under.signals, **found.signals},
+        time=found.time or under.time,
+        messages=(*found.messages, *under.messages),
     )
 
 
 @cache
 def shipped_maps() -> tuple[TopicMap, ...]:
     """Return every map in ``configs/topics``, by file name."""
-    return tuple(load_topic_map(file) for file in sorted(SHIPPED.glob("*.yaml")))
-
-
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    files = sorted((configs_folder() / "topics").glob("*.yaml"))
+    return tuple(load_topic_map(file) for file in files)

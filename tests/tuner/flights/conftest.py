@@ -19,3 +19,9 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("short") / "short.bag"
     return making.rewrite(making.CIRCLE, path, first, chunk=1 << 18)
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep the user's cache out of the tests, and each test's out of the others'."""
+    monkeypatch.setenv("TUNE_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))

@@ -274,9 +274,11 @@ def test_side_car_names_the_trajectory_and_the_mission(short: Path, tmp_path: Pa
         "trajectory: {name: circle, radius: 2.0, speed_scale: 2.1}\nstart: 6.0\nend: 11\n"
     )
     got = load_flight(path)
-    assert got.trajectory == {"name": "circle", "radius": 2.0, "speed_scale": 2.1}
+    assert got.trajectory is not None
+    assert got.trajectory["name"] == "circle"
+    assert got.trajectory["speed_scale"] == 2.1
     assert got.duration == pytest.approx(5.0, abs=0.02)
     (tmp_path / "side.yaml").write_text("trajectory: {name: cirlce}")
-    with pytest.raises(Exception, match="did you mean 'circle'") as caught:
+    with pytest.raises(Exception, match="it should be 'circle'") as caught:
         load_flight(path)
     assert "\n" not in str(caught.value)

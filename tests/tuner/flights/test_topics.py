@@ -23,9 +23,9 @@ def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:
         ("name: x\nformat: ros\nsignals: {positon: /a}", "did you mean 'position'"),
         ("name: x\nformat: ros\nsignals: {position: {topik: /a}}", "topik"),
         ("name: x\nformat: ros\nsignals: {rotor_speed: {topic: /a, unit: rmp}}", "'rpm'"),
-        ("name: x\nformat: ros\nsignals: {position: {topic: /a, fields: [x]}}", "3 columns, 1"),
-        ("- a\n- b", "is no topic map"),
-        ("a: [", "no valid YAML"),
+        ("name: x\nformat: ros\nsignals: {position: {topic: /a, fields: [x]}}", "name all 3"),
+        ("- a\n- b", "should be a mapping"),
+        ("a: [", "line 1"),
         ("name: x\nformat: rosbag\nsignals: {}", "format"),
     ],
 )

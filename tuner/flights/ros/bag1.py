@@ -334,8 +334,11 @@ def _block(content: Bytes, connection: int, time: Index, offset: Index) -> Block
 def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
     """Tell which record headers name a connection; those of one length are laid out alike."""
     belongs = np.zeros(len(header), dtype=np.bool_)
+    if len(header) == 0:
+        return belongs
     name = b"conn=" + struct.pack("<I", connection)
-    for length in np.unique(size):
+    alike = int(size.min()) == int(size.max())
+    for length in size[:1] if alike else np.unique(size):
         rows = np.flatnonzero(size == length)
         first = content[header[rows[0]] : header[rows[0]] + length].tobytes()
         at = first.find(name)

@@ -1,0 +1,215 @@
+"""Read a recording to say what it holds, whether or not a flight can be made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from tuner.errors import RecordingError
+from tuner.flights.clock import fit_grid
+from tuner.flights.content import Content, Settings, given_map, read_content
+from tuner.flights.flight import SIGNALS, Array, Series
+from tuner.flights.informs import informed, inlets
+from tuner.flights.inspection import (
+    Inspection,
+    MissionReport,
+    SignalReport,
+    TopicReport,
+)
+from tuner.flights.mission import yaw_spin
+from tuner.flights.motion import derivative, rotate, smooth
+from tuner.flights.opening import open_recording
+from tuner.flights.recording import Recording, Samples
+from tuner.flights.resample import resample
+from tuner.flights.sidecar import Sidecar, read_sidecar
+from tuner.flights.sync import pose_offset
+from tuner.flights.topics import TopicMap
+
+#: Stamps before 1990 count from a start-up, not from 1970.
+NO_DATE = 631_152_000_000_000_000
+
+
+def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) -> Inspection:
+    """Say what a recording holds.
+
+    Raises
+    ------
+    RecordingError
+        Nothing of it can be read.
+    ConfigError
+        The topic map or the side-car is wrong.
+    """
+    settings = Settings(topics, namespace)
+    sidecar = read_sidecar(path)
+    given = given_map(path, settings, sidecar)
+    try:
+        content = read_content(path, settings, sidecar, given)
+    except RecordingError as err:
+        # What is in it may still be told, so that the user sees what to map.
+        recording = open_recording(path, given.messages if given else ())
+        return _without_flight(recording, err)
+    return _with_flight(content, sidecar)
+
+
+def _without_flight(recording: Recording, problem: RecordingError) -> Inspection:
+    return Inspection(
+        path=str(recording.path),
+        format=recording.format,
+        size=_size(recording.path),
+        started=None,
+        duration=0.0,
+        topic_map="",
+        problem=f"{problem.what}; {problem.remedy}",
+        topics=tuple(
+            TopicReport(topic.name, topic.type, topic.count, None, None, None, None, ())
+            for topic in recording.topics
+        ),
+        signals=(),
+        missions=(),
+        inlets=inlets({}, trajectory=False),
+        coefficients=(),
+        clock={},
+        battery=None,
+        notes=(),
+    )
+
+
+def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
+    recording = content.recording
+    times = [s.receive for s in content.samples.values() if len(s.receive)]
+    first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+    missions = tuple(_mission(content, i) for i in range(len(content.missions)))
+    measured = {name: _measured(series) for name, series in content.series.items()}
+    voltage = content.series.get("battery_voltage")
+    return Inspection(
+        path=str(recording.path),
+        format=recording.format,
+        size=_size(recording.path),
+        started=_date(first),
+        duration=(last - first) * 1e-9,
+        topic_map=content.topic_map.name,
+        problem=None if missions else "nothing flies in it: no mission was found",
+        topics=tuple(_topic(content, t.name, t.type, t.count) for t in recording.topics),
+        signals=tuple(
+            SignalReport(
+                name,
+                content.places[name].topic,
+                SIGNALS[name][1],
+                len(series.time),
+                _rate(series.time),
+                measured[name],
+            )
+            for name, series in content.series.items()
+        ),
+        missions=missions,
+        inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
+        coefficients=informed(content.series, measured, missions),
+        clock=_clock(content),
+        battery=((float(voltage.values[0, 0]), float(voltage.values[-1, 0])) if voltage else None),
+        notes=tuple(dataclasses.asdict(note) for note in content.notes),
+    )
+
+
+def _size(path: Path) -> int:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def _date(nanoseconds: int) -> str | None:
+    if not NO_DATE < nanoseconds < 8 * NO_DATE:
+        return None
+    return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat(timespec="seconds")
+
+
+def _rate(time: Array) -> float:
+    return 1 / float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+
+
+def _measured(series: Series) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.flatnonzero(np.isfinite(series.values).any(axis=0)))
+
+
+def _topic(content: Content, name: str, kind: str, count: int) -> TopicReport:
+    signals = tuple(s for s, place in content.places.items() if place.topic == name)
+    samples = content.samples.get(name)
+    if samples is None or len(samples.receive) < 2:
+        return TopicReport(name, kind, count, None, None, None, None, signals)
+    time = _seconds(samples)
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    delay = None
+    if samples.stamp is not None and samples.stamp is not samples.receive:
+        delay = float(np.median(samples.receive - samples.stamp)) * 1e-9
+    near = steps[(steps > 0) & (steps < 3 * usual)]
+    return TopicReport(
+        name=name,
+        type=kind,
+        count=len(samples.receive),
+        rate=1 / usual if usual > 0 else None,
+        longest_gap=float(steps.max()),
+        jitter=float(near.std()) if len(near) else None,
+        delay=delay,
+        signals=signals,
+    )
+
+
+def _seconds(samples: Samples) -> Array:
+    stamps = samples.receive if samples.stamp is None else samples.stamp
+    return np.sort(np.asarray((stamps - stamps[0]) * 1e-9, dtype=np.float64))
+
+
+def _clock(content: Content) -> Mapping[str, float]:
+    found = {}
+    for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
+        if name in content.series:
+            grid = fit_grid(content.series[name].time, 100.0)
+            if grid is not None:
+                found = {"spread": grid.spread, "drift": grid.drift}
+                break
+    offset = pose_offset(content.series)
+    return found if offset is None else {**found, "pose_offset": offset}
+
+
+def _mission(content: Content, index: int) -> MissionReport:
+    mission = content.missions[index]
+    clock = np.arange(mission.start, mission.end, 0.01)
+    position = resample("position", content.series["position"], clock)
+    attitude = resample("attitude", content.series["attitude"], clock)
+    speed = np.linalg.norm(derivative(smooth(position)), axis=1)
+    up = rotate(attitude, np.tile([0.0, 0.0, 1.0], (len(clock), 1)))[:, 2]
+    rates = content.series.get("body_rate")
+    turning = None
+    if rates is not None:
+        own = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
+        turning = float(np.nanmax(own)) if np.isfinite(own).any() else None
+    setpoints = content.series.get("rate_setpoint")
+    known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1)
+    return MissionReport(
+        start=mission.start,
+        duration=mission.end - mission.start,
+        begins_with=mission.begins_with,
+        laps=_laps(content.series.get("lap"), mission.start, mission.end),
+        mean_speed=_of(np.nanmean, speed),
+        top_speed=_of(np.nanmax, speed),
+        largest_tilt=float(np.degrees(np.arccos(np.clip(_of(np.nanmin, up), -1, 1)))),
+        top_turn_rate=turning,
+        yaw_rate_setpoint=(
+            yaw_spin(setpoints, mission.start, mission.end) if setpoints is not None else None
+        ),
+        height=(_of(np.nanmin, position[:, 2]), _of(np.nanmax, position[:, 2])),
+        known=float(known.mean()),
+    )
+
+
+def _of(reduce: object, values: Array) -> float:
+    return float(reduce(values)) if np.isfinite(values).any() else float("nan")  # type: ignore[operator]
+
+
+def _laps(lap: Series | None, start: float, end: float) -> int | None:
+    if lap is None:
+        return None
+    return int(((lap.time >= start) & (lap.time <= end)).sum())

@@ -1,0 +1,162 @@
+"""Which inlets a recording can be fed in at, and which coefficients it could inform.
+
+These are rules of thumb from what was recorded and how hard it was flown; what a fit really
+learned stands in its own report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from tuner.flights.flight import Array, Series
+from tuner.flights.inspection import Informed, Inlet, MissionReport
+
+#: Below these a motion says little of a coefficient, and below a third of them nothing.
+ROLL_PITCH_RATE = 0.2
+YAW_RATE = 0.4
+SPEED = 1.5
+VERTICAL_SPEED = 3.0
+COMMAND_SPREAD = 0.03
+#: Hz that a signal needs to show how fast a rotor follows.
+QUICK = 80.0
+
+_POSE = ("position", "attitude")
+_NEEDS: Mapping[str, Sequence[str]] = {
+    "reference": (*_POSE, "reference_position"),
+    "body_rate": (*_POSE, "rate_setpoint", "thrust_setpoint"),
+    "actuator": (*_POSE, "command"),
+    "rotor_speed": (*_POSE, "rotor_speed"),
+}
+
+
+def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tuple[Inlet, ...]:
+    """Return what each inlet lacks.
+
+    Parameters
+    ----------
+    measured
+        Signal -> columns that were measured.
+    trajectory
+        Whether the trajectory is named, which stands for a recorded reference.
+    """
+    found = []
+    for name, needs in _NEEDS.items():
+        missing = [need for need in needs if need not in measured]
+        if trajectory and "reference_position" in missing:
+            missing.remove("reference_position")
+        for need in ("command", "rotor_speed"):
+            columns = measured.get(need)
+            if need in needs and columns is not None and len(columns) < 4:
+                lacking = [str(i) for i in range(4) if i not in columns]
+                missing.append(f"{need} of rotors {', '.join(lacking)}")
+        found.append(Inlet(name, tuple(missing)))
+    return tuple(found)
+
+
+def informed(
+    series: Mapping[str, Series],
+    measured: Mapping[str, tuple[int, ...]],
+    missions: Sequence[MissionReport],
+) -> tuple[Informed, ...]:
+    """Return what a recording could say of each coefficient.
+
+    Parameters
+    ----------
+    series
+        Signal -> cleaned samples.
+    measured
+        Signal -> columns that were measured.
+    missions
+        What was flown.
+    """
+    if not missions:
+        return ()
+    has = set(measured)
+    rates = _spread(series, "body_rate", missions)
+    command = float(np.max(_spread(series, "command", missions), initial=0.0))
+    speed = max(mission.top_speed for mission in missions)
+    climb = float(_largest(series, "velocity", missions)[2]) if "velocity" in series else 0.0
+    driven = bool(has & {"command", "rotor_speed", "rate_setpoint", "reference_position"})
+    quick = {n for n in ("command", "rotor_speed") if n in series and _rate(series[n]) >= QUICK}
+    tachometer, commands = "rotor_speed" in has, "command" in has
+
+    def turning(axis: int, limit: float, name: str) -> tuple[str, str]:
+        if "body_rate" not in has:
+            return "weakly", "no gyro: only through the attitude"
+        if not driven:
+            return "no", "nothing recorded drives the simulation"
+        return _graded(float(rates[axis]), limit, f"{name} rate varies by {rates[axis]:.2f} rad/s")
+
+    yaw = turning(2, YAW_RATE, "yaw")
+    curve = (
+        ("yes", "commands and rotor speed show the curve")
+        if tachometer and commands and command > COMMAND_SPREAD
+        else ("weakly", "only together with the motor constant")
+    )
+    lag = (
+        ("yes", "rotor speed recorded quickly enough")
+        if "rotor_speed" in quick
+        else ("weakly", "through the body rates only" if driven else "no rotor speed")
+    )
+    loop = {"reference_position"} <= has and "rate_setpoint" in has
+    findings = {
+        "mass": ("no", "weigh it: forces and inertias scale with it"),
+        "inertia_xx": turning(0, ROLL_PITCH_RATE, "roll"),
+        "inertia_yy": turning(1, ROLL_PITCH_RATE, "pitch"),
+        "inertia_zz": yaw,
+        "input_scaling": curve,
+        "zero_position_armed": curve,
+        "time_constant_up": lag,
+        "time_constant_down": lag,
+        "motor_constant": (
+            ("yes", "rotor speed against the weight")
+            if tachometer
+            else ("weakly", "only together with the RPM curve")
+        ),
+        "moment_constant": yaw,
+        "rotor_drag_coefficient": _graded(speed, SPEED, f"flown at up to {speed:.1f} m/s"),
+        "rolling_moment_coefficient": ("no", "such flights do not show it"),
+        "max_relative_airspeed": _graded(climb, VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
+        "estimate_latency": (
+            ("yes", "reference and set-points close the loop")
+            if loop
+            else ("no", "the loop's reference or set-points are missing")
+        ),
+        "actuator_latency": (
+            ("yes", "commands and rotor speed recorded")
+            if tachometer and commands
+            else ("weakly", "no commands beside rotor speeds")
+        ),
+    }
+    return tuple(Informed(name, how, why) for name, (how, why) in findings.items())
+
+
+def _graded(value: float, limit: float, why: str) -> tuple[str, str]:
+    how = "yes" if value >= limit else "weakly" if value >= limit / 3 else "no"
+    return how, why
+
+
+def _rate(series: Series) -> float:
+    return 1 / float(np.median(np.diff(series.time))) if len(series.time) > 1 else 0.0
+
+
+def _during(series: Series, missions: Sequence[MissionReport]) -> Array:
+    inside = np.zeros(len(series.time), dtype=np.bool_)
+    for mission in missions:
+        inside |= (series.time >= mission.start) & (series.time <= mission.start + mission.duration)
+    return series.values[inside]
+
+
+def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:
+    """Return the standard deviation of each column during the missions; zeros without samples."""
+    if name not in series:
+        return np.zeros(4)
+    values = _during(series[name], missions)
+    return np.asarray(np.nanstd(values, axis=0)) if len(values) else np.zeros(values.shape[1])
+
+
+def _largest(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:
+    values = np.abs(_during(series[name], missions))
+    return np.asarray(np.nanmax(values, axis=0)) if len(values) else np.zeros(values.shape[1])

@@ -1,0 +1,128 @@
+"""Inspections as tables for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from tuner.flights.inspection import Inspection, MissionReport
+
+_COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
+
+
+def render(inspections: Iterable[Inspection]) -> RenderableType:
+    """Return what was found in recordings, for rich to print."""
+    return Group(*(part for one in inspections for part in _one(one)))
+
+
+def _one(one: Inspection) -> list[RenderableType]:
+    size = f"{one.size / 1e6:.1f} MB"
+    about = [one.format, size, f"{one.duration:.1f} s"]
+    about += [one.started.replace("+00:00", " UTC")] if one.started else []
+    about += [f"topic map {one.topic_map}"] if one.topic_map else []
+    parts: list[RenderableType] = [Text(), Text(one.path, "bold"), Text(" · ".join(about))]
+    if one.problem:
+        parts.append(Text(one.problem, "red"))
+    parts.append(_topics(one))
+    if one.missions:
+        parts.append(_missions(one))
+    if one.clock or one.battery:
+        parts.append(_clock_and_battery(one))
+    parts.append(_inlets(one))
+    if one.coefficients:
+        parts.append(_coefficients(one))
+    for note in one.notes:
+        colour = "yellow" if note["kind"] == "warning" else "dim"
+        topic = f"{note['topic']}: " if note["topic"] else ""
+        parts.append(Text(f"{note['kind']}: {topic}{note['text']}", colour))
+    return parts
+
+
+def _number(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "" if value is None else format(value * scale, form)
+
+
+def _topics(one: Inspection) -> Table:
+    table = Table(title="topics", title_justify="left", title_style="bold", box=None)
+    for name in ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for"):
+        right = name not in ("topic", "type", "used for")
+        table.add_column(name, justify="right" if right else "left", no_wrap=name == "topic")
+    for topic in one.topics:
+        table.add_row(
+            topic.name or "(table)",
+            topic.type,
+            str(topic.count),
+            _number(topic.rate, ".1f"),
+            _number(topic.longest_gap, ".3f"),
+            _number(topic.jitter, ".2f", 1e3),
+            _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
+            ", ".join(topic.signals),
+            style="" if topic.signals else "dim",
+        )
+    return table
+
+
+def _missions(one: Inspection) -> Table:
+    table = Table(title="missions", title_justify="left", title_style="bold", box=None)
+    for name in ("start s", "s", "begins with", "laps", "mean m/s", "top m/s", "tilt °"):
+        table.add_column(name, justify="left" if name == "begins with" else "right")
+    for name in ("turn rad/s", "height m", "pose known", "remark"):
+        table.add_column(name, justify="left" if name == "remark" else "right")
+    for mission in one.missions:
+        table.add_row(
+            f"{mission.start:.2f}",
+            f"{mission.duration:.2f}",
+            mission.begins_with,
+            "" if mission.laps is None else str(mission.laps),
+            f"{mission.mean_speed:.2f}",
+            f"{mission.top_speed:.2f}",
+            f"{mission.largest_tilt:.1f}",
+            _number(mission.top_turn_rate, ".2f"),
+            f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
+            f"{100 * mission.known:.1f} %",
+            _remark(mission),
+        )
+    return table
+
+
+def _remark(mission: MissionReport) -> str:
+    spin = mission.yaw_rate_setpoint
+    return "" if spin is None else f"yaw spin at {spin:g} rad/s"
+
+
+def _clock_and_battery(one: Inspection) -> Text:
+    said = []
+    if "spread" in one.clock:
+        said.append(f"reference's stamps late by up to {1e3 * one.clock['spread']:.2f} ms")
+    if one.clock.get("drift"):
+        said.append(f"its clock drifts by {1e6 * one.clock['drift']:+.0f} ppm")
+    if "pose_offset" in one.clock:
+        said.append(f"pose {1e3 * one.clock['pose_offset']:+.1f} ms late against the gyro")
+    text = f"clock: {', '.join(said)}" if said else ""
+    if one.battery:
+        text += f"{'   ' if text else ''}battery: {one.battery[0]:.2f} V to {one.battery[1]:.2f} V"
+    return Text(text)
+
+
+def _inlets(one: Inspection) -> Table:
+    table = Table(title="inlets", title_justify="left", title_style="bold", box=None)
+    table.add_column("inlet")
+    table.add_column("can be fed in")
+    for inlet in one.inlets:
+        usable = not inlet.missing and one.problem is None
+        lacks = f"lacks {', '.join(inlet.missing)}" if inlet.missing else "no mission"
+        table.add_row(inlet.name, "yes" if usable else lacks, style="" if usable else "dim")
+    return table
+
+
+def _coefficients(one: Inspection) -> Table:
+    table = Table(title="could inform", title_justify="left", title_style="bold", box=None)
+    for name in ("coefficient", "", "because"):
+        table.add_column(name)
+    for finding in one.coefficients:
+        how = Text(finding.how, _COLOURS[finding.how])
+        table.add_row(finding.coefficient, how, finding.why)
+    return table
