@@ -48,8 +48,8 @@ class State(eqx.Module):
     integral: Vec3
     gyro: GyroMemory
     command: PerRotor
-    estimates: Float[Array, "length 10 *batch"] | None
-    commands: Float[Array, "length 4 *batch"] | None
+    estimates: Float[Array, "estimate_history 10 *batch"] | None
+    commands: Float[Array, "command_history 4 *batch"] | None
     crash_time: Scalar
     """s, infinite while flying."""
 

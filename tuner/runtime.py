@@ -63,6 +63,8 @@ def _flags() -> dict[str, str]:
 
 def _set_environment() -> None:
     os.environ.setdefault("NPROC", "1")
+    # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     given = os.environ.get("XLA_FLAGS", "")
     names = {flag.partition("=")[0] for flag in given.split()}
     added = [f"{name}={value}" for name, value in _flags().items() if name not in names]

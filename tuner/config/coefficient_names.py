@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
-from pydantic import ValidationError
-
-from tuner.config.model import config_error
+from tuner.config.model import build
 from tuner.config.vehicle import VehicleFile
-from tuner.config.yaml_file import Document
 from tuner.errors import ConfigError, did_you_mean
 
 
@@ -122,7 +118,4 @@ def with_values(vehicle: VehicleFile, values: Mapping[str, float]) -> VehicleFil
     for name, value in values.items():
         section, key = COEFFICIENTS[name].place
         (data[section] if section else data)[key] = float(value)
-    try:
-        return VehicleFile.model_validate(data)
-    except ValidationError as error:
-        raise config_error(error, Document(Path(vehicle.name), {}, {})) from None
+    return build(VehicleFile, data, vehicle.name)

@@ -180,6 +180,8 @@ class JobFile(Section):
     ----------
     vehicle, controller, topics
         Files, or None for what ships. `read_job` makes paths absolute and finds shipped names.
+    namespace
+        Prefix of the recorded topics that the topic map does not have, as ``uav1``.
     mass
         kg, as weighed; instead of the vehicle file's.
     holdout
@@ -207,6 +209,7 @@ class JobFile(Section):
     vehicle: Path | None = None
     controller: Path | None = None
     topics: Path | None = None
+    namespace: str = ""
     mass: Positive | None = None
     holdout: tuple[str, ...] = ()
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None

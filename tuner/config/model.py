@@ -72,6 +72,20 @@ def read_model(kind: type[M], path: str | Path) -> M:
         raise config_error(error, document) from None
 
 
+def build(kind: type[M], values: Mapping[str, object], where: str) -> M:
+    """Make a model of values that were given elsewhere than in a file, as on the command line.
+
+    Raises
+    ------
+    ConfigError
+        In one line: where, the key, its value, what it should be.
+    """
+    try:
+        return kind.model_validate(values)
+    except ValidationError as error:
+        raise config_error(error, Document(Path(where), {}, {})) from None
+
+
 def config_error(error: ValidationError, document: Document) -> ConfigError:
     """Turn the first of pydantic's findings into one line."""
     details = error.errors(include_url=False)

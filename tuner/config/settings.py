@@ -42,6 +42,8 @@ class Options:
         Coefficients: exactly those to fit, or those to leave alone.
     method, seed
         Of the search.
+    topics, namespace
+        The topic map, and the prefix of the recorded topics.
     """
 
     flights: Sequence[str]
@@ -54,6 +56,8 @@ class Options:
     fix: Sequence[str] | None = None
     method: Method | None = None
     seed: int | None = None
+    topics: str | None = None
+    namespace: str | None = None
 
 
 @dataclass(frozen=True)
@@ -84,8 +88,15 @@ class Settings:
     origin: Mapping[str, str]
 
 
-def settle(options: Options) -> Settings:
+def settle(options: Options, *, fits: bool = True) -> Settings:
     """Read what the options and the flights' job file name, and let the command line win.
+
+    Parameters
+    ----------
+    options
+        What was said.
+    fits
+        Whether something is to be fitted, so that some flight must not be held out.
 
     Raises
     ------
@@ -101,7 +112,7 @@ def settle(options: Options) -> Settings:
     flights = (*flights, *extra)
     _names_are_distinct(flights)
     _check_flight_names(job, job_path, flights)
-    if all(flight.stem in holdout for flight in flights):
+    if fits and all(flight.stem in holdout for flight in flights):
         raise InputError("--holdout", "holds out every flight", "leave one to fit")
     try:
         job = _override(job, options, holdout)
@@ -237,6 +248,10 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
         changes["fixed"] = tuple(dict.fromkeys((*job.fixed, *options.fix)))
     if options.mass is not None:
         changes["mass"] = options.mass
+    if options.namespace is not None:
+        changes["namespace"] = options.namespace
+    if options.topics is not None:
+        changes["topics"] = find_config("topics", options.topics, Path())
     search = {"method": options.method, "seed": options.seed}
     changes["search"] = job.search.replace(**{k: v for k, v in search.items() if v is not None})
     return job.replace(**changes)

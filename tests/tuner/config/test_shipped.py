@@ -49,7 +49,9 @@ def test_an_installed_wheel_carries_the_configuration(tmp_path):
     show = (
         "import tuner; from tuner.config import *; print(tuner.__file__);"
         "print(read_vehicle(find_config('vehicles', 'hovergames', configs_folder())).name);"
-        "print(read_job(configs_folder() / 'tune.yaml').mass)"
+        "print(read_job(configs_folder() / 'tune.yaml').mass);"
+        "from tuner.flights.topics import load_topic_map;"
+        "print(load_topic_map('thesis_lab').name)"
     )
     found = subprocess.run(
         [sys.executable, "-c", show],
@@ -59,6 +61,6 @@ def test_an_installed_wheel_carries_the_configuration(tmp_path):
         capture_output=True,
         text=True,
     )
-    where, vehicle, mass = found.stdout.splitlines()
+    where, vehicle, mass, topics = found.stdout.splitlines()
     assert where == str(tmp_path / "site" / "tuner" / "__init__.py")
-    assert (vehicle, mass) == ("hovergames", "2.243")
+    assert (vehicle, mass, topics) == ("hovergames", "2.243", "thesis_lab")

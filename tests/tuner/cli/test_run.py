@@ -1,0 +1,113 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tuner.cli import main
+from tuner.cli.app import commands
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def test_the_help_names_every_command(capsys):
+    assert main(["--help"]) == 0
+    text = capsys.readouterr().out
+    for name in commands():
+        assert name in text
+
+
+@pytest.mark.parametrize("name", commands())
+def test_every_command_has_help_with_an_example(name, capsys):
+    assert main([name, "--help"]) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert f"Example: tune {name}" in words
+
+
+def test_the_version_is_said(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.strip()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["simulat"], "no command 'simulat'; did you mean 'simulate'?"),
+        (["lab/a.bag"], "for a fit write: tune --flights lab/a.bag"),
+        (["simulate", "--trajectory", "square", "--out", "x.csv"], '"square"'),
+        (["simulate", "--trajectory", "circle", "--rate", "fast", "--out", "x.csv"], "--rate"),
+        (["simulate", "--trajectory", "circle", "--oot", "x.csv"], "--out"),
+        (["simulate", "--trajectory", "circle", "--out", "x.csv", "extra"], "extra"),
+        (["simulate", "--trajectory", "circle", "--out", "x.csv", "--vehicle", "no"], "no: is"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(arguments, expected, capsys):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("tune: ")
+    assert err.count("\n") == 1
+    assert expected in err
+
+
+@pytest.fixture
+def failing(monkeypatch):
+    """Make a command that raises what it is given."""
+
+    def make(error):
+        def fail(_):
+            raise error
+
+        monkeypatch.setattr("tuner.cli.run.app", fail)
+
+    return make
+
+
+def test_a_fault_of_ours_is_status_1_with_its_trace(failing, capsys):
+    failing(RuntimeError("oops"))
+    assert main(["simulate"]) == 1
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert err.endswith("tune: this is a fault of ours: RuntimeError: oops\n")
+
+
+def test_ctrl_c_is_one_line_and_status_130(failing, capsys):
+    failing(KeyboardInterrupt())
+    assert main(["simulate"]) == 130
+    assert capsys.readouterr().err == "tune: interrupted\n"
+
+
+def test_help_loads_nothing_heavy():
+    script = (
+        "import sys\nfrom tuner.cli import main\nmain(['--help'])\n"
+        "heavy = {'jax', 'numpy', 'pandas', 'scipy', 'rosbags', 'matplotlib', 'equinox', 'lxml'}\n"
+        "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or None)"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", script],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+
+
+def test_simulate_writes_what_it_is_told(tmp_path, capsys):
+    out = tmp_path / "c.csv"
+    arguments = ["simulate", "--trajectory", "circle", "--duration", "4", "--out", str(out)]
+    assert main(arguments) == 0
+    assert f"written to {out}" in capsys.readouterr().out
+    assert len(out.read_text().splitlines()) == 402
+    assert main([*arguments, "--quiet"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_sweeps_may_follow_each_other(tmp_path, capsys):
+    out = tmp_path / "g.csv"
+    arguments = ["simulate", "--trajectory", "hover", "--duration", "4", "--out", str(out)]
+    assert main([*arguments, "--sweep", "motor_constant=1.3e-5:1.5e-5:2", "inertia_xx=0.02"]) == 0
+    assert out.read_text().startswith("motor_constant,inertia_xx,time,")
+    assert "inertia_xx" in capsys.readouterr().out

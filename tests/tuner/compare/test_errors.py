@@ -1,0 +1,126 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim_jax.crash import AIRBORNE, Limits
+from tuner.compare.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of
+from tuner.config import ControllerFile, TrajectorySettings, with_values
+from tuner.flights.flight import Series
+from tuner.simulate.trajectory import with_named_reference
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def errors(position, attitude, **options):
+    position, attitude = np.asarray(position, float), np.asarray(attitude, float)
+    usual = {"laps": np.zeros(0), "crash_time": None}
+    return FlightErrors(
+        name="f",
+        position_time=np.arange(len(position)) * 1.0,
+        position=position,
+        attitude_time=np.arange(len(attitude)) * 1.0,
+        attitude=attitude,
+        **usual | options,
+    )
+
+
+def test_the_root_mean_square_of_known_errors():
+    found = errors([[3, 0, 1], [-4, 0, 1]], [[1, 2, 0], [1, -2, 0]]).rmse
+    assert found.x == pytest.approx(np.sqrt(12.5))
+    assert (found.y, found.z, found.roll, found.pitch, found.yaw) == (0, 1, 1, 2, 0)
+
+
+def test_flights_are_pooled_by_their_samples():
+    one = errors([[1, 0, 0]], [[1, 0, 0]])
+    three = errors([[3, 0, 0]] * 3, [[3, 0, 0]] * 3)
+    assert rmse_of([one, three]).x == pytest.approx(np.sqrt((1 + 3 * 9) / 4))
+
+
+def test_a_crash_or_nothing_measured_has_no_rmse():
+    crashed = errors([[1, 0, 0]], [[1, 0, 0]], crash_time=1.0)
+    assert set(rmse_of([errors([[1, 1, 1]], [[1, 1, 1]]), crashed]).model_dump().values()) == {None}
+    assert errors(np.zeros((0, 3)), [[1, 0, 0]]).rmse.x is None
+
+
+def test_a_stretch_is_cut_by_each_clock():
+    part = errors(np.eye(3), np.eye(3)).between(1.0, 2.0)
+    np.testing.assert_array_equal(part.position, [[0, 1, 0]])
+    np.testing.assert_array_equal(part.attitude, [[0, 1, 0]])
+
+
+def test_the_vehicle_that_flew_meets_its_recording(flight, vehicle):
+    comparison = Comparison([flight], ControllerFile())
+    own = comparison.fly(vehicle)["small_circle"]
+    assert own.crash_time is None
+    for axis in ("x", "y", "z"):
+        assert getattr(own.rmse, axis) < 2e-4, axis
+    for axis in ("roll", "pitch", "yaw"):
+        assert getattr(own.rmse, axis) < 0.02, axis
+    other = comparison.fly(with_values(vehicle, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
+    assert other.rmse.x > 100 * own.rmse.x
+
+
+def test_a_late_clock_is_taken_back(flight, vehicle):
+    late = replace(
+        flight,
+        series={
+            name: Series(data.time + 0.05, data.values)
+            if name in ("position", "attitude")
+            else data
+            for name, data in flight.series.items()
+        },
+    )
+    as_is = Comparison([late], ControllerFile()).fly(vehicle)["small_circle"].rmse
+    known = Comparison([late], ControllerFile(), {"small_circle": 0.05}).fly(vehicle)
+    assert known["small_circle"].rmse.x < 3e-4
+    assert as_is.x > 0.02
+
+
+def test_a_vehicle_that_cannot_fly_crashes(flight, vehicle):
+    heavy = with_values(vehicle, {"mass": 9.0})
+    found = Comparison([flight], ControllerFile()).fly(heavy)["small_circle"]
+    assert 0 < found.crash_time < 12
+    assert found.rmse.x is None
+
+
+def test_flights_of_different_length_fly_side_by_side(flight, vehicle):
+    half = replace(
+        flight,
+        name="half",
+        time=flight.time[:600],
+        signals={name: values[:600] for name, values in flight.signals.items()},
+    )
+    both = Comparison([flight, half], ControllerFile()).fly(vehicle)
+    assert both["half"].position_time[-1] <= half.duration
+    assert both["half"].rmse.x < 2e-4
+    assert both["small_circle"].rmse.x < 2e-4
+
+
+def test_laps_are_where_the_counter_rises(flight):
+    laps = laps_of(flight)
+    assert len(laps) >= 3
+    assert np.all(np.diff(laps) > 0.5)
+    assert len(laps_of(replace(flight, series={}))) == 0
+
+
+def test_the_arena_gives_way_to_recordings_beyond_it(flight):
+    assert limits_of([flight]) == Limits()
+    place = flight.series["position"]
+    low = Series(place.time, place.values - [0, 0, 0.6])
+    assert limits_of([replace(flight, series={**flight.series, "position": low})]) == AIRBORNE
+
+
+def test_a_named_trajectory_stands_in_for_a_reference(flight):
+    bare = replace(
+        flight,
+        signals={k: v for k, v in flight.signals.items() if not k.startswith("reference")},
+    )
+    shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
+    named = with_named_reference(bare, shape)
+    np.testing.assert_allclose(
+        named.signals["reference_position"], flight.signals["reference_position"], atol=1e-12
+    )
+    assert named.yaw_rate_setpoint is None
+    spin = with_named_reference(bare, TrajectorySettings(name="yaw_spin", yaw_rate=1.5))
+    assert spin.yaw_rate_setpoint == 1.5

@@ -1,0 +1,54 @@
+"""The commands of `tune`, each imported when it is asked for."""
+
+from __future__ import annotations
+
+from cyclopts import App
+
+SUMMARY = "Fit the coefficients of a multirotor simulator to recorded flights."
+
+
+def version() -> str:
+    """Return the installed version."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("multirotor-tune")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+app = App(
+    name="tune",
+    help=SUMMARY,
+    version=version,
+    result_action="return_value",
+    exit_on_error=False,
+    print_error=False,
+    suppress_keyboard_interrupt=False,
+)
+
+#: Command -> what it does, and examples.
+COMMANDS = {
+    "compare": (
+        "Tabulate how closely several coefficient sets meet recordings; nothing is fitted.",
+        "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --out c.html",
+    ),
+    "simulate": (
+        "Fly a trajectory and write the flight as CSV or ROS 1 bag.",
+        "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",
+        "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
+    ),
+}
+for _name, (_summary, *_examples) in COMMANDS.items():
+    app.command(
+        f"tuner.cli.{_name}:{_name}",
+        name=_name,
+        help=_summary,
+        help_epilogue="\n".join(f"Example: {example}" for example in _examples),
+        help_format="plaintext",
+    )
+
+
+def commands() -> tuple[str, ...]:
+    """Return the names of the commands."""
+    return tuple(COMMANDS)

@@ -1,0 +1,48 @@
+"""``tune compare``: the RMSE table of several coefficient sets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from tuner.cli.options import ControllerChoice, Flights, JobChoice, Many, Namespace, Quiet, Topics
+
+
+def compare(
+    *,
+    flights: Flights,
+    vehicle: Annotated[list[str], Many],
+    controller: ControllerChoice = None,
+    config: JobChoice = None,
+    topics: Topics = None,
+    namespace: Namespace = None,
+    out: Annotated[list[Path] | None, Many] = None,
+    laps: Annotated[bool, Parameter(negative=())] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Fly recordings with several coefficient sets and tabulate the RMSE, nothing fitted.
+
+    Parameters
+    ----------
+    vehicle
+        Vehicle files, or names of shipped ones, to compare.
+    out
+        Files to write: .csv, .json or .html.
+    laps
+        Show every lap on the terminal too.
+    """
+    from tuner.cli.tables import print_comparison
+    from tuner.runtime import configure
+
+    configure()
+    from tuner.compare.compare import compare as compare_vehicles
+    from tuner.config import Options
+
+    options = Options(
+        flights, controller=controller, config=config, topics=topics, namespace=namespace
+    )
+    table, settings = compare_vehicles(options, vehicle, out or ())
+    if not quiet:
+        print_comparison(table, settings, laps=laps, written=out or ())

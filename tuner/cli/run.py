@@ -1,0 +1,69 @@
+"""One command run from its arguments: what goes wrong becomes one line and an exit status."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import traceback
+from collections.abc import Sequence
+
+from cyclopts import CycloptsError
+
+from tuner.cli.app import app, commands
+from tuner.errors import InputError, did_you_mean
+
+DONE = 0
+OUR_FAULT = 1
+WRONG_INPUT = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `tune` and return its exit status.
+
+    Parameters
+    ----------
+    arguments
+        Without the program's name; None takes those of the process.
+    """
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    logging.basicConfig(level=logging.WARNING, format="tune: %(message)s", stream=sys.stderr)
+    logging.captureWarnings(True)
+    try:
+        _know_the_command(given)
+        app(given)
+    except InputError as error:
+        return _say(str(error), WRONG_INPUT)
+    except CycloptsError as error:
+        return _say(f"{' '.join(str(error).split())} See {_help(given)}.", WRONG_INPUT)
+    except KeyboardInterrupt:
+        return _say("interrupted", INTERRUPTED)
+    except BrokenPipeError:
+        sys.stderr.close()  # whoever read our output has gone; nothing is left to say
+        return DONE
+    except Exception as error:
+        traceback.print_exc()
+        return _say(f"this is a fault of ours: {type(error).__name__}: {error}", OUR_FAULT)
+    return DONE
+
+
+def _know_the_command(arguments: Sequence[str]) -> None:
+    """Refuse a first word that is neither an option nor a command."""
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in commands():
+        raise InputError("command line", f"no command '{arguments[0]}'", _remedy(arguments[0]))
+
+
+def _remedy(word: str) -> str:
+    if "." in word or "/" in word:
+        return f"for a fit write: tune --flights {word}"
+    return did_you_mean(word, commands())
+
+
+def _help(arguments: Sequence[str]) -> str:
+    named = arguments and arguments[0] in commands()
+    return f"tune {arguments[0]} --help" if named else "tune --help"
+
+
+def _say(line: str, status: int) -> int:
+    sys.stderr.write(f"tune: {' '.join(line.split())}\n")
+    return status

@@ -1,0 +1,86 @@
+"""Results as tables on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from tuner.compare.table import Row
+    from tuner.compare.table import Table as Comparison
+    from tuner.config import Settings
+    from tuner.simulate.write import Summary
+
+
+#: Columns that a table may take, if need be beyond the terminal's, so that no number is cut.
+WIDTH = 140
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.width >= WIDTH else Console(highlight=False, width=WIDTH)
+
+
+def print_flights(summaries: Sequence[Summary], path: Path) -> None:
+    """Print one line a simulated flight, and where they were written."""
+    table = Table(box=None)
+    for name in summaries[0].coefficients:
+        table.add_column(name, justify="right")
+    for name in ("top speed m/s", "off reference x m", "y", "z", "crashed"):
+        table.add_column(name, justify="right")
+    for summary in summaries:
+        crash = "no" if summary.crash_time is None else f"at {summary.crash_time:.2f} s"
+        table.add_row(
+            *(f"{value:.6g}" for value in summary.coefficients.values()),
+            f"{summary.top_speed:.2f}",
+            *(f"{axis:.3f}" for axis in summary.tracking_rmse),
+            crash,
+        )
+    console = _console()
+    console.print(table)
+    console.print(f"written to {path}")
+
+
+def print_settings(settings: Settings) -> None:
+    """Print where each setting comes from."""
+    console = _console()
+    for name, origin in settings.origin.items():
+        console.print(f"{name}: {origin}")
+
+
+def print_comparison(
+    comparison: Comparison, settings: Settings, *, laps: bool, written: Sequence[Path]
+) -> None:
+    """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
+    console = _console()
+    console.print(f"controller: {settings.origin['controller']}")
+    table = Table(box=None)
+    for name in ("flight", "vehicle"):
+        table.add_column(name)
+    for name in ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg"):
+        table.add_column(name, justify="right")
+    for row in comparison.rows:
+        if laps or row.lap is None:
+            table.add_row(*_cells(row, comparison))
+    console.print(table)
+    console.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
+    for path in written:
+        console.print(f"written to {path}")
+
+
+def _cells(row: Row, comparison: Comparison) -> list[str]:
+    stretch = "all flights" if row.flight == "all" else row.flight
+    first = stretch if row.lap is None else f"{stretch} lap {row.lap}"
+    if row.crash_time is not None:
+        return [first, row.vehicle, f"crashed at {row.crash_time:.2f} s"]
+    winners = comparison.winners(row.flight, row.lap)
+    cells = []
+    for axis, value in row.rmse:
+        best = winners.get(axis) == row.vehicle and len(comparison.vehicles) > 1
+        text = "-" if value is None else f"{value:.4f}"
+        cells.append(f"[bold]{text}*[/bold]" if best else f"{text} ")
+    return [first, row.vehicle, *cells]

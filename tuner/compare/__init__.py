@@ -1,0 +1,1 @@
+"""How closely sets of coefficients meet recordings: nothing is fitted here."""

@@ -1,0 +1,105 @@
+"""The comparison as CSV, JSON or a small HTML page."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from tuner.compare.table import UNITS, Row, Table
+from tuner.config.yaml_file import write_text
+from tuner.errors import InputError
+
+SCHEMA_VERSION = 1
+TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a comparison in the format that the file's suffix names.
+
+    Raises
+    ------
+    InputError
+        The suffix is none of .csv, .json and .html, or the file cannot be written.
+    """
+    write_text(path, _writer(path)(table))
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse a file whose suffix names no format, before anything is computed."""
+    _writer(path)
+
+
+def _writer(path: Path) -> Callable[[Table], str]:
+    writers = {".csv": _csv, ".json": _json, ".html": _html}
+    if path.suffix not in writers:
+        raise InputError(
+            path, f"no table is written as '{path.suffix}'", "name a .csv, .json or .html"
+        )
+    return writers[path.suffix]
+
+
+def _csv(table: Table) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["flight", "lap", "vehicle", "axis", "unit", "rmse", "best", "crash_time"])
+    for row in table.rows:
+        winners = table.winners(row.flight, row.lap)
+        for axis, unit in UNITS.items():
+            value = getattr(row.rmse, axis)
+            writer.writerow(
+                [
+                    row.flight,
+                    "" if row.lap is None else row.lap,
+                    row.vehicle,
+                    axis,
+                    unit,
+                    "" if value is None else repr(value),
+                    int(winners.get(axis) == row.vehicle),
+                    "" if row.crash_time is None else row.crash_time,
+                ]
+            )
+    return text.getvalue()
+
+
+def _json(table: Table) -> str:
+    content = {
+        "schema_version": SCHEMA_VERSION,
+        "units": UNITS,
+        "vehicles": list(table.vehicles),
+        "best": table.best,
+        "rows": [_row(row) for row in table.rows],
+    }
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def _row(row: Row) -> dict[str, object]:
+    return {
+        "flight": row.flight,
+        "lap": row.lap,
+        "vehicle": row.vehicle,
+        "rmse": row.rmse.model_dump(),
+        "crash_time": row.crash_time,
+    }
+
+
+def _html(table: Table) -> str:
+    from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (for HTML alone)
+
+    environment = Environment(undefined=StrictUndefined, autoescape=True)
+    stretches = dict.fromkeys((row.flight, row.lap) for row in table.rows)
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        table=table,
+        units=UNITS,
+        stretches=[
+            {
+                "flight": flight,
+                "lap": lap,
+                "winners": table.winners(flight, lap),
+                "rows": [row for row in table.rows if (row.flight, row.lap) == (flight, lap)],
+            }
+            for flight, lap in stretches
+        ],
+    )

@@ -1,0 +1,195 @@
+"""A simulated flight as a ROS 1 bag, on the topics and in the units of a MAVROS lab."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag1 import Writer, WriterError
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tuner.errors import InputError
+from tuner.simulate.simulate import Simulation
+
+#: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
+EPOCH = 1_577_836_800_000_000_000
+RPM_PER_RAD_S = 60.0 / (2.0 * np.pi)
+#: µs of PWM at command 0, and from there to command 1.
+PWM_LOW, PWM_SPAN = 1000, 1000
+#: s of hover at the first point before the set-points begin, as labs record them.
+HOVER_BEFORE = 2.0
+ONLY_IN_FLIGHT = ("/mavros/setpoint_raw/attitude", "/mavros/rc/out")
+#: Mask of a reference that holds position, velocity and acceleration.
+NO_JERK_NO_SNAP = 2
+#: Mask of a set-point that is a body rate.
+NO_ATTITUDE = 128
+
+#: Message types of MAVROS and of the controllers, which ROS itself does not bring along.
+DEFINITIONS = {
+    "mavros_msgs/msg/RCOut": "std_msgs/Header header\nuint16[] channels\n",
+    "mavros_msgs/msg/RPM": "std_msgs/Header header\nuint8 index\nfloat32 frequency\n",
+    "mavros_msgs/msg/AttitudeTarget": (
+        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Quaternion orientation\n"
+        "geometry_msgs/Vector3 body_rate\nfloat32 thrust\n"
+    ),
+    "controller_msgs/msg/FlatTarget": (
+        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Vector3 position\n"
+        "geometry_msgs/Vector3 velocity\ngeometry_msgs/Vector3 acceleration\n"
+        "geometry_msgs/Vector3 jerk\ngeometry_msgs/Vector3 snap\n"
+    ),
+}
+
+TOPICS = {
+    "/optitrack/pose": "geometry_msgs/msg/PoseStamped",
+    "/mavros/local_position/pose": "geometry_msgs/msg/PoseStamped",
+    "/mavros/local_position/velocity_local": "geometry_msgs/msg/TwistStamped",
+    "/mavros/imu/data": "sensor_msgs/msg/Imu",
+    "/mavros/rpm": "mavros_msgs/msg/RPM",
+    "/mavros/rc/out": "mavros_msgs/msg/RCOut",
+    "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
+    "/reference/flatsetpoint": "controller_msgs/msg/FlatTarget",
+    "/trajectory_publisher/lap_completed": "std_msgs/msg/Int32",
+}
+
+
+def write_bag(simulation: Simulation, path: Path) -> None:
+    """Write a flight as MAVROS, a motion capture system and the trajectory publisher record one.
+
+    Two seconds of hover come first. Every message carries the time at which it is true; nothing is
+    noisy or late. Commands are PWM in whole µs, as autopilots send them. The file appears whole.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+            unfinished = Path(folder) / path.name
+            _write(simulation, unfinished)
+            unfinished.replace(path)
+    except (OSError, WriterError) as error:
+        raise InputError(path, f"cannot be written ({error})", "check the folder") from None
+
+
+def _write(simulation: Simulation, path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    messages = _Messages(store.types)
+    with Writer(path) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in TOPICS.items()
+        }
+        for topic, nanoseconds, message in _in_time(simulation, messages):
+            raw = store.serialize_ros1(message, TOPICS[topic])
+            writer.write(connections[topic], nanoseconds, raw)
+
+
+def _in_time(simulation: Simulation, messages: _Messages) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, time in ns and message of the hover before the flight, then of the flight."""
+    step = float(simulation.time[1] - simulation.time[0])
+    resting = replace(
+        simulation, signals={name: values[:1] for name, values in simulation.signals.items()}
+    )
+    before = round(HOVER_BEFORE / step)
+    for number in range(before):
+        nanoseconds = EPOCH + round(number * step * 1e9)
+        for topic, message in messages.at(resting, 0, nanoseconds):
+            if topic not in ONLY_IN_FLIGHT:
+                yield topic, nanoseconds, message
+    for index, seconds in enumerate(simulation.time):
+        nanoseconds = EPOCH + round((before * step + float(seconds)) * 1e9)
+        for topic, message in messages.at(simulation, index, nanoseconds):
+            yield topic, nanoseconds, message
+
+
+class _Messages:
+    """Makes the messages of one instant."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+        self._still = self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+
+    def at(self, flight: Simulation, index: int, nanoseconds: int) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message for every topic that has one then."""
+        now = {name: values[index].tolist() for name, values in flight.signals.items()}
+        stamp = self._make("builtin_interfaces/msg/Time", *divmod(nanoseconds, 1_000_000_000))
+        world = self._make("std_msgs/msg/Header", index, stamp, "map")
+        body = self._make("std_msgs/msg/Header", index, stamp, "base_link")
+        w, x, y, z = now["attitude"]
+        attitude = self._make("geometry_msgs/msg/Quaternion", x, y, z, w)
+        place = self._make("geometry_msgs/msg/Point", *now["position"])
+        pose = self._make("geometry_msgs/msg/Pose", place, attitude)
+        stamped = self._make("geometry_msgs/msg/PoseStamped", world, pose)
+        yield "/optitrack/pose", stamped
+        yield "/mavros/local_position/pose", stamped
+        twist = self._make(
+            "geometry_msgs/msg/Twist", self._vector(now["velocity"]), self._vector(now["body_rate"])
+        )
+        yield (
+            "/mavros/local_position/velocity_local",
+            self._make("geometry_msgs/msg/TwistStamped", world, twist),
+        )
+        yield "/mavros/imu/data", self._imu(body, attitude, now)
+        for rotor, speed in enumerate(now["rotor_speed"]):
+            yield (
+                "/mavros/rpm",
+                self._make("mavros_msgs/msg/RPM", body, rotor, speed * RPM_PER_RAD_S),
+            )
+        pwm = np.array([PWM_LOW + round(PWM_SPAN * u) for u in now["command"]], dtype=np.uint16)
+        yield "/mavros/rc/out", self._make("mavros_msgs/msg/RCOut", body, pwm)
+        yield (
+            "/mavros/setpoint_raw/attitude",
+            self._make(
+                "mavros_msgs/msg/AttitudeTarget",
+                body,
+                NO_ATTITUDE,
+                self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+                self._vector(now["rate_setpoint"]),
+                now["thrust_setpoint"][0],
+            ),
+        )
+        names = ("reference_position", "reference_velocity", "reference_acceleration")
+        parts = [self._vector(now[name]) for name in names]
+        yield (
+            "/reference/flatsetpoint",
+            self._make(
+                "controller_msgs/msg/FlatTarget",
+                world,
+                NO_JERK_NO_SNAP,
+                *parts,
+                self._still,
+                self._still,
+            ),
+        )
+        laps = flight.signals["lap"][:, 0]
+        if index and laps[index] != laps[index - 1]:
+            yield (
+                "/trajectory_publisher/lap_completed",
+                self._make("std_msgs/msg/Int32", int(laps[index])),
+            )
+
+    def _imu(self, header: Any, attitude: Any, now: Mapping[str, list[float]]) -> Any:
+        unknown = np.zeros(9)
+        return self._make(
+            "sensor_msgs/msg/Imu",
+            header,
+            attitude,
+            unknown,
+            self._vector(now["body_rate"]),
+            unknown,
+            self._vector(now["acceleration"]),
+            unknown,
+        )
+
+    def _vector(self, values: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", *values)
+
+    def _make(self, kind: str, *fields: object) -> Any:
+        return self._types[kind](*fields)

@@ -1,0 +1,180 @@
+"""The closed loop flown with given coefficients, one vehicle or a grid of them side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.numeric import GRAVITY
+from sim_jax.rollout import Rollout, rollout
+from sim_jax.schedule import Schedule
+from sim_jax.state import hover
+from tuner.config import ControllerFile, TrajectorySettings, VehicleFile
+from tuner.flights.flight import Array, Series
+from tuner.flights.resample import resample
+from tuner.model import Model, model_of, schedule_of, with_coefficients
+from tuner.simulate.trajectory import Published, published
+
+#: Vehicles that fly at once; more take turns, so that memory stays bounded.
+CHUNK = 256
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One simulated flight.
+
+    Attributes
+    ----------
+    time
+        (N,) s, uniform, from 0.
+    signals
+        Signal -> (N, k), named, in units and frames as in `tuner.flights.flight.SIGNALS`;
+        ``acceleration`` is the specific force in body axes, as an accelerometer shows it.
+    crash_time
+        s at which the vehicle crashed and was frozen; None if it never did.
+    coefficients
+        What was varied for this flight: coefficient -> value.
+    """
+
+    time: Array
+    signals: Mapping[str, Array]
+    crash_time: float | None
+    coefficients: Mapping[str, float]
+
+
+def simulate(
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    trajectory: TrajectorySettings,
+    *,
+    duration: float = 40.0,
+    rate: float = 100.0,
+    grid: Mapping[str, Array] | None = None,
+) -> Iterator[Simulation]:
+    """Fly a trajectory, starting at rest at its first point.
+
+    Parameters
+    ----------
+    vehicle, controller
+        What flies.
+    trajectory
+        What is flown.
+    duration
+        s.
+    rate
+        Hz of the result.
+    grid
+        Coefficient -> (B,) values of B vehicles; None flies the vehicle alone.
+
+    Yields
+    ------
+    Simulation
+        One, or B of them in the order of the grid.
+    """
+    clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
+    fits = round(controller.physics.rate) % rate == 0
+    schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
+    control_rate = schedule.position_control_rate
+    reference = published(trajectory, duration=duration, control_rate=control_rate)
+    sent = _sent(reference, clock, control_rate)
+    samples = math.ceil(duration * schedule.log_rate) + 1
+    log_time = np.arange(samples) / schedule.log_rate
+    for columns, wanted in _chunks(grid or {}):
+        model = with_coefficients(
+            model_of(vehicle, controller),
+            {name: jnp.asarray(column) for name, column in columns.items()},
+        )
+        flown = _fly(model, schedule, reference, samples)
+        logged = _logged(flown)
+        crashes = np.asarray(flown.crash_time).reshape(-1)
+        for lane in range(wanted):
+            signals = {
+                name: resample(name, Series(log_time, values[..., lane]), clock)
+                for name, values in logged.items()
+            }
+            signals["acceleration"] = _specific_force(clock, signals)
+            yield Simulation(
+                time=clock,
+                signals=signals | sent,
+                crash_time=float(crashes[lane]) if np.isfinite(crashes[lane]) else None,
+                coefficients={name: float(column[lane]) for name, column in columns.items()},
+            )
+
+
+def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:
+    """Yield a grid in pieces of one size, the last filled up, and how many of each are wanted."""
+    count = len(next(iter(grid.values()))) if grid else 1
+    size = min(count, CHUNK)
+    for start in range(0, count, size):
+        piece = {name: np.asarray(column)[start : start + size] for name, column in grid.items()}
+        wanted = min(size, count - start)
+        yield (
+            {name: np.pad(column, (0, size - wanted), "edge") for name, column in piece.items()},
+            wanted,
+        )
+
+
+def _fly(model: Model, schedule: Schedule, reference: Published, samples: int) -> Rollout:
+    flown: Rollout = eqx.filter_jit(rollout)(
+        model.vehicle,
+        model.controller,
+        schedule,
+        reference.inlet,
+        hover(model.vehicle, reference.start),
+        samples=samples,
+    )
+    return flown
+
+
+def _logged(flown: Rollout) -> dict[str, Array]:
+    """Return signal -> (samples, k, lanes)."""
+    log = flown.log
+    motion, setpoints = log.motion, log.setpoints
+    attitude = motion.attitude
+    parts = {
+        "position": (motion.position.x, motion.position.y, motion.position.z),
+        "velocity": (motion.velocity.x, motion.velocity.y, motion.velocity.z),
+        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
+        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
+        "rotor_speed": log.rotor_speed,
+        "command": log.command,
+        "rate_setpoint": (setpoints.rate.x, setpoints.rate.y, setpoints.rate.z),
+        "thrust_setpoint": (setpoints.thrust,),
+    }
+    lanes = flown.crash_time.size
+    return {
+        name: np.stack(
+            [np.asarray(leaf, dtype=np.float64).reshape(-1, lanes) for leaf in leaves], axis=1
+        )
+        for name, leaves in parts.items()
+    }
+
+
+def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
+    """Return the reference in force at each instant of a clock."""
+    tick = np.floor(clock * control_rate + 1e-9).astype(int)
+    points = reference.inlet.points
+    parts = {
+        "reference_position": points.position,
+        "reference_velocity": points.velocity,
+        "reference_acceleration": points.acceleration,
+    }
+    sent = {
+        name: np.asarray(part.stacked(), dtype=np.float64).T[tick] for name, part in parts.items()
+    }
+    return sent | {"lap": reference.lap[tick, None].astype(np.float64)}
+
+
+def _specific_force(clock: Array, signals: Mapping[str, Array]) -> Array:
+    """Return (N, 3) m/s² in body axes, from differences of the velocity."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
+
+    force = np.gradient(signals["velocity"], clock, axis=0) + np.array([0.0, 0.0, GRAVITY])
+    turns = Rotation.from_quat(signals["attitude"], scalar_first=True)
+    turned: Array = turns.inv().apply(force)
+    return turned

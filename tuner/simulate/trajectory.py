@@ -1,0 +1,135 @@
+"""A named trajectory as the simulator's reference, as the thesis's publisher would send it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.control.position import ReferencePoint
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.trajectory import TICK_RATE, Shape, ShapeName, publish
+from sim_jax.vector import Vec3
+from tuner.config import TrajectorySettings
+from tuner.errors import InputError
+from tuner.flights.flight import Flight
+
+_SHAPES: dict[str, ShapeName] = {
+    "circle": "circle",
+    "lemniscate": "lemniscate",
+    "straight": "straight",
+    "diagonal": "diagonal",
+    "yaw_spin": "stationary",
+    "hover": "stationary",
+}
+
+#: Peak speed of each shape's reference, in radius·omega·velocity scaler.
+_PEAK = {"circle": 1.0, "lemniscate": math.sqrt(2), "straight": 1.0, "diagonal": math.sqrt(2)}
+
+
+@dataclass(frozen=True)
+class Published:
+    """A reference over a whole flight.
+
+    Attributes
+    ----------
+    inlet
+        What the simulator flies, one point a control tick.
+    lap
+        (ticks,) laps completed at each control tick.
+    """
+
+    inlet: ReferenceInlet
+    lap: NDArray[np.int64]
+
+    @property
+    def start(self) -> Vec3:
+        """The first point, m."""
+        place = self.inlet.points.position
+        return Vec3(place.x[0], place.y[0], place.z[0])
+
+
+def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
+    """Return the reference of a trajectory from rest.
+
+    Parameters
+    ----------
+    settings
+        Shape and its numbers.
+    duration
+        s.
+    control_rate
+        Hz of the position controller, which sees the last of the publisher's 100 Hz ticks.
+    """
+    shape = Shape(
+        _SHAPES[settings.name],
+        radius=jnp.asarray(settings.radius),
+        omega=jnp.asarray(settings.omega),
+    )
+    ticks = math.ceil(duration * TICK_RATE) + 1
+    sent = publish(shape, ticks=ticks, velocity_scaler=settings.speed_scale)
+    count = math.ceil(duration * control_rate) + 1
+    seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
+    rows = seen.astype(int)
+    points = sent.points
+    spins = settings.name == "yaw_spin"
+    return Published(
+        ReferenceInlet(
+            ReferencePoint(
+                *(
+                    Vec3(part.x[rows], part.y[rows], part.z[rows])
+                    for part in (points.position, points.velocity, points.acceleration)
+                )
+            ),
+            spins=jnp.asarray(spins),
+            yaw_rate=jnp.asarray(settings.yaw_rate if spins else 0.0),
+        ),
+        np.asarray(sent.lap)[rows],
+    )
+
+
+def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight:
+    """Return a recording without a reference with that of a named trajectory.
+
+    The publisher is taken to have started with the mission.
+    """
+    sent = published(settings, duration=flight.duration, control_rate=flight.rate)
+    points = sent.inlet.points
+    count = len(flight.time)
+    parts = {
+        "reference_position": points.position,
+        "reference_velocity": points.velocity,
+        "reference_acceleration": points.acceleration,
+    }
+    reference = {
+        name: np.asarray(part.stacked(), dtype=np.float64).T[:count] for name, part in parts.items()
+    }
+    spin = settings.yaw_rate if settings.name == "yaw_spin" else flight.yaw_rate_setpoint
+    return replace(flight, signals={**flight.signals, **reference}, yaw_rate_setpoint=spin)
+
+
+def at_speed(settings: TrajectorySettings, speed: float) -> TrajectorySettings:
+    """Return the trajectory with the velocity scaler at which its reference peaks at a speed.
+
+    Parameters
+    ----------
+    settings
+        Shape and its numbers.
+    speed
+        m/s.
+
+    Raises
+    ------
+    InputError
+        The trajectory stays in one place, or the speed is none.
+    """
+    peak = _PEAK.get(settings.name)
+    if peak is None:
+        raise InputError("--speed", f"{settings.name} stays in one place", "leave it out")
+    scale = speed / (peak * settings.radius * settings.omega)
+    if not 0 < scale < math.inf:
+        raise InputError("--speed", f"{speed:g} m/s is no speed", "give m/s above zero")
+    return settings.replace(speed_scale=scale)
