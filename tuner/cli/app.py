@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from cyclopts import App
 
+from tuner.cli.tune import tune
+
 SUMMARY = "Fit the coefficients of a multirotor simulator to recorded flights."
 
 
@@ -47,6 +49,9 @@ for _name, (_summary, *_examples) in COMMANDS.items():
         help_epilogue="\n".join(f"Example: {example}" for example in _examples),
         help_format="plaintext",
     )
+
+
+app.default(tune)
 
 
 def commands() -> tuple[str, ...]:

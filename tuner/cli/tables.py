@@ -20,9 +20,10 @@ if TYPE_CHECKING:
 WIDTH = 140
 
 
-def _console() -> Console:
-    console = Console(highlight=False)
-    return console if console.width >= WIDTH else Console(highlight=False, width=WIDTH)
+def console() -> Console:
+    """Return a console wide enough that no number is cut."""
+    fitting = Console(highlight=False)
+    return fitting if fitting.width >= WIDTH else Console(highlight=False, width=WIDTH)
 
 
 def print_flights(summaries: Sequence[Summary], path: Path) -> None:
@@ -40,24 +41,24 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
             *(f"{axis:.3f}" for axis in summary.tracking_rmse),
             crash,
         )
-    console = _console()
-    console.print(table)
-    console.print(f"written to {path}")
+    screen = console()
+    screen.print(table)
+    screen.print(f"written to {path}")
 
 
 def print_settings(settings: Settings) -> None:
     """Print where each setting comes from."""
-    console = _console()
+    screen = console()
     for name, origin in settings.origin.items():
-        console.print(f"{name}: {origin}")
+        screen.print(f"{name}: {origin}")
 
 
 def print_comparison(
     comparison: Comparison, settings: Settings, *, laps: bool, written: Sequence[Path]
 ) -> None:
     """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
-    console = _console()
-    console.print(f"controller: {settings.origin['controller']}")
+    screen = console()
+    screen.print(f"controller: {settings.origin['controller']}")
     table = Table(box=None)
     for name in ("flight", "vehicle"):
         table.add_column(name)
@@ -66,10 +67,10 @@ def print_comparison(
     for row in comparison.rows:
         if laps or row.lap is None:
             table.add_row(*_cells(row, comparison))
-    console.print(table)
-    console.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
+    screen.print(table)
+    screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
     for path in written:
-        console.print(f"written to {path}")
+        screen.print(f"written to {path}")
 
 
 def _cells(row: Row, comparison: Comparison) -> list[str]:

@@ -75,7 +75,7 @@ class LaneSums(eqx.Module):
     loss
         (F,) half the robust sum of squares.
     gradient, hessian
-        (P, F) and (P, P, F); zero-sized where derivatives were not asked for.
+        (P, F) and (P, P, F); zero where derivatives were not asked for.
     squares
         Channel -> (F,) plain sum of squares in unscaled standard deviations.
     counts
@@ -194,7 +194,8 @@ class _Flier:
         scaled = {name: e / scale[name] for name, e in errors.items()}
         loss = sum((jnp.sum(_huber(e, huber), axis=(0, 1)) for e in scaled.values()), jnp.zeros(()))
         lanes_here = offsets.shape[-1]
-        gradient, hessian = jnp.zeros((0, lanes_here)), jnp.zeros((0, 0, lanes_here))
+        size = len(coefficients) + len(offsets)
+        gradient, hessian = jnp.zeros((size, lanes_here)), jnp.zeros((size, size, lanes_here))
         if moved is not None:
             columns = _columns(compare, trace, moved, offsets)
             gradient, hessian = _normal(columns, scaled, scale, huber)

@@ -7,8 +7,7 @@ minimum. Noise is loosened at first, since the model is still wrong by more than
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,6 +29,7 @@ OFFSETS_FROM = 5.0
 """s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
 STRAY = 3.0
 """A flight this many times worse than the others is weighed down, channel by channel."""
+WHOLE = "whole flights"
 FEEDBACK_AT = 3.0
 """s of horizon at which the mixer's saturation feedback is tried both ways."""
 FEEDBACK_GAIN = 1.2
@@ -93,7 +93,7 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     rescale=False,
                 )
             )
-    whole = Leg("whole flights", samples, 1.0, False, True, min(10, steps), 1e-3, False)
+    whole = Leg(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, False)
     legs.append(whole)
     polish = replace(whole, robust=robust, tolerance=1e-5, rescale=True, steps=min(15, steps))
     legs += [replace(polish, name="polish"), replace(polish, name="polish again")]
@@ -122,6 +122,8 @@ class Progress:
         Whether the last leg ended by itself.
     feedback
         The mixer's saturation feedback that is flown: 1 as in PX4.
+    step, trail
+        The solver's state inside a leg, and the losses (S,) of the leg so far; None between legs.
     """
 
     leg: int
@@ -132,6 +134,8 @@ class Progress:
     evaluations: int
     converged: bool = False
     feedback: float = 1.0
+    step: Step | None = None
+    trail: tuple[NDArray[np.float64], ...] = ()
 
 
 def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
@@ -155,7 +159,7 @@ def grow(
     *,
     free_offsets: bool,
     clipped: bool,
-    tell: Callable[[Iteration], None],
+    tell: Callable[[Progress], None],
 ) -> Iterator[Progress]:
     """Run the remaining legs, yielding the state after each.
 
@@ -173,7 +177,7 @@ def grow(
         Whether rotors were clipped low in a recording: whether the rate integrator then stops is
         tried both ways, for set-ups differ in it and a saturated yaw step shows it.
     tell
-        Called after every iteration.
+        Called after every iteration with where the search then stands.
     """
     while progress.leg < len(legs):
         leg = legs[progress.leg]
@@ -193,43 +197,54 @@ def run_leg(
     leg: Leg,
     progress: Progress,
     free_offsets: bool,
-    tell: Callable[[Iteration], None],
+    tell: Callable[[Progress], None],
 ) -> Progress:
     """Run one leg to its end for every start at once."""
     objective = with_feedback(objective, progress.feedback)
+    points, kept = _offsets_that_matter(leg, progress)
     best = int(np.argmin(progress.losses))
-    points, kept = progress.points, np.ones_like(np.asarray(progress.points.offsets[0]))
-    if leg.rescale:
-        kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET).astype(float)
-        points = Point(points.coefficients, points.offsets * kept)
-    stage = stage_of(leg, progress.scales, np.asarray(points.offsets[best]))
+    stage = on_host(stage_of(leg, progress.scales, np.asarray(points.offsets[best])))
     count = len(objective.space)
     free = np.concatenate([np.ones(count), kept.ravel() * float(leg.offsets and free_offsets)])
-    step = on_host(begin(objective, on_host(points), on_host(stage), free))
-    iterations = list(progress.iterations)
-    trail: list[NDArray[np.float64]] = []
+    step = progress.step
+    if step is None:
+        step = on_host(begin(objective, on_host(points), stage, free))
     converged = False
-    for _ in range(leg.steps):
-        step = on_host(advance(objective, step, on_host(stage), free))
-        trail.append(np.asarray(step.loss))
-        iterations.append(_iteration(objective, leg, step, len(iterations)))
-        tell(iterations[-1])
-        if _settled(trail, np.asarray(step.accepted), leg.tolerance):
-            converged = True
-            break
-    scales = strays(step, progress.scales, leg.loosening)
-    if leg.rescale or leg.name == "whole flights":
+    while len(progress.trail) < leg.steps and not converged:
+        step = on_host(advance(objective, step, stage, free))
+        iteration = _iteration(objective, leg, step, len(progress.iterations))
+        progress = replace(
+            progress,
+            step=step,
+            trail=(*progress.trail, np.asarray(step.loss)),
+            iterations=(*progress.iterations, iteration),
+            evaluations=progress.evaluations + 1,
+        )
+        tell(progress)
+        converged = _settled(progress.trail, np.asarray(step.accepted), leg.tolerance)
+    scales = strays(step, leg.loosening)
+    if leg.rescale or leg.name == WHOLE:
         scales = misfit(step)
     return replace(
         progress,
         leg=progress.leg + 1,
         points=step.point,
         scales=scales,
-        losses=trail[-1],
-        iterations=tuple(iterations),
-        evaluations=progress.evaluations + len(trail),
+        losses=progress.trail[-1],
         converged=converged,
+        step=None,
+        trail=(),
     )
+
+
+def _offsets_that_matter(leg: Leg, progress: Progress) -> tuple[Point, NDArray[np.float64]]:
+    """Return the points with small clock offsets set to none for the polish, and which are kept."""
+    points = progress.points
+    if not leg.rescale:
+        return points, np.ones(points.offsets.shape[1:])
+    best = int(np.argmin(progress.losses))
+    kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET).astype(float)
+    return Point(points.coefficients, points.offsets * kept), kept
 
 
 def stage_of(
@@ -254,7 +269,7 @@ def on_host(tree: Any) -> Any:
 
 
 def _settled(
-    trail: list[NDArray[np.float64]], accepted: NDArray[np.bool_], tolerance: float
+    trail: Sequence[NDArray[np.float64]], accepted: NDArray[np.bool_], tolerance: float
 ) -> bool:
     """Tell whether no start gains any more: not by its last step, nor by its last three tries."""
     if len(trail) < 2:
@@ -278,9 +293,7 @@ def root_mean_squares(step: Step, start: int) -> dict[str, NDArray[np.float64]]:
     return found
 
 
-def strays(
-    step: Step, scales: dict[str, NDArray[np.float64]], loosening: float
-) -> dict[str, NDArray[np.float64]]:
+def strays(step: Step, loosening: float) -> dict[str, NDArray[np.float64]]:
     """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
     found = root_mean_squares(step, int(np.argmin(np.asarray(step.loss))))
     table = np.stack(list(found.values())) / loosening
@@ -329,20 +342,9 @@ def point_of(points: Point, start: int) -> Point:
     return picked
 
 
-def one(point: Point) -> Point:
-    """Return a point as the only one of S = 1."""
-    alone: Point = jax.tree.map(lambda leaf: leaf[None], point)
-    return alone
-
-
 def with_feedback(objective: Objective, feedback: float) -> Objective:
     """Return the objective with the mixer's saturation feedback set: 1 as in PX4, 0 without."""
     changed: Objective = eqx.tree_at(
         lambda o: o.model.controller.rate.saturation_feedback, objective, jnp.asarray(feedback)
     )
     return changed
-
-
-def seconds_since(start: float) -> float:
-    """Return the wall time since a `time.perf_counter` reading."""
-    return time.perf_counter() - start

@@ -27,7 +27,7 @@ class Step(eqx.Module):
     solver
         optimistix's own state.
     sums
-        The lanes' sums at the point that was tried.
+        The lanes' sums at the point that was tried, gradient and Hessian included.
     loss
         Scalar: the loss at the best point, per compared value.
     accepted
@@ -60,8 +60,6 @@ def total(
     pull, slope = jax.jvp(prior, (point.coefficients,), (jnp.ones(count),))
     clock_pull = point.offsets / OFFSET_SD
     loss = jnp.sum(sums.loss) + 0.5 * (jnp.sum(pull**2) + jnp.sum(clock_pull**2))
-    if sums.gradient.shape[0] == 0:
-        return loss / compared, jnp.zeros(0), jnp.zeros((0, 0))
     size = count + clocks * lanes
     gradient, hessian = jnp.zeros(size), jnp.zeros((size, size))
     gradient = gradient.at[:count].set(jnp.sum(sums.gradient[:count], axis=-1) + slope * pull)
@@ -126,17 +124,10 @@ def _square_problem(objective: Objective, stage: Stage, free: Array) -> Any:
         residual = jax.scipy.linalg.solve_triangular(factor, gradient, lower=True)
         rest = jnp.sqrt(jnp.maximum(2.0 * loss - residual @ residual, 0.0))
         pushed = jnp.concatenate([factor.T @ change, jnp.zeros(1, packed.dtype)])
-        sums = _without_derivatives(sums)
         quiet = jax.tree.map(jnp.zeros_like, sums)
         return (jnp.concatenate([residual, rest[None]]), sums), (pushed, quiet)
 
     return lambda packed, _: square(packed)
-
-
-def _without_derivatives(sums: LaneSums) -> LaneSums:
-    lanes = sums.loss.shape[-1]
-    empty = (jnp.zeros((0, lanes)), jnp.zeros((0, 0, lanes)))
-    return eqx.tree_at(lambda s: (s.gradient, s.hessian), sums, empty)
 
 
 class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):

@@ -1,0 +1,99 @@
+"""What a long run shows: a line that moves on a terminal, plain lines when piped, tables at the end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from tuner.cli.tables import console
+
+if TYPE_CHECKING:
+    from tuner.config import Settings
+    from tuner.job.run import Listener
+    from tuner.result import RunResult
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+@contextmanager
+def listening(*, quiet: bool) -> Iterator[Listener]:
+    """Yield a listener that shows a run on the terminal, or nothing."""
+    from tuner.job.run import SILENT, Listener
+
+    if quiet:
+        yield SILENT
+        return
+    screen, began = console(), time.perf_counter()
+    live = screen.status("reading the flights") if screen.is_terminal else None
+    if live is not None:
+        live.start()
+
+    def settled(settings: Settings) -> None:
+        for name, origin in settings.origin.items():
+            screen.print(f"{name}: {origin}")
+
+    def iteration(stage: str, number: int, horizon: float, loss: float, rmse: float) -> None:
+        seconds = time.perf_counter() - began
+        line = (
+            f"{stage}: iteration {number}, horizon {horizon:.3g} s, position RMSE "
+            f"{1000 * rmse:.2f} mm, loss {loss:.4g}, {seconds:.0f} s so far"
+        )
+        if live is None:
+            screen.print(line)
+        else:
+            live.update(line)
+
+    try:
+        yield Listener(settled, iteration, screen.print)
+    finally:
+        if live is not None:
+            live.stop()
+
+
+def print_run(folder: Path, result: RunResult) -> None:
+    """Print the coefficients, the RMSE before and after, and where everything lies."""
+    screen = console()
+    screen.print(_coefficients(result))
+    screen.print(_errors(result))
+    search = result.search
+    screen.print(
+        f"{search.evaluations} Jacobians in {search.wall_time:.0f} s, {search.message}; "
+        f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv)"
+    )
+
+
+def _coefficients(result: RunResult) -> Table:
+    table = Table(box=None, title="Coefficients", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("initial", "best", "±", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    table.add_column("how well it is known")
+    for name, one in result.coefficients.items():
+        error = "" if one.std_error is None else f"{one.std_error:.2g}"
+        table.add_row(name, f"{one.initial:.5g}", f"{one.best:.5g}", error, one.unit, one.note)
+    return table
+
+
+def _errors(result: RunResult) -> Table:
+    table = Table(box=None, title="RMSE before → after", title_justify="left")
+    table.add_column("flight")
+    for axis in AXES:
+        unit = "m" if axis in ("x", "y", "z") else "deg"
+        table.add_column(f"{axis} {unit}", justify="right")
+    for flight in result.flights:
+        cells = []
+        for axis in AXES:
+            before, after = getattr(flight.rmse_initial, axis), getattr(flight.rmse_best, axis)
+            cells.append(f"{_number(before)} → {_number(after)}")
+        held = " (held out)" if flight.split == "holdout" else ""
+        table.add_row(flight.name + held, *cells)
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "crash" if value is None else f"{value:.4f}" if value < 0.1 else f"{value:.3f}"

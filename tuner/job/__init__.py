@@ -1,0 +1,1 @@
+"""One tuning job from inputs to result folder: check, search, validate, write."""

@@ -1,0 +1,121 @@
+"""From settled options to the problem that is searched: flights read, noise told, lanes laid."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_jax.crash import AIRBORNE, Limits
+from tuner.coefficients import Space, space_of
+from tuner.compare.compare import flights_of
+from tuner.config import Settings
+from tuner.errors import RecordingError
+from tuner.flights.flight import Flight
+from tuner.model import model_of, schedule_of
+from tuner.objective.lanes import lanes_of, noise_of
+from tuner.objective.noise import CHANNELS
+from tuner.objective.normal import Objective
+
+#: What a yaw spin is compared by: nothing holds its position, so that a gust or a tilt of a
+#: hundredth of a degree moves it by metres without meaning anything.
+SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
+
+CLIPPED = 0.005
+"""A recorded command below this is a rotor clipped low."""
+CLEARANCE = 0.3
+"""m: a recording that comes closer to the ground than this does not end there."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A problem and what it was made of.
+
+    Attributes
+    ----------
+    settings
+        The user's.
+    fitted, held_out
+        Flights.
+    noise
+        Channel -> standard deviation in its unit (attitude: rad).
+    space, objective
+        What is searched.
+    """
+
+    settings: Settings
+    fitted: tuple[Flight, ...]
+    held_out: tuple[Flight, ...]
+    noise: Mapping[str, float]
+    space: Space
+    objective: Objective
+
+    @property
+    def flights(self) -> tuple[Flight, ...]:
+        """Every flight, the fitted ones first."""
+        return (*self.fitted, *self.held_out)
+
+    @property
+    def clipped(self) -> bool:
+        """Tell whether some recorded rotor was clipped low."""
+        return any(
+            bool((np.nan_to_num(flight.signals["command"], nan=1.0) < CLIPPED).any())
+            for flight in self.fitted
+            if flight.has("command")
+        )
+
+
+def prepare(settings: Settings) -> Job:
+    """Read the flights and build the problem.
+
+    Raises
+    ------
+    InputError
+        A recording cannot be read or used, or the job leaves nothing to fit.
+    """
+    flights = flights_of(settings)
+    held = set(settings.job.holdout)
+    fitted = tuple(flight for flight in flights if flight.name not in held)
+    held_out = tuple(flight for flight in flights if flight.name in held)
+    if not fitted:
+        raise RecordingError("--holdout", "holds out every flight", "leave one to fit")
+    return job_of(settings, fitted, held_out)
+
+
+def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Flight, ...]) -> Job:
+    """Build the problem of some flights."""
+    job = settings.job
+    channels = [name for name in CHANNELS if job.channels.get(name, True)]
+    noise = noise_of(fitted, channels)
+    space = space_of(settings.vehicle, job)
+    schedule = schedule_of(settings.controller)
+    lanes = lanes_of(fitted, noise=noise, weights=_weights(settings, fitted))
+    steps = max(len(flight.time) for flight in fitted) * schedule.log_rate
+    objective = Objective(
+        model=model_of(settings.vehicle, settings.controller),
+        lanes=lanes,
+        space=space,
+        schedule=schedule,
+        samples=int(np.ceil(steps / fitted[0].rate)),
+        limits=limits_for(fitted),
+    )
+    return Job(settings, fitted, held_out, noise, space, objective)
+
+
+def limits_for(flights: Sequence[Flight]) -> Limits:
+    """Return the simulator's limits; a recording near the ground has no floor to crash into."""
+    lowest = min(float(np.nanmin(flight.signals["position"][:, 2])) for flight in flights)
+    return Limits() if lowest > Limits().floor + CLEARANCE else AIRBORNE
+
+
+def _weights(settings: Settings, flights: Sequence[Flight]) -> dict[str, dict[str, float]]:
+    weights: dict[str, dict[str, float]] = {}
+    for flight in flights:
+        own = settings.job.flights.get(flight.name)
+        factor = 1.0 if own is None else own.weight
+        of_flight = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
+        if flight.yaw_rate_setpoint is not None:
+            of_flight |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
+        weights[flight.name] = of_flight
+    return weights

@@ -1,0 +1,231 @@
+"""A finished search into the result folder: what was found, how well it is met, how sure it is."""
+
+from __future__ import annotations
+
+import csv
+import io
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+
+from tuner.compare.errors import Comparison, FlightErrors
+from tuner.config import (
+    COEFFICIENTS,
+    ControllerFile,
+    VehicleFile,
+    values_of,
+    with_values,
+    write_vehicle,
+)
+from tuner.config.yaml_file import write_text
+from tuner.flights.flight import Flight
+from tuner.identifiability import Uncertainty
+from tuner.job.prepare import Job
+from tuner.objective.lanes import CLOCKS
+from tuner.objective.normal import OFFSET_UNIT
+from tuner.result import (
+    BEST_FIT_FILE,
+    SCHEMA_VERSION,
+    AxesRmse,
+    CoefficientResult,
+    FlightResult,
+    RunResult,
+    SearchResult,
+    write_result,
+)
+from tuner.search.fitted import Fitted
+
+METRICS_FILE = "metrics.csv"
+LIBRARIES = ("multirotor-tune", "jax", "jaxlib", "equinox", "optimistix", "numpy", "rosbags")
+UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+
+
+def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
+    """Return the controller file with what the search found out about the set-up."""
+    said = job.settings.controller
+    feedback = bool(fitted.objective.model.controller.rate.saturation_feedback > 0.5)
+    return said.replace(mixer=said.mixer.replace(saturation_feedback=feedback))
+
+
+def vehicle_fitted(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> VehicleFile:
+    """Return the vehicle with the best coefficients.
+
+    A coefficient that the flights do not determine keeps its initial value.
+    """
+    return with_values(job.settings.vehicle, best_values(job, fitted, uncertainty))
+
+
+def best_values(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> dict[str, float]:
+    """Return the coefficients that are reported: the fitted ones, where they are identifiable."""
+    start = values_of(job.settings.vehicle)
+    found = job.space.values(fitted.point.coefficients)
+    return {
+        name: float(value) if uncertainty.estimates[name].identifiable else start[name]
+        for name, value in found.items()
+    }
+
+
+def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return flight -> s by which its pose stamps are late."""
+    pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
+    return {flight.name: float(late) for flight, late in zip(job.fitted, pose, strict=True)}
+
+
+def validate(
+    job: Job, fitted: Fitted, vehicle: VehicleFile
+) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
+    """Fly every flight whole with the initial and with the fitted vehicle."""
+    comparison = Comparison(job.flights, controller_flown(job, fitted), offsets_of(job, fitted))
+    return comparison.fly(job.settings.vehicle), comparison.fly(vehicle)
+
+
+def result_of(
+    job: Job,
+    fitted: Fitted,
+    uncertainty: Uncertainty,
+    errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
+    *,
+    status: str,
+) -> RunResult:
+    """Assemble ``result.json``."""
+    initial, best = errors
+    settings = job.settings
+    return RunResult(
+        schema_version=SCHEMA_VERSION,
+        status=status,
+        seed=settings.job.search.seed,
+        versions=versions(),
+        settings={
+            "vehicle": settings.vehicle.model_dump(mode="json"),
+            "controller": controller_flown(job, fitted).model_dump(mode="json"),
+            "job": settings.job.model_dump(mode="json"),
+            "origin": dict(settings.origin),
+            "noise": dict(fitted.noise),
+            "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+            "findings": [vars(finding) for finding in fitted.findings],
+            "starts": [
+                {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes
+            ],
+        },
+        coefficients=_coefficients(job, fitted, uncertainty),
+        flights=tuple(
+            _flight(job, fitted, flight, initial[flight.name].rmse, best[flight.name].rmse)
+            for flight in job.flights
+        ),
+        search=SearchResult(
+            method=fitted.method,
+            evaluations=fitted.evaluations,
+            iterations=len(fitted.iterations),
+            wall_time=fitted.wall_time,
+            cost_initial=fitted.loss_initial,
+            cost_best=fitted.loss_best,
+            converged=fitted.converged,
+            message=fitted.message,
+        ),
+    )
+
+
+def _coefficients(
+    job: Job, fitted: Fitted, uncertainty: Uncertainty
+) -> dict[str, CoefficientResult]:
+    start = values_of(job.settings.vehicle)
+    cutoff = job.settings.controller.filters.gyro_cutoff
+    if cutoff is not None:
+        start.setdefault("gyro_cutoff", float(cutoff))
+    best = best_values(job, fitted, uncertainty)
+    bounds = {
+        name: (parameter.lower * ratio, parameter.upper * ratio)
+        for parameter in job.space.parameters
+        for name, ratio in parameter.ratios.items()
+    }
+    found = {}
+    for name, value in start.items():
+        unit = COEFFICIENTS[name].unit
+        if name not in best:
+            found[name] = CoefficientResult(
+                unit=unit, initial=value, best=value, fitted=False, note="kept as given"
+            )
+            continue
+        low, high = bounds[name]
+        estimate = uncertainty.estimates[name]
+        found[name] = CoefficientResult(
+            unit=unit,
+            initial=value,
+            best=best[name],
+            fitted=True,
+            lower=low,
+            upper=high,
+            std_error=_finite(estimate.std_error),
+            ci95=_interval(estimate.ci95),
+            identifiable=estimate.identifiable,
+            note=f"{estimate.verdict.value}: {estimate.reason}",
+        )
+    return found
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _interval(pair: tuple[float, float]) -> tuple[float, float] | None:
+    low, high = pair
+    return (low, high) if np.isfinite(low) and np.isfinite(high) else None
+
+
+def _flight(
+    job: Job, fitted: Fitted, flight: Flight, initial: AxesRmse, best: AxesRmse
+) -> FlightResult:
+    return FlightResult(
+        name=flight.name,
+        path=flight.path,
+        sha256=flight.sha256,
+        split="holdout" if flight in job.held_out else "fit",
+        duration=flight.duration,
+        time_offset=offsets_of(job, fitted).get(flight.name, 0.0),
+        rmse_initial=initial,
+        rmse_best=best,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that decide a run's numbers."""
+    found = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def write_folder(folder: Path, result: RunResult, vehicle: VehicleFile, job: Job) -> None:
+    """Write ``best_fit.yaml``, ``metrics.csv`` and, last, ``result.json``."""
+    fitted = ", ".join(flight.name for flight in job.fitted)
+    source = {"made_by": f"multirotor-tune {result.versions['multirotor-tune']}", "flights": fitted}
+    named = vehicle.replace(name=f"{job.settings.vehicle.name}_fitted", source=source)
+    write_vehicle(named, folder / BEST_FIT_FILE, header=f"Fitted by tune to {fitted}.")
+    write_text(folder / METRICS_FILE, metrics(result))
+    write_result(result, folder)
+
+
+def metrics(result: RunResult) -> str:
+    """Return ``metrics.csv``: one row a flight and axis."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["flight", "split", "axis", "unit", "rmse_initial", "rmse_best"])
+    for flight in result.flights:
+        for axis, unit in UNITS.items():
+            pair = (getattr(flight.rmse_initial, axis), getattr(flight.rmse_best, axis))
+            table.writerow(
+                [
+                    flight.name,
+                    flight.split,
+                    axis,
+                    unit,
+                    *("" if v is None else repr(v) for v in pair),
+                ]
+            )
+    return text.getvalue()

@@ -1,0 +1,129 @@
+"""The command `tune` as a function: settle, prepare, check, search, validate, write, report."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tuner.config import Options, Settings, settle, with_values, write_vehicle
+from tuner.errors import InputError
+from tuner.result import BEST_FIT_FILE, RunResult
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What a run tells while it works.
+
+    Attributes
+    ----------
+    settled
+        The settings, before anything is read.
+    iteration
+        Stage, iteration number, horizon in s, loss and position RMSE in m.
+    message
+        One line for people.
+    """
+
+    settled: Callable[[Settings], None]
+    iteration: Callable[[str, int, float, float, float], None]
+    message: Callable[[str], None]
+
+
+SILENT = Listener(lambda _: None, lambda *_: None, lambda _: None)
+
+
+def run(
+    options: Options,
+    *,
+    out: Path | None = None,
+    resume: bool = False,
+    force: bool = False,
+    listener: Listener = SILENT,
+) -> tuple[Path, RunResult]:
+    """Fit, validate and report.
+
+    Parameters
+    ----------
+    options
+        What the user said.
+    out
+        Result folder; None makes one under ``runs/`` named by the time.
+    resume
+        Go on from the folder's checkpoint.
+    force
+        Search although the check before it failed.
+    listener
+        Is told how it goes.
+
+    Returns
+    -------
+    tuple
+        The result folder and the content of its ``result.json``.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used; nothing was written.
+    """
+    from tuner.runtime import configure  # noqa: PLC0415 (jax starts here)
+
+    configure()
+    from tuner.identifiability import uncertainty as uncertainty_of  # noqa: PLC0415
+    from tuner.job.check import check  # noqa: PLC0415
+    from tuner.job.prepare import Job, prepare  # noqa: PLC0415
+    from tuner.job.results import (  # noqa: PLC0415
+        result_of,
+        validate,
+        vehicle_fitted,
+        write_folder,
+    )
+    from tuner.job.search import parameters_of, search  # noqa: PLC0415
+    from tuner.report import render, write_report_data  # noqa: PLC0415
+    from tuner.search.growing import Progress  # noqa: PLC0415
+
+    settings = settle(options)
+    listener.settled(settings)
+    folder = _folder(out, resume)
+    job = prepare(settings)
+    findings = check(job)
+    for finding in findings:
+        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
+    failures = [finding for finding in findings if finding.kind == "failure"]
+    if failures and not force:
+        first = failures[0]
+        raise InputError(first.subject, first.text, f"{first.remedy}, or use --force")
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def tell(job: Job, progress: Progress) -> None:
+        last = progress.iterations[-1]
+        best = with_values(settings.vehicle, parameters_of(job, progress))
+        write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far; the search is not done.")
+        listener.iteration(last.stage, last.number, last.horizon, last.loss, last.position_rmse)
+
+    fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
+    listener.message("telling how far each coefficient can be trusted")
+    uncertainty = uncertainty_of(fitted)
+    vehicle = vehicle_fitted(job, fitted, uncertainty)
+    listener.message("flying every flight with the initial and the fitted coefficients")
+    errors = validate(job, fitted, vehicle)
+    status = "converged" if fitted.converged else "stopped"
+    result = result_of(job, fitted, uncertainty, errors, status=status)
+    write_folder(folder, result, vehicle, job)
+    write_report_data(folder, job, fitted, uncertainty, vehicle)
+    render(folder)
+    return folder, result
+
+
+def _folder(out: Path | None, resume: bool) -> Path:
+    if out is None:
+        if resume:
+            raise InputError("--resume", "needs the folder to go on in", "name it with --out")
+        return Path("runs") / datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")  # noqa: DTZ005
+    if out.exists() and not out.is_dir():
+        raise InputError(out, "is a file", "name a folder with --out")
+    return out
