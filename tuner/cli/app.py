@@ -8,6 +8,11 @@ from tuner.cli.tune import tune
 
 SUMMARY = "Fit the coefficients of a multirotor simulator to recorded flights."
 
+EXAMPLES = (
+    "tune --flights lab/*.bag",
+    "tune --flights lab/*.bag --holdout circle_4mps --mass 2.243 --out runs/first",
+)
+
 
 def version() -> str:
     """Return the installed version."""
@@ -22,6 +27,8 @@ def version() -> str:
 app = App(
     name="tune",
     help=SUMMARY,
+    help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
+    help_format="plaintext",
     version=version,
     result_action="return_value",
     exit_on_error=False,
@@ -31,9 +38,19 @@ app = App(
 
 #: Command -> what it does, and examples.
 COMMANDS = {
+    "inspect": (
+        "Say what recordings hold and what they are good for.",
+        "tune inspect lab/*.bag",
+        "tune inspect 'lab/*.bag' --json",
+    ),
     "compare": (
         "Tabulate how closely several coefficient sets meet recordings; nothing is fitted.",
         "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --out c.html",
+    ),
+    "export": (
+        "Write the coefficients of a run for a simulator, if they hold there.",
+        "tune export runs/x --format sdf --into models/quad.sdf",
+        "tune export runs/x --format px4 --out quad.params",
     ),
     "simulate": (
         "Fly a trajectory and write the flight as CSV or ROS 1 bag.",
@@ -49,8 +66,6 @@ for _name, (_summary, *_examples) in COMMANDS.items():
         help_epilogue="\n".join(f"Example: {example}" for example in _examples),
         help_format="plaintext",
     )
-
-
 app.default(tune)
 
 

@@ -1,4 +1,4 @@
-"""What a long run shows: a line that moves on a terminal, plain lines when piped, tables at the end."""
+"""What a long run shows: a moving line on a terminal, plain lines when piped, tables at the end."""
 
 from __future__ import annotations
 

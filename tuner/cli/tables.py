@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from tuner.compare.table import Row
     from tuner.compare.table import Table as Comparison
     from tuner.config import Settings
+    from tuner.export.export import Exported
+    from tuner.flights.inspection import Inspection
     from tuner.simulate.write import Summary
 
 
@@ -43,14 +45,33 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
         )
     screen = console()
     screen.print(table)
-    screen.print(f"written to {path}")
+    screen.print(f"written to {path}", markup=False)
+
+
+def print_inspections(found: Sequence[Inspection]) -> None:
+    """Print what recordings hold."""
+    from tuner.flights.inspection_table import render
+
+    console().print(render(found))
+
+
+def print_export(done: Exported) -> None:
+    """Print which conditions were met, what was done, and where the file is."""
+    screen = console()
+    for gate in done.gates:
+        screen.print(f"{'yes' if gate.passed else 'NO '}  {gate.name}", markup=False)
+        for objection in gate.objections:
+            screen.print(f"     {objection}", markup=False)
+    for note in done.notes:
+        screen.print(f"note: {note}", markup=False)
+    screen.print(f"written to {done.path} and read back", markup=False)
 
 
 def print_settings(settings: Settings) -> None:
     """Print where each setting comes from."""
     screen = console()
     for name, origin in settings.origin.items():
-        screen.print(f"{name}: {origin}")
+        screen.print(f"{name}: {origin}", markup=False)
 
 
 def print_comparison(
@@ -58,7 +79,7 @@ def print_comparison(
 ) -> None:
     """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
     screen = console()
-    screen.print(f"controller: {settings.origin['controller']}")
+    screen.print(f"controller: {settings.origin['controller']}", markup=False)
     table = Table(box=None)
     for name in ("flight", "vehicle"):
         table.add_column(name)
@@ -70,7 +91,7 @@ def print_comparison(
     screen.print(table)
     screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
     for path in written:
-        screen.print(f"written to {path}")
+        screen.print(f"written to {path}", markup=False)
 
 
 def _cells(row: Row, comparison: Comparison) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -18,7 +18,10 @@ from tuner.cli.options import (
     VehicleChoice,
 )
 
-Method = Annotated[str | None, Parameter(help="auto, gradient, cma or hybrid.")]
+Method = Annotated[
+    Literal["auto", "gradient", "cma", "hybrid"] | None,
+    Parameter(help="How the minimum is looked for. Default: the job file's, else auto."),
+]
 
 
 def tune(

@@ -3,7 +3,7 @@
 from tuner.config.coefficient_names import COEFFICIENTS, check_names, values_of, with_values
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import CHANNELS, JobFile, TrajectorySettings, read_job
-from tuner.config.settings import Options, Settings, find_flights, find_job_file, settle
+from tuner.config.settings import Options, Settings, find_job_file, settle
 from tuner.config.shipped import configs_folder, find_config
 from tuner.config.vehicle import VehicleFile, read_vehicle
 from tuner.config.vehicle_writer import vehicle_text, write_vehicle
@@ -20,7 +20,6 @@ __all__ = [
     "check_names",
     "configs_folder",
     "find_config",
-    "find_flights",
     "find_job_file",
     "read_controller",
     "read_job",

@@ -17,6 +17,7 @@ from tuner.config.shipped import Kind, find_config
 from tuner.config.vehicle import VehicleFile, read_vehicle
 from tuner.config.yaml_file import Document
 from tuner.errors import ConfigError, InputError, did_you_mean
+from tuner.flights.paths import find_flights
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"
@@ -141,36 +142,6 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
         job_path if job.free is not None or job.fixed else None,
     )
     return Settings(flights, vehicle, read_controller(controller_path), job, job_path, origin)
-
-
-def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
-    """Return the recordings that paths and quoted globs mean, each once, globs sorted.
-
-    Raises
-    ------
-    InputError
-        A path does not exist, a glob matches nothing, or nothing is named at all.
-    """
-    found: dict[Path, Path] = {}
-    for pattern in patterns:
-        path = Path(pattern).expanduser()
-        if path.exists():
-            matches = [path]
-        elif glob.has_magic(pattern):
-            matches = [Path(match) for match in sorted(glob.glob(str(path)))]  # noqa: PTH207
-            if not matches:
-                raise InputError(pattern, "matches no file", "check the folder and the pattern")
-        else:
-            raise InputError(path, "does not exist", "check the path")
-        for match in matches:
-            if match.is_dir() and not (match / "metadata.yaml").exists():
-                raise InputError(
-                    match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
-                )
-            found.setdefault(match.resolve(), match)
-    if not found:
-        raise InputError("--flights", "names no recording", "give the recordings to use")
-    return tuple(found.values())
 
 
 def find_job_file(flights: Iterable[Path]) -> Path | None:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from tuner.config import VehicleFile
+from tuner.errors import InputError
 from tuner.result import AxesRmse, Run
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.
@@ -38,10 +39,14 @@ class Gate:
 
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
     """Hold a run and the vehicle as exported against every condition."""
-    flown = refly(run, vehicle)
+    try:
+        flown = refly(run, vehicle)
+        otherwise = _otherwise(run, flown)
+    except InputError as error:
+        flown, otherwise = {}, [f"the flights cannot be flown again ({error})"]
     return (
         Gate("every trajectory of the run is flown without a crash", tuple(_crashes(flown))),
-        Gate("the exported numbers fly as the run says", tuple(_otherwise(run, flown))),
+        Gate("the exported numbers fly as the run says", tuple(otherwise)),
         Gate("no held-out flight is worse than before", tuple(_worse(run))),
         Gate("no coefficient sits on a bound", tuple(_on_bounds(run))),
     )

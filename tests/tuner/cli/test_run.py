@@ -1,3 +1,4 @@
+import json
 import os
 import subprocess
 import sys
@@ -14,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[3]
 def test_the_help_names_every_command(capsys):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
-    for name in commands():
+    for name in (*commands(), "--flights", "--holdout", "--resume", "Example: tune --flights"):
         assert name in text
 
 
@@ -111,3 +112,21 @@ def test_sweeps_may_follow_each_other(tmp_path, capsys):
     assert main([*arguments, "--sweep", "motor_constant=1.3e-5:1.5e-5:2", "inertia_xx=0.02"]) == 0
     assert out.read_text().startswith("motor_constant,inertia_xx,time,")
     assert "inertia_xx" in capsys.readouterr().out
+
+
+def test_inspect_prints_tables_or_json(capsys):
+    bag = str(ROOT / "reference_flights" / "yaw_spin_3rps.bag")
+    assert main(["inspect", bag]) == 0
+    assert "/optitrack/pose" in capsys.readouterr().out
+    assert main(["inspect", bag, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["schema_version"] == 1
+
+
+def test_inspect_says_which_recording_cannot_be_read(tmp_path, capsys):
+    broken = tmp_path / "broken.bag"
+    broken.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    assert main(["inspect", str(broken), str(ROOT / "reference_flights/yaw_spin_3rps.bag")]) == 2
+    out, err = capsys.readouterr()
+    assert "broken.bag" in err
+    assert err.count("\n") == 1
+    assert "/optitrack/pose" in out

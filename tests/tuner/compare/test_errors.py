@@ -49,19 +49,19 @@ def test_a_stretch_is_cut_by_each_clock():
     np.testing.assert_array_equal(part.attitude, [[0, 1, 0]])
 
 
-def test_the_vehicle_that_flew_meets_its_recording(flight, vehicle):
+def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
     comparison = Comparison([flight], ControllerFile())
-    own = comparison.fly(vehicle)["small_circle"]
+    own = comparison.fly(updated)["small_circle"]
     assert own.crash_time is None
     for axis in ("x", "y", "z"):
         assert getattr(own.rmse, axis) < 2e-4, axis
     for axis in ("roll", "pitch", "yaw"):
         assert getattr(own.rmse, axis) < 0.02, axis
-    other = comparison.fly(with_values(vehicle, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
+    other = comparison.fly(with_values(updated, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
     assert other.rmse.x > 100 * own.rmse.x
 
 
-def test_a_late_clock_is_taken_back(flight, vehicle):
+def test_a_late_clock_is_taken_back(flight, updated):
     late = replace(
         flight,
         series={
@@ -71,27 +71,27 @@ def test_a_late_clock_is_taken_back(flight, vehicle):
             for name, data in flight.series.items()
         },
     )
-    as_is = Comparison([late], ControllerFile()).fly(vehicle)["small_circle"].rmse
-    known = Comparison([late], ControllerFile(), {"small_circle": 0.05}).fly(vehicle)
+    as_is = Comparison([late], ControllerFile()).fly(updated)["small_circle"].rmse
+    known = Comparison([late], ControllerFile(), {"small_circle": 0.05}).fly(updated)
     assert known["small_circle"].rmse.x < 3e-4
     assert as_is.x > 0.02
 
 
-def test_a_vehicle_that_cannot_fly_crashes(flight, vehicle):
-    heavy = with_values(vehicle, {"mass": 9.0})
+def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
+    heavy = with_values(updated, {"mass": 9.0})
     found = Comparison([flight], ControllerFile()).fly(heavy)["small_circle"]
     assert 0 < found.crash_time < 12
     assert found.rmse.x is None
 
 
-def test_flights_of_different_length_fly_side_by_side(flight, vehicle):
+def test_flights_of_different_length_fly_side_by_side(flight, updated):
     half = replace(
         flight,
         name="half",
         time=flight.time[:600],
         signals={name: values[:600] for name, values in flight.signals.items()},
     )
-    both = Comparison([flight, half], ControllerFile()).fly(vehicle)
+    both = Comparison([flight, half], ControllerFile()).fly(updated)
     assert both["half"].position_time[-1] <= half.duration
     assert both["half"].rmse.x < 2e-4
     assert both["small_circle"].rmse.x < 2e-4

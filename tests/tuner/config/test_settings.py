@@ -2,8 +2,9 @@ import shutil
 
 import pytest
 
-from tuner.config import Options, configs_folder, find_flights, find_job_file, settle
+from tuner.config import Options, configs_folder, find_job_file, settle
 from tuner.errors import ConfigError, InputError
+from tuner.flights.paths import find_flights
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 
 from tests.tuner.export.conftest import MODELS, as_the_run_says, rmse
 from tuner.config import read_vehicle
-from tuner.errors import ExportError
+from tuner.errors import ExportError, InputError
 from tuner.export.export import export
 from tuner.export.gates import check
 
@@ -116,7 +116,11 @@ def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
     def forgets(run, vehicle):
         return {"circle": as_the_run_says(run, vehicle)["circle"]}
 
+    def cannot(_run, _vehicle):
+        raise InputError("a.bag", "is not there any more", "look for it")
+
     for refly, expected in (
+        (cannot, "cannot be flown again .a.bag: is not there any more"),
         (crashes, "circle crashes"),
         (differs, "circle x gives 0.0012, the run 0.001"),
         (forgets, "held was not flown again"),

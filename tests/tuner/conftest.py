@@ -1,25 +1,31 @@
+"""A recording that is simulated once for all tests that need one."""
+
 import pytest
 
 from tuner.config import ControllerFile, TrajectorySettings, configs_folder, read_vehicle
-from tuner.flights.load import load_flight
-from tuner.simulate.simulate import simulate
-from tuner.simulate.write import write_flights
 
 
 @pytest.fixture(scope="session")
-def vehicle():
+def updated():
+    """The HoverGames quad with the thesis's coefficients."""
     return read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
 
 
 @pytest.fixture(scope="session")
-def bag(vehicle, tmp_path_factory):
+def bag(updated, tmp_path_factory):
     """Twelve seconds of a small, quick circle of several laps, as a recording."""
+    from tuner.simulate.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.simulate.write import write_flights  # noqa: PLC0415
+
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "small_circle.bag"
-    write_flights(simulate(vehicle, ControllerFile(), shape, duration=12.0), path)
+    write_flights(simulate(updated, ControllerFile(), shape, duration=12.0), path)
     return path
 
 
 @pytest.fixture(scope="session")
 def flight(bag):
+    """The same, read."""
+    from tuner.flights.load import load_flight  # noqa: PLC0415
+
     return load_flight(bag)

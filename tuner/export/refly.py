@@ -1,0 +1,58 @@
+"""A run's flights flown again with another vehicle, from what its result folder says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from tuner.compare.compare import flights_of
+from tuner.compare.errors import Comparison
+from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
+from tuner.errors import InputError
+from tuner.result import RESULT_FILE, AxesRmse, Run
+
+
+def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
+    """Return flight name to RMSE of a run's recordings, simulated whole with a vehicle.
+
+    Parameters
+    ----------
+    run
+        Gives the recordings, the controller that flew, and each flight's clock offset.
+    vehicle
+        What flies now.
+
+    Raises
+    ------
+    InputError
+        A recording is gone or has changed, or the run does not say what flew.
+    """
+    settings = _settings(run, vehicle)
+    wanted = {flight.name: flight for flight in run.result.flights}
+    flights = [flight for flight in flights_of(settings) if flight.name in wanted]
+    for flight in flights:
+        if flight.sha256 != wanted[flight.name].sha256:
+            raise InputError(flight.path, "is not the recording of the run", "fit it again")
+    offsets = {flight.name: flight.time_offset for flight in run.result.flights}
+    flown = Comparison(flights, settings.controller, offsets).fly(vehicle)
+    return {name: errors.rmse for name, errors in flown.items()}
+
+
+def _settings(run: Run, vehicle: VehicleFile) -> Settings:
+    said = run.result.settings
+    try:
+        controller = ControllerFile.model_validate(said["controller"])
+        job = JobFile.model_validate(said["job"])
+    except (KeyError, ValidationError):
+        raise InputError(
+            run.folder / RESULT_FILE, "does not say with which controller", "fit again"
+        ) from None
+    paths = tuple(dict.fromkeys(Path(flight.path) for flight in run.result.flights))
+    for path in paths:
+        if not path.exists():
+            raise InputError(
+                path, "is not there any more", "run from the folder that the fit ran in"
+            )
+    return Settings(paths, vehicle, controller, job, None, {})
