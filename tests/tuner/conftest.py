@@ -14,8 +14,8 @@ def updated():
 @pytest.fixture(scope="session")
 def bag(updated, tmp_path_factory):
     """Twelve seconds of a small, quick circle of several laps, as a recording."""
-    from tuner.simulate.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.simulate.write import write_flights  # noqa: PLC0415
+    from tuner.simulation.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.simulation.write import write_flights  # noqa: PLC0415
 
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "small_circle.bag"

@@ -37,7 +37,7 @@ def compare(
     from tuner.runtime import configure
 
     configure()
-    from tuner.compare.compare import compare as compare_vehicles
+    from tuner.comparison.compare import compare as compare_vehicles
     from tuner.config import Options
 
     options = Options(

@@ -54,7 +54,7 @@ def simulate(
     from tuner.runtime import configure
 
     configure()
-    from tuner.simulate.plan import simulate_to_file
+    from tuner.simulation.plan import simulate_to_file
 
     summaries = simulate_to_file(
         out,

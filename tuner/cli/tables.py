@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from tuner.compare.table import Row
-    from tuner.compare.table import Table as Comparison
+    from tuner.comparison.table import Row
+    from tuner.comparison.table import Table as Comparison
     from tuner.config import Settings
     from tuner.export.export import Exported
     from tuner.flights.inspection import Inspection
-    from tuner.simulate.write import Summary
+    from tuner.simulation.write import Summary
 
 
 #: Columns that a table may take, if need be beyond the terminal's, so that no number is cut.

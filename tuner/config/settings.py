@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from pydantic import ValidationError
 
@@ -34,7 +35,7 @@ class Options:
     holdout
         Names or paths of flights that are evaluated, never fitted.
     vehicle, controller
-        Paths, or names of shipped files.
+        Paths, names of shipped files, or, from Python, what such a file holds.
     mass
         kg.
     config
@@ -49,8 +50,8 @@ class Options:
 
     flights: Sequence[str]
     holdout: Sequence[str] | None = None
-    vehicle: str | None = None
-    controller: str | None = None
+    vehicle: str | VehicleFile | None = None
+    controller: str | ControllerFile | None = None
     mass: float | None = None
     config: str | None = None
     fit: Sequence[str] | None = None
@@ -120,12 +121,9 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     except ValidationError as error:
         raise config_error(error, Document(Path("command line"), {}, {})) from None
 
-    vehicle_path, origin["vehicle"] = _choose(
-        "vehicles", options.vehicle, "--vehicle", job.vehicle, job_path
-    )
-    vehicle = read_vehicle(vehicle_path)
-    controller_path, origin["controller"] = _choose(
-        "controllers", options.controller, "--controller", job.controller, job_path
+    vehicle, origin["vehicle"] = _choose(VEHICLES, options.vehicle, job.vehicle, job_path)
+    controller, origin["controller"] = _choose(
+        CONTROLLERS, options.controller, job.controller, job_path
     )
     if job.mass is not None:
         vehicle = with_values(vehicle, {"mass": job.mass})
@@ -141,7 +139,7 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
         "--fit" if options.fit is not None else "--fix" if options.fix is not None else None,
         job_path if job.free is not None or job.fixed else None,
     )
-    return Settings(flights, vehicle, read_controller(controller_path), job, job_path, origin)
+    return Settings(flights, vehicle, controller, job, job_path, origin)
 
 
 def find_job_file(flights: Iterable[Path]) -> Path | None:
@@ -165,17 +163,35 @@ def _job_path(options: Options, flights: tuple[Path, ...]) -> Path | None:
     return Path(options.config).expanduser() if options.config else find_job_file(flights)
 
 
+M = TypeVar("M", VehicleFile, ControllerFile)
+
+
+@dataclass(frozen=True)
+class _Choice(Generic[M]):
+    """Something that the command line, the job file or the default can name."""
+
+    kind: Kind
+    option: str
+    read: Callable[[Path], M]
+
+
+VEHICLES = _Choice[VehicleFile]("vehicles", "--vehicle", read_vehicle)
+CONTROLLERS = _Choice[ControllerFile]("controllers", "--controller", read_controller)
+
+
 def _choose(
-    kind: Kind, said: str | None, option: str, in_job: Path | None, job_path: Path | None
-) -> tuple[Path, str]:
-    """Return a file and where the choice of it comes from."""
+    choice: _Choice[M], said: str | M | None, in_job: Path | None, job_path: Path | None
+) -> tuple[M, str]:
+    """Return what is named first, and where it comes from."""
+    if isinstance(said, str):
+        path = find_config(choice.kind, said, Path())
+        return choice.read(path), f"{choice.option} {path}"
     if said is not None:
-        path = find_config(kind, said, Path())
-        return path, f"{option} {path}"
+        return said, f"{choice.option} '{said.name}'"
     if in_job is not None:
-        return in_job, f"{in_job} ({job_path})"
-    path = find_config(kind, DEFAULT_NAME, Path("/nonexistent"))
-    return path, f"default ({path.name})"
+        return choice.read(in_job), f"{in_job} ({job_path})"
+    path = find_config(choice.kind, DEFAULT_NAME, Path("/nonexistent"))
+    return choice.read(path), f"default ({path.name})"
 
 
 def _from(option: str | None, job_path: Path | None, otherwise: str = "default") -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from tuner.compare.compare import flights_of
-from tuner.compare.errors import Comparison
+from tuner.comparison.compare import flights_of
+from tuner.comparison.errors import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
 from tuner.result import RESULT_FILE, AxesRmse, Run

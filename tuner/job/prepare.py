@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients import Space, space_of
-from tuner.compare.compare import flights_of
+from tuner.comparison.compare import flights_of
 from tuner.config import Settings
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.compare.errors import Comparison, FlightErrors
+from tuner.comparison.errors import Comparison, FlightErrors
 from tuner.config import (
     COEFFICIENTS,
     ControllerFile,

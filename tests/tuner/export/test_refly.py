@@ -4,7 +4,7 @@ import pytest
 
 from tests.tuner.export.conftest import MODELS
 from tuner.cli import main
-from tuner.compare.errors import Comparison
+from tuner.comparison.errors import Comparison
 from tuner.config import (
     COEFFICIENTS,
     ControllerFile,

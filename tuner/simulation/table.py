@@ -10,7 +10,7 @@ import numpy as np
 
 from tuner.errors import InputError
 from tuner.flights.flight import Array
-from tuner.simulate.simulate import Simulation
+from tuner.simulation.simulate import Simulation
 
 _XYZ = ("x", "y", "z")
 #: Signal -> the columns that hold it, in the order of the file.

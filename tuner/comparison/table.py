@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from tuner.compare.errors import FlightErrors, rmse_of
+from tuner.comparison.errors import FlightErrors, rmse_of
 from tuner.result import AxesRmse
 
 UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}

@@ -12,9 +12,9 @@ from tuner.config import (
 )
 from tuner.errors import InputError
 from tuner.flights.flight import SIGNALS
-from tuner.simulate import simulate as module
-from tuner.simulate.simulate import simulate
-from tuner.simulate.trajectory import at_speed, published
+from tuner.simulation import simulate as module
+from tuner.simulation.simulate import simulate
+from tuner.simulation.trajectory import at_speed, published
 
 #: One duration for all, so that the loop is compiled once.
 SHORT = {"duration": 4.0}

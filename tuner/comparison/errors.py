@@ -17,7 +17,7 @@ from tuner.flights.flight import Array, Flight
 from tuner.model import model_of, schedule_of
 from tuner.objective.lanes import lanes_of
 from tuner.result import AxesRmse
-from tuner.simulate.table import roll_pitch_yaw
+from tuner.simulation.table import roll_pitch_yaw
 
 #: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
 CLEARANCE = 0.3

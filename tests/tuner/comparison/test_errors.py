@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from sim_jax.crash import AIRBORNE, Limits
-from tuner.compare.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of
+from tuner.comparison.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of
 from tuner.config import ControllerFile, TrajectorySettings, with_values
 from tuner.flights.flight import Series
-from tuner.simulate.trajectory import with_named_reference
+from tuner.simulation.trajectory import with_named_reference
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from tuner.compare.errors import Comparison
-from tuner.compare.table import Table, table_of
-from tuner.compare.write import check_suffix, write_table
-from tuner.config import Options, Settings, TrajectorySettings, find_config, read_vehicle, settle
+from tuner.comparison.errors import Comparison
+from tuner.comparison.table import Table, table_of
+from tuner.comparison.write import check_suffix, write_table
+from tuner.config import (
+    Options,
+    Settings,
+    TrajectorySettings,
+    VehicleFile,
+    find_config,
+    read_vehicle,
+    settle,
+)
 from tuner.config.model import build
 from tuner.errors import InputError
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
-from tuner.simulate.trajectory import with_named_reference
+from tuner.simulation.trajectory import with_named_reference
 
 
 def compare(
-    options: Options, vehicles: Sequence[str], out: Sequence[Path] = ()
+    options: Options,
+    vehicles: Sequence[str] | Mapping[str, VehicleFile],
+    out: Sequence[Path] = (),
 ) -> tuple[Table, Settings]:
     """Fly recordings with several vehicles, and tabulate how closely each meets them.
 
@@ -26,7 +36,7 @@ def compare(
     options
         Flights, controller, job file and topics; the vehicle's mass is each vehicle file's own.
     vehicles
-        Vehicle files, or names of shipped ones.
+        Vehicle files or names of shipped ones; or name -> vehicle.
     out
         Files to write, by suffix .csv, .json or .html.
 
@@ -45,11 +55,12 @@ def compare(
     settings = settle(options, fits=False)
     if not vehicles:
         raise InputError("--vehicle", "names no vehicle", "name those to compare")
-    named = {word: read_vehicle(find_config("vehicles", word, Path())) for word in vehicles}
+    if not isinstance(vehicles, Mapping):
+        vehicles = {w: read_vehicle(find_config("vehicles", w, Path())) for w in vehicles}
     flights = flights_of(settings)
     offsets = {flight.name: offset_of(settings, flight.name) for flight in flights}
     comparison = Comparison(flights, settings.controller, offsets)
-    table = table_of({word: comparison.fly(vehicle) for word, vehicle in named.items()})
+    table = table_of({word: comparison.fly(vehicle) for word, vehicle in vehicles.items()})
     for path in out:
         write_table(table, path)
     return table, settings

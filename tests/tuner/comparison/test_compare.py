@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from lxml import html
 
-from tests.tuner.compare.test_errors import errors
+from tests.tuner.comparison.test_errors import errors
 from tuner.cli import main
-from tuner.compare.compare import compare
-from tuner.compare.errors import Comparison
-from tuner.compare.table import table_of
-from tuner.compare.write import write_table
+from tuner.comparison.compare import compare
+from tuner.comparison.errors import Comparison
+from tuner.comparison.table import table_of
+from tuner.comparison.write import write_table
 from tuner.config import ControllerFile, Options, configs_folder
 from tuner.errors import InputError
 

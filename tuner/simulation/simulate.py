@@ -18,7 +18,7 @@ from tuner.config import ControllerFile, TrajectorySettings, VehicleFile
 from tuner.flights.flight import Array, Series
 from tuner.flights.resample import resample
 from tuner.model import Model, model_of, schedule_of, with_coefficients
-from tuner.simulate.trajectory import Published, published
+from tuner.simulation.trajectory import Published, published
 
 #: Vehicles that fly at once; more take turns, so that memory stays bounded.
 CHUNK = 256

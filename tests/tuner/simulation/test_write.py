@@ -6,10 +6,10 @@ import pytest
 
 from tuner.errors import InputError
 from tuner.flights.load import load_flight
-from tuner.simulate.plan import simulate_to_file
-from tuner.simulate.sweep import grid_of
-from tuner.simulate.table import roll_pitch_yaw, write_csv
-from tuner.simulate.write import summary_of, write_flights
+from tuner.simulation.plan import simulate_to_file
+from tuner.simulation.sweep import grid_of
+from tuner.simulation.table import roll_pitch_yaw, write_csv
+from tuner.simulation.write import summary_of, write_flights
 
 COLUMNS = [
     *("time", "x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw"),

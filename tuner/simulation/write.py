@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from tuner.errors import InputError
-from tuner.simulate.bag import write_bag
-from tuner.simulate.simulate import Simulation
-from tuner.simulate.table import write_csv
+from tuner.simulation.bag import write_bag
+from tuner.simulation.simulate import Simulation
+from tuner.simulation.table import write_csv
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from rosbags.rosbag1 import Writer, WriterError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tuner.errors import InputError
-from tuner.simulate.simulate import Simulation
+from tuner.simulation.simulate import Simulation
 
 #: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
 EPOCH = 1_577_836_800_000_000_000

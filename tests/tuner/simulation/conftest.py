@@ -1,7 +1,7 @@
 import pytest
 
 from tuner.config import ControllerFile, TrajectorySettings, configs_folder, read_vehicle
-from tuner.simulate.simulate import simulate
+from tuner.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from tuner.compare.table import UNITS, Row, Table
+from tuner.comparison.table import UNITS, Row, Table
 from tuner.config.yaml_file import write_text
 from tuner.errors import InputError
 

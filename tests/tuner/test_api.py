@@ -1,0 +1,87 @@
+import inspect
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import tuner
+from tuner import api
+from tuner.cli.compare import compare as compare_command
+from tuner.cli.export import export as export_command
+from tuner.cli.simulate import simulate as simulate_command
+from tuner.cli.tune import tune as tune_command
+from tuner.config import ControllerFile, with_values
+from tuner.errors import InputError
+
+#: Function -> its command, and what each calls by another name or has alone.
+PEERS = {
+    api.fit: (tune_command, {"free": "fit", "fixed": "fix"}, {"quiet"}),
+    api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps"}),
+    api.simulate: (simulate_command, {"grid": "sweep"}, {"quiet", "out"}),
+    api.export: (export_command, {}, {"quiet"}),
+}
+
+
+@pytest.mark.parametrize("function", PEERS, ids=lambda function: function.__name__)
+def test_functions_take_what_their_commands_take(function):
+    command, renamed, alone = PEERS[function]
+    ours = {renamed.get(name, name) for name in inspect.signature(function).parameters}
+    theirs = set(inspect.signature(command).parameters) - alone
+    assert ours == theirs
+
+
+@pytest.mark.parametrize("function", PEERS, ids=lambda function: function.__name__)
+def test_defaults_are_those_of_the_commands(function):
+    command, renamed, _ = PEERS[function]
+    theirs = inspect.signature(command).parameters
+    for name, parameter in inspect.signature(function).parameters.items():
+        if parameter.default is not inspect.Parameter.empty and parameter.default != ():
+            assert parameter.default == theirs[renamed.get(name, name)].default, name
+
+
+def test_the_package_offers_the_functions_and_loads_them_late():
+    assert tuner.fit is api.fit
+    assert tuner.compare is api.compare
+    assert set(tuner.__all__) == set(api.__all__) <= set(dir(tuner))
+    with pytest.raises(AttributeError, match="no attribute 'tune'"):
+        _ = tuner.tune
+    heavy = "import tuner, sys; sys.exit(len({'jax', 'numpy', 'pydantic'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", heavy], check=False).returncode == 0
+
+
+def test_compare_takes_vehicles_as_they_are(bag, updated):
+    slow = with_values(updated, {"rotor_drag_coefficient": 4e-4})
+    table = tuner.compare([bag], {"flown": updated, "draggy": slow}, controller=ControllerFile())
+    assert table.best == "flown"
+    assert table.of("flown", "small_circle").x < 2e-4
+
+
+def test_simulate_flies_what_it_is_given(updated):
+    (flight,) = tuner.simulate("circle", vehicle=updated, duration=4.0)
+    (same,) = tuner.simulate("circle", vehicle="hovergames_updated", duration=4.0)
+    np.testing.assert_array_equal(flight.signals["position"], same.signals["position"])
+    grid = {"motor_constant": [1.3e-5, 1.5e-5], "inertia_xx": [0.028, 0.028]}
+    both = tuner.simulate("circle", vehicle=updated, duration=4.0, grid=grid)
+    assert [one.coefficients["motor_constant"] for one in both] == [1.3e-5, 1.5e-5]
+    with pytest.raises(InputError, match="did you mean 'mass'"):
+        tuner.simulate("circle", grid={"mas": [1.0]})
+
+
+def test_load_flight_reads_a_recording(bag):
+    assert tuner.load_flight(bag).name == "small_circle"
+
+
+def test_the_room_of_the_exports_can_be_called_like_its_function(tmp_path):
+    import tuner.export.gates  # noqa: PLC0415 (after which the room is an attribute)
+
+    with pytest.raises(InputError, match="is no folder"):
+        tuner.export(tmp_path / "gone", "px4")
+    assert tuner.export.gates.check
+
+
+def test_wrong_input_is_the_same_one_line(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        tuner.compare([tmp_path / "gone.bag"], ["hovergames"])
+    with pytest.raises(InputError, match="shipped vehicles"):
+        tuner.simulate("circle", vehicle="nope")

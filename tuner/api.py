@@ -1,0 +1,278 @@
+"""What the command line does, as functions: the same names, the same defaults, the same errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import date
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tuner.config import (
+    ControllerFile,
+    Options,
+    VehicleFile,
+)
+from tuner.config.job import Method, TrajectoryName
+from tuner.flights.flight import Array
+from tuner.flights.load import load_flight
+from tuner.result import Run, read_run
+from tuner.runtime import configure
+
+if TYPE_CHECKING:
+    from tuner.comparison.table import Table
+    from tuner.export.export import Exported, Format
+    from tuner.export.sdf.snippet import Simulator
+    from tuner.simulation.simulate import Simulation
+
+Named = str | Path
+
+__all__ = [
+    "compare",
+    "export",
+    "fit",
+    "load_flight",
+    "simulate",
+]
+
+
+def fit(
+    flights: Sequence[Named],
+    *,
+    holdout: Sequence[str] | None = None,
+    vehicle: Named | VehicleFile | None = None,
+    controller: Named | ControllerFile | None = None,
+    mass: float | None = None,
+    config: Named | None = None,
+    free: Sequence[str] | None = None,
+    fixed: Sequence[str] | None = None,
+    method: Method | None = None,
+    seed: int | None = None,
+    topics: Named | None = None,
+    namespace: str | None = None,
+    out: Named | None = None,
+    resume: bool = False,
+    force: bool = False,
+) -> Run:
+    """Fit the coefficients of a vehicle to recordings; what ``tune --flights`` does.
+
+    Parameters
+    ----------
+    flights
+        Recordings, or globs.
+    holdout
+        Flights that are evaluated, never fitted.
+    vehicle
+        Where the search starts: a vehicle, its file, or the name of a shipped one.
+    controller
+        What flew: a controller, its file, or the name of a shipped one.
+    mass
+        kg, the weighed take-off mass instead of the vehicle's.
+    config
+        Job file; None takes the ``tune.yaml`` beside the flights, if there is one.
+    free, fixed
+        Coefficients: exactly those to fit, or those to leave alone.
+    method, seed
+        Of the search.
+    topics, namespace
+        As of `load_flight`.
+    out
+        Result folder; None makes one under ``runs/``.
+    resume
+        Go on from the folder's checkpoint.
+    force
+        Search although the check before it failed.
+
+    Returns
+    -------
+    Run
+        The result folder, read: ``run.vehicle`` has the best coefficients, ``run.result`` the rest.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used; one line says what to do.
+    """
+    from tuner.job.run import run  # noqa: PLC0415 (jax)
+
+    options = Options(
+        flights=[str(path) for path in flights],
+        holdout=holdout,
+        vehicle=str(vehicle) if isinstance(vehicle, Path) else vehicle,
+        controller=str(controller) if isinstance(controller, Path) else controller,
+        mass=mass,
+        config=None if config is None else str(config),
+        fit=free,
+        fix=fixed,
+        method=method,
+        seed=seed,
+        topics=None if topics is None else str(topics),
+        namespace=namespace,
+    )
+    folder, _ = run(options, out=None if out is None else Path(out), resume=resume, force=force)
+    return read_run(folder)
+
+
+def compare(
+    flights: Sequence[Named],
+    vehicles: Sequence[Named] | Mapping[str, VehicleFile],
+    *,
+    controller: Named | ControllerFile | None = None,
+    config: Named | None = None,
+    topics: Named | None = None,
+    namespace: str | None = None,
+    out: Sequence[Named] = (),
+) -> Table:
+    """Fly recordings with several vehicles and tabulate the RMSE; what ``tune compare`` does.
+
+    Parameters
+    ----------
+    flights
+        Recordings, or globs.
+    vehicles
+        Files or names of shipped ones; or name -> vehicle.
+    controller, config, topics, namespace
+        As of `fit`.
+    out
+        Files to write, by suffix .csv, .json or .html.
+
+    Returns
+    -------
+    Table
+        ``table.best`` is the closest set, ``table.of(vehicle, flight)`` its RMSE.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used.
+    """
+    configure()
+    from tuner.comparison.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
+
+    options = Options(
+        flights=[str(path) for path in flights],
+        controller=str(controller) if isinstance(controller, Path) else controller,
+        config=None if config is None else str(config),
+        topics=None if topics is None else str(topics),
+        namespace=namespace,
+    )
+    named = vehicles if isinstance(vehicles, Mapping) else [str(word) for word in vehicles]
+    table, _ = compare_vehicles(options, named, [Path(path) for path in out])
+    return table
+
+
+def simulate(
+    trajectory: TrajectoryName,
+    *,
+    vehicle: Named | VehicleFile = "hovergames",
+    controller: Named | ControllerFile = "hovergames",
+    radius: float = 2.0,
+    omega: float = 0.7,
+    speed_scale: float = 2.1,
+    speed: float | None = None,
+    yaw_rate: float = 2.0,
+    duration: float = 40.0,
+    rate: float = 100.0,
+    grid: Mapping[str, Array] | None = None,
+) -> tuple[Simulation, ...]:
+    """Fly a trajectory; what ``tune simulate`` does.
+
+    Parameters
+    ----------
+    trajectory
+        Which shape, flown from rest.
+    vehicle, controller
+        What flies: the thing itself, its file, or the name of a shipped one.
+    radius, omega
+        m and rad/s.
+    speed_scale
+        The publisher's velocity scaler.
+    speed
+        m/s at which the reference peaks; instead of ``speed_scale``.
+    yaw_rate
+        rad/s, of the yaw spin.
+    duration
+        s.
+    rate
+        Hz of the result.
+    grid
+        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.sweep.grid_of`
+        makes every combination of several ranges.
+
+    Returns
+    -------
+    tuple
+        One simulation, or B of them; `tuner.simulation.write.write_flights` writes them.
+
+    Raises
+    ------
+    InputError
+        Something cannot be flown.
+    """
+    configure()
+    from tuner.simulation.plan import fly  # noqa: PLC0415 (jax)
+
+    said = {
+        "name": trajectory,
+        "radius": radius,
+        "omega": omega,
+        "speed_scale": speed_scale,
+        "yaw_rate": yaw_rate,
+    }
+    return tuple(
+        fly(
+            str(vehicle) if isinstance(vehicle, Path) else vehicle,
+            str(controller) if isinstance(controller, Path) else controller,
+            said,
+            speed=speed,
+            duration=duration,
+            rate=rate,
+            grid=grid,
+        )
+    )
+
+
+def export(
+    run: Run | Named,
+    format: Format,  # noqa: A002 (the option's name)
+    *,
+    into: Named | None = None,
+    out: Named | None = None,
+    simulator: Simulator = "gazebo-classic",
+    accept: str = "",
+) -> Exported:
+    """Write a run's coefficients for a simulator, if they hold there; what ``tune export`` does.
+
+    Parameters
+    ----------
+    run
+        A run, or its result folder.
+    format
+        ``yaml``, ``sdf`` or ``px4``.
+    into
+        With ``sdf``, the model to put them into; None gives the tags alone.
+    out
+        Where to write; None is the model itself, or ``export/`` in the result folder.
+    simulator
+        Whose plugins tags without a model are for.
+    accept
+        A reason to export in spite of conditions that are not met.
+
+    Raises
+    ------
+    ExportError
+        A condition is not met, or the file cannot be written or does not read back.
+    """
+    configure()
+    from tuner.export.export import export as export_run  # noqa: PLC0415 (jax)
+    from tuner.export.refly import refly  # noqa: PLC0415
+
+    return export_run(
+        run if isinstance(run, Run) else read_run(run),
+        format,
+        refly=refly,
+        today=date.today(),  # the user's own day
+        into=None if into is None else Path(into),
+        out=None if out is None else Path(out),
+        simulator=simulator,
+        accept=accept,
+    )
