@@ -76,24 +76,36 @@ def step_semi_implicit(
 def step_midpoint(
     body: Body, motion: Motion, wrench_at: WrenchAt, step: float, *, gravity: float = GRAVITY
 ) -> Motion:
-    """Advance with the force taken at the attitude of mid-step: one evaluation, second order.
+    """Advance with force and moment taken at mid-step: two evaluations, second order.
 
-    The moment does not depend on attitude, so the rate comes first, then the attitude at mid-step
-    with the mean rate, then force and velocity there. Only the slow drag terms, taken at the
-    velocity before the step, stay first order. ``step`` in s, ``gravity`` in m/s².
+    The rotors' drag turns the vehicle as it slows it: taken before the step instead, it alone
+    shifts a 4 m/s lemniscate by half a millimetre and its body rates by 0.003 rad/s at 400 Hz,
+    which a fit takes for other time constants. ``step`` in s, ``gravity`` in m/s².
     """
     half = 0.5 * step
-    middle = motion.attitude.advanced(motion.attitude, motion.body_rate, half)
-    rotation = middle.matrix()
-    wrench = wrench_at(rotation, motion.velocity, motion.body_rate)
-    turning = angular_acceleration(body, motion.body_rate, wrench.moment)
-    body_rate = motion.body_rate + turning * step
-    velocity = motion.velocity + acceleration(body, rotation, wrench.force, gravity=gravity) * step
+
+    def slope(at: Motion) -> tuple[Vec3, Vec3]:
+        rotation = at.attitude.matrix()
+        wrench = wrench_at(rotation, at.velocity, at.body_rate)
+        return (
+            acceleration(body, rotation, wrench.force, gravity=gravity),
+            angular_acceleration(body, at.body_rate, wrench.moment),
+        )
+
+    pull, turn = slope(motion)
+    middle = Motion(
+        position=motion.position,
+        velocity=motion.velocity + pull * half,
+        attitude=motion.attitude.advanced(motion.attitude, motion.body_rate, half),
+        body_rate=motion.body_rate + turn * half,
+    )
+    pull, turn = slope(middle)
+    velocity = motion.velocity + pull * step
     return Motion(
         position=motion.position + (motion.velocity + velocity) * half,
         velocity=velocity,
-        attitude=motion.attitude.advanced(middle, (motion.body_rate + body_rate) * 0.5, step),
-        body_rate=body_rate,
+        attitude=motion.attitude.advanced(middle.attitude, middle.body_rate, step),
+        body_rate=motion.body_rate + turn * step,
     )
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import datetime
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle, with_values, write_vehicle
-from tuner.errors import InputError
+from tuner.errors import ConfigError, InputError
 from tuner.result import BEST_FIT_FILE, RunResult
 
 logger = logging.getLogger(__name__)
@@ -101,8 +102,9 @@ def run(
 
     def tell(job: Job, progress: Progress) -> None:
         last = progress.iterations[-1]
-        best = with_values(settings.vehicle, parameters_of(job, progress))
-        write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far; the search is not done.")
+        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
+            best = with_values(settings.vehicle, parameters_of(job, progress))
+            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
         listener.iteration(last.stage, last.number, last.horizon, last.loss, last.position_rmse)
 
     fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
