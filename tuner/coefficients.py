@@ -141,7 +141,8 @@ class Space:
 
     def scaled(self, vector: Array) -> Array:
         """Return the scaled coordinates (K,) of a search vector; traceable."""
-        return self._lower + self._range * nn.sigmoid(vector / self._stretch)
+        scaled: Array = self._lower + self._range * nn.sigmoid(vector / self._stretch)
+        return scaled
 
     def values(self, vector: Array) -> dict[str, Array]:
         """Return every free coefficient's value, tied ones too; traceable."""
@@ -174,7 +175,7 @@ def space_of(vehicle: VehicleFile, job: JobFile) -> Space:
     values = values_of(vehicle)
     values.setdefault("gyro_cutoff", 40.0)
     free = _free_names(job)
-    groups = {name: (name,) for name in free}
+    groups: dict[str, tuple[str, ...]] = {name: (name,) for name in free}
     for group in job.ties:
         tied = [name for name in group if name in free]
         if not tied:
@@ -204,7 +205,7 @@ def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile
     name = names[0]
     habit, said, start = HABITS[name], job.coefficients.get(name), values[name]
     scale = said.scale if said is not None and said.scale is not None else habit.scale
-    lower, upper = _default_bounds(habit, scale, start, name)
+    lower, upper = _default_bounds(habit, start, name)
     lower = said.lower if said is not None and said.lower is not None else lower
     upper = said.upper if said is not None and said.upper is not None else upper
     if scale == "log" and lower <= 0:
@@ -243,7 +244,7 @@ def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile
     )
 
 
-def _default_bounds(habit: Habit, scale: str, start: float, name: str) -> tuple[float, float]:
+def _default_bounds(habit: Habit, start: float, name: str) -> tuple[float, float]:
     if isinstance(habit.reach, tuple):
         return habit.reach
     if start <= 0:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
-from tuner.objective.normal import Point
 from tuner.search.fitted import Finding
 from tuner.search.growing import Leg, on_host, stage_of
 from tuner.search.levenberg_marquardt import advance, begin
@@ -52,9 +52,11 @@ def check(job: Job) -> tuple[Finding, ...]:
 def _recordings(job: Job) -> list[Finding]:
     found = []
     for flight in job.flights:
-        for note in flight.notes:
-            if note.kind == "warning":
-                found.append(Finding("warning", flight.name, f"{note.topic}: {note.text}", ""))
+        found += [
+            Finding("warning", flight.name, f"{note.topic}: {note.text}")
+            for note in flight.notes
+            if note.kind == "warning"
+        ]
         missing = [name for name in ("body_rate", "rotor_speed", "command") if not flight.has(name)]
         if missing:
             found.append(
@@ -158,7 +160,7 @@ def information(job: Job) -> NDArray[np.float64]:
     scales = {name: np.ones(lanes) for name in objective.lanes.measured}
     start = objective.start(job.space.initial)
     stage = on_host(stage_of(leg, scales, np.asarray(start.offsets)))
-    alone = Point(np.asarray(start.coefficients)[None], np.asarray(start.offsets)[None])
+    alone = on_host(jax.tree.map(lambda leaf: leaf[None], start))
     free = np.zeros(len(job.space) + start.offsets.size)
     step = advance(objective, on_host(begin(objective, alone, stage, free)), stage, free)
     count = len(job.space)

@@ -125,7 +125,7 @@ def _folder(out: Path | None, resume: bool) -> Path:
     if out is None:
         if resume:
             raise InputError("--resume", "needs the folder to go on in", "name it with --out")
-        return Path("runs") / datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")  # noqa: DTZ005
+        return Path("runs") / datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     if out.exists() and not out.is_dir():
         raise InputError(out, "is a file", "name a folder with --out")
     return out

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +83,7 @@ def search(
         _save(path, key, now, spent + time.perf_counter() - clock)
         tell(job, now)
 
-    for progress in grow(  # noqa: B007 (the last one counts)
+    for reached in grow(
         objective,
         legs,
         progress,
@@ -90,9 +91,9 @@ def search(
         clipped=job.clipped,
         tell=keep,
     ):
-        pass
+        progress = reached
     spent += time.perf_counter() - clock
-    return _fitted(job, legs[-1], progress, starts, spent, findings)
+    return _fitted(job, legs[-1], progress, starts, wall_time=spent, findings=findings)
 
 
 def settings_of_offsets(job: Job) -> bool:
@@ -118,6 +119,7 @@ def _fitted(
     leg: Leg,
     progress: Progress,
     starts: NDArray[np.float64],
+    *,
     wall_time: float,
     findings: tuple[Finding, ...],
 ) -> Fitted:
@@ -160,7 +162,7 @@ def _origin(number: int) -> str:
 
 def _loss_at(objective: Objective, point: Point, stage: object) -> float:
     """Return the loss at a point; one step of a solver evaluates it with what is compiled."""
-    alone = Point(np.asarray(point.coefficients)[None], np.asarray(point.offsets)[None])
+    alone = on_host(jax.tree.map(lambda leaf: leaf[None], point))
     free = np.zeros(len(objective.space) + point.offsets.size)
     step = on_host(begin(objective, alone, on_host(stage), free))
     return float(advance(objective, step, on_host(stage), free).loss[0])

@@ -333,7 +333,7 @@ def _position_rmse(objective: Objective, step: Step, start: int) -> float:
     sigma = 1.0 / weight.max(initial=1e-30)
     counts = float(jnp.sum(step.sums.counts["position"][start]))
     squares = float(jnp.sum(step.sums.squares["position"][start]))
-    return sigma * float(np.sqrt(3.0 * squares / max(counts, 1.0)))
+    return float(sigma * np.sqrt(3.0 * squares / max(counts, 1.0)))
 
 
 def point_of(points: Point, start: int) -> Point:

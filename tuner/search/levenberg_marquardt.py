@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import optimistix
 from jax import Array
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from tuner.objective.normal import LaneSums, Objective, Point, Stage
@@ -92,13 +93,14 @@ def _unpack(objective: Objective, packed: Array) -> Point:
     return Point(packed[:count], packed[count:].reshape(-1, objective.lanes.count))
 
 
-def _square_problem(objective: Objective, stage: Stage, free: Array) -> Any:
+def _square_problem(objective: Objective, stage: Stage, free: ArrayLike) -> Any:
     """Return a least-squares function with as many residuals as parameters, plus one.
 
     Its derivative rule gives residuals r and Jacobian J with ½|r|² the loss, Jᵀr its gradient and
     JᵀJ the Gauss-Newton Hessian: a solver takes the very steps that it would take on all the
     residuals, without seeing them. Evaluated alone, it costs one simulation.
     """
+    free = jnp.asarray(free)
 
     def evaluate(packed: Array, *, derivatives: bool) -> tuple[Array, Array, Array, LaneSums]:
         point = _unpack(objective, packed)
@@ -130,7 +132,7 @@ def _square_problem(objective: Objective, stage: Stage, free: Array) -> Any:
     return lambda packed, _: square(packed)
 
 
-class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):
+class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]
     """Levenberg-Marquardt that takes longer steps as soon as the model predicts well."""
 
     rtol: float = 1e-9
@@ -146,7 +148,9 @@ class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):
 _SOLVER = _Solver()
 
 
-def _fresh(objective: Objective, point: Point, stage: Stage, free: Array) -> tuple[Any, Any, Any]:
+def _fresh(
+    objective: Objective, point: Point, stage: Stage, free: ArrayLike
+) -> tuple[Any, Any, Any]:
     """Return the function, the solver's first state, and the shape of what it reports."""
     fn = _square_problem(objective, stage, free)
     packed = _pack(point)
@@ -154,14 +158,14 @@ def _fresh(objective: Objective, point: Point, stage: Stage, free: Array) -> tup
     return fn, _SOLVER.init(fn, packed, None, {}, shape, report, frozenset()), report
 
 
-def _begin(objective: Objective, point: Point, stage: Stage, free: Array) -> Step:
+def _begin(objective: Objective, point: Point, stage: Stage, free: ArrayLike) -> Step:
     _, state, report = _fresh(objective, point, stage, free)
     sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), report)
     arrays = eqx.filter(state, eqx.is_array)
     return Step(point, arrays, sums, jnp.asarray(jnp.inf), jnp.asarray(True))
 
 
-def _advance(objective: Objective, before: Step, stage: Stage, free: Array) -> Step:
+def _advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -> Step:
     fn, template, _ = _fresh(objective, before.point, stage, free)
     state = eqx.combine(before.solver, eqx.filter(template, eqx.is_array, inverse=True))
     packed = _pack(before.point)
@@ -172,13 +176,14 @@ def _advance(objective: Objective, before: Step, stage: Stage, free: Array) -> S
 
 
 @eqx.filter_jit
-def begin(objective: Objective, points: Point, stage: Stage, free: Array) -> Step:
+def begin(objective: Objective, points: Point, stage: Stage, free: ArrayLike) -> Step:
     """Set a stage up at S points; their leaves have S first, and so has every leaf returned."""
-    return eqx.filter_vmap(lambda point: _begin(objective, point, stage, free))(points)
+    step: Step = eqx.filter_vmap(lambda point: _begin(objective, point, stage, free))(points)
+    return step
 
 
 @eqx.filter_jit
-def advance(objective: Objective, before: Step, stage: Stage, free: Array) -> Step:
+def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
 
     Parameters
@@ -192,4 +197,5 @@ def advance(objective: Objective, before: Step, stage: Stage, free: Array) -> St
     free
         (K + clocks·F,) one for what may move, zero for what stays.
     """
-    return eqx.filter_vmap(lambda step: _advance(objective, step, stage, free))(before)
+    after: Step = eqx.filter_vmap(lambda step: _advance(objective, step, stage, free))(before)
+    return after
