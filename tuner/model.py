@@ -89,26 +89,30 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
     )
     aerodynamics = file.aerodynamics
     return Vehicle(
-        body=Body(file.mass, file.inertia.xx, file.inertia.yy, file.inertia.zz),
+        body=Body(
+            *map(jnp.asarray, (file.mass, file.inertia.xx, file.inertia.yy, file.inertia.zz))
+        ),
         rotors=(first, second, third, fourth),
         motor=Motor(
-            input_scaling=file.motor.input_scaling,
-            zero_position_armed=file.motor.zero_position_armed,
-            max_rotor_velocity=file.motor.max_rotor_velocity,
-            time_constant_up=file.motor.time_constant_up,
-            time_constant_down=file.motor.time_constant_down,
-            input_offset=file.motor.input_offset,
-            quadratic=file.motor.quadratic,
+            input_scaling=jnp.asarray(file.motor.input_scaling),
+            zero_position_armed=jnp.asarray(file.motor.zero_position_armed),
+            max_rotor_velocity=jnp.asarray(file.motor.max_rotor_velocity),
+            time_constant_up=jnp.asarray(file.motor.time_constant_up),
+            time_constant_down=jnp.asarray(file.motor.time_constant_down),
+            input_offset=jnp.asarray(file.motor.input_offset),
+            quadratic=jnp.asarray(file.motor.quadratic),
         ),
         aerodynamics=Aerodynamics(
-            motor_constant=aerodynamics.motor_constant,
-            moment_constant=aerodynamics.moment_constant,
-            rotor_drag_coefficient=aerodynamics.rotor_drag_coefficient,
-            rolling_moment_coefficient=aerodynamics.rolling_moment_coefficient,
-            max_relative_airspeed=aerodynamics.max_relative_airspeed,
+            motor_constant=jnp.asarray(aerodynamics.motor_constant),
+            moment_constant=jnp.asarray(aerodynamics.moment_constant),
+            rotor_drag_coefficient=jnp.asarray(aerodynamics.rotor_drag_coefficient),
+            rolling_moment_coefficient=jnp.asarray(aerodynamics.rolling_moment_coefficient),
+            max_relative_airspeed=jnp.asarray(aerodynamics.max_relative_airspeed),
             reaction_torque=aerodynamics.reaction_torque,
         ),
-        setup=Setup(file.setup.estimate_latency, file.setup.actuator_latency),
+        setup=Setup(
+            jnp.asarray(file.setup.estimate_latency), jnp.asarray(file.setup.actuator_latency)
+        ),
     )
 
 

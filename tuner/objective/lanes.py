@@ -226,4 +226,4 @@ def _measured(
 
 
 def _inside(flight: Flight, time: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return (time >= 0.0) & (time <= flight.time[-1])
+    return np.asarray((time >= 0.0) & (time <= flight.time[-1]))
