@@ -164,12 +164,13 @@ class ExportSettings(Section):
     Attributes
     ----------
     formats
-        ``sdf`` and ``px4``; ``yaml`` with source and confidence of each coefficient.
+        ``yaml`` is the vehicle file with source and confidence of each coefficient, ``sdf`` the
+        model or, without one, its tags, ``px4`` the parameters.
     into
         The SDF model that ``sdf`` starts from; the original stays as it is.
     """
 
-    formats: tuple[Literal["yaml", "sdf", "px4"], ...] = ()
+    formats: tuple[Literal["yaml", "sdf", "px4"], ...] = ("yaml", "sdf", "px4")
     into: Path | None = None
 
 

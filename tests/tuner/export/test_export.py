@@ -5,7 +5,9 @@ import pytest
 
 from tests.tuner.export.conftest import MODELS, as_the_run_says, rmse
 from tuner.config import read_vehicle
+from tuner.config.job import ExportSettings
 from tuner.errors import ExportError, InputError
+from tuner.export.after_run import export_as_asked
 from tuner.export.export import export
 from tuner.export.gates import check
 
@@ -132,6 +134,20 @@ def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
 def test_a_fixed_coefficient_may_equal_its_bound(make_run):
     run = make_run(coefficients={"mass": {"fitted": False, "upper": 2.243}})
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
+
+
+def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
+    run = make_run()
+    model = MODELS / "quad_x.sdf"
+    asked = ExportSettings(formats=("yaml", "sdf", "px4"), into=model)
+    lines = list(export_as_asked(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    folder = run.folder / "export"
+    names = ["hovergames_updated.yaml", "quad_x.sdf", "hovergames_updated.params"]
+    assert lines == [f"exported {folder / name}" for name in names]
+    assert (folder / "quad_x.sdf").read_text() != model.read_text()
+    make_run(**BAD[0][0])
+    lines = list(export_as_asked(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    assert all(line.startswith("not exported as ") and "held position" in line for line in lines)
 
 
 def test_gates_fly_what_the_format_holds(make_run, tmp_path):
