@@ -18,7 +18,7 @@ from tuner.config import (
     settle,
 )
 from tuner.config.model import build
-from tuner.errors import InputError
+from tuner.errors import InputError, did_you_mean
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.simulation.trajectory import with_named_reference
@@ -80,6 +80,10 @@ def flights_of(settings: Settings) -> tuple[Flight, ...]:
         for path in settings.flights
         for flight in load_flights(path, topics=job.topics, namespace=job.namespace)
     ]
+    names = [flight.name for flight in read]
+    for name in job.holdout:
+        if name not in names:
+            raise InputError("holdout", f"no flight '{name}'", did_you_mean(name, names))
     return tuple(_with_reference(flight, settings) for flight in read)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -204,11 +205,11 @@ def _holdout(
     """Return the held-out flights' names and the recordings that are named only as such."""
     names = {flight.stem for flight in flights}
     if options.holdout is None:
-        return tuple(name for name in job.holdout if name in names), ()
+        return tuple(name for name in job.holdout if _is_among(name, names)), ()
     held: list[str] = []
     extra: list[Path] = []
     for word in options.holdout:
-        if word in names:
+        if _is_among(word, names):
             held.append(word)
         elif Path(word).exists() or glob.has_magic(word):
             for path in find_flights([word]):
@@ -244,6 +245,11 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
     return job.replace(**changes)
 
 
+def _is_among(name: str, recordings: Collection[str]) -> bool:
+    """Tell whether a flight is of one of some recordings: its only mission, or ``NAME-2``, …"""
+    return name in recordings or re.sub(r"-\d+$", "", name) in recordings
+
+
 def _names_are_distinct(flights: tuple[Path, ...]) -> None:
     seen: dict[str, Path] = {}
     for flight in flights:
@@ -260,7 +266,7 @@ def _check_flight_names(job: JobFile, job_path: Path | None, flights: tuple[Path
     folders = {flight.parent for flight in flights} | ({job_path.parent} if job_path else set())
     known = {file.stem for folder in folders for file in folder.iterdir()} | set(given)
     for name in (*job.holdout, *job.flights):
-        if name not in known:
+        if not _is_among(name, known):
             raise ConfigError(
                 job_path or "flights",
                 f"names a flight '{name}' that is not there",

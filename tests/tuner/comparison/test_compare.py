@@ -133,6 +133,11 @@ def test_the_job_file_says_what_flew(bag, compared, tmp_path):
     assert row.rmse.x > 100 * compared[0].of("hovergames_updated", "small_circle").x
 
 
+def test_a_mission_that_is_not_there_is_named(bag):
+    with pytest.raises(InputError, match="no flight 'small_circle-2'; did you mean"):
+        compare(Options([str(bag)], holdout=["small_circle-2"]), ["hovergames"])
+
+
 def test_the_command_prints_the_table(bag, capsys):
     arguments = ["compare", "--flights", str(bag), "--vehicle", "hovergames_updated", "hovergames"]
     assert main([*arguments, "--laps"]) == 0

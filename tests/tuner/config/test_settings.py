@@ -144,6 +144,13 @@ def test_a_misspelt_flight_in_the_job_file_is_named(lab):
         settle(Options([f"{lab}/*.bag"]))
 
 
+def test_a_second_mission_can_be_meant(lab):
+    (lab / "tune.yaml").write_text("holdout: [c-2]\nflights: {a-3: {weight: 2}}\n")
+    assert settle(Options([f"{lab}/*.bag"])).job.holdout == ("c-2",)
+    assert settle(Options([f"{lab}/a.bag"])).job.holdout == ()
+    assert settle(Options([f"{lab}/*.bag"], holdout=["b-2"])).job.holdout == ("b-2",)
+
+
 def test_two_recordings_of_one_name_are_refused(lab):
     (lab / "more").mkdir()
     (lab / "more" / "a.bag").touch()
