@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.coefficients import HABITS, space_of
-from tuner.config import COEFFICIENTS, CoefficientSettings, ControllerFile, JobFile, read_vehicle
+from tuner.config import COEFFICIENTS, ControllerFile, JobFile, read_vehicle
+from tuner.config.job import CoefficientSettings
 from tuner.config.shipped import find_config
 from tuner.errors import ConfigError
 from tuner.model import model_of, with_coefficients
