@@ -1,0 +1,199 @@
+"""What the data say, cut into flights, channels and stretches of time.
+
+Everything here is in the scaled coordinates of the `Space` (logarithm or number). Each lane's clock
+offsets are nuisances: they are eliminated lane by lane, so that what is left speaks of the
+coefficients alone and can be added up and split at will.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.normal import Jacobian, Objective, Point, Stage
+from tuner.search.levenberg_marquardt import OFFSET_SD
+
+Array = NDArray[np.float64]
+
+BLOCK = 2.0
+"""s; residuals further apart than this are taken to be independent."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Gradient and information of a fit, in C channels, F lanes, B blocks, K coefficients.
+
+    Attributes
+    ----------
+    channels
+        C names.
+    flight
+        (F,) number of the flight that each lane belongs to.
+    information
+        (C, F, B, K, K): JᵀWJ in the scaled coordinates, clock offsets eliminated.
+    score
+        (C, F, B, K): JᵀWr, likewise.
+    spread
+        (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
+    clock_prior
+        (K, K): what the prior of the clock offsets contributes.
+    prior
+        (K, K): what the priors of the coefficients contribute.
+    crashed
+        (F,) which simulated lanes crashed.
+    """
+
+    channels: tuple[str, ...]
+    flight: NDArray[np.int_]
+    information: Array
+    score: Array
+    spread: Array
+    clock_prior: Array
+    prior: Array
+    crashed: NDArray[np.bool_]
+
+    @property
+    def data(self) -> Array:
+        """The information (K, K) of all flights."""
+        return np.asarray(self.information.sum(axis=(0, 1, 2)) + self.clock_prior)
+
+    @property
+    def total(self) -> Array:
+        """The information (K, K) of flights and priors."""
+        return np.asarray(self.data + self.prior)
+
+
+def gather(
+    objective: Objective,
+    point: Point,
+    stage: Stage,
+    *,
+    clocks: NDArray[np.bool_] | None = None,
+    block: float = BLOCK,
+) -> Evidence:
+    """Evaluate the Jacobian at a point and sum it up.
+
+    Parameters
+    ----------
+    objective, point, stage
+        A fit and where it stands.
+    clocks
+        (clocks, F) which clock offsets were fitted; by default those that are not exactly zero.
+    block
+        s of one flight that are summed up together.
+    """
+    jacobian = objective.jacobian(point, stage)
+    return summed(objective, point, stage, jacobian, clocks=clocks, block=block)
+
+
+def summed(
+    objective: Objective,
+    point: Point,
+    stage: Stage,
+    jacobian: Jacobian,
+    *,
+    clocks: NDArray[np.bool_] | None = None,
+    block: float = BLOCK,
+) -> Evidence:
+    """Sum a Jacobian up; see `gather`."""
+    count, lanes = len(objective.space), objective.lanes.count
+    channels = tuple(jacobian.residuals)
+    blocks = _block_count(objective, stage, block)
+    size = count + point.offsets.shape[0]
+    information = np.zeros((len(channels), lanes, blocks, size, size))
+    score = np.zeros((len(channels), lanes, blocks, size))
+    spread = np.ones((len(channels), lanes))
+    for number, channel in enumerate(channels):
+        columns = np.asarray(jacobian.columns[channel])
+        residuals = np.asarray(jacobian.residuals[channel])
+        weight = np.asarray(objective.lanes.measured[channel].weight)
+        time = np.asarray(objective.lanes.measured[channel].time)
+        scale = np.asarray(stage.scale[channel])
+        for lane in range(lanes):
+            rows = columns[..., lane] / scale[lane]
+            error = residuals[..., lane] / scale[lane]
+            size_of = np.abs(error)
+            robust = np.minimum(1.0, float(stage.huber) / np.maximum(size_of, 1e-300))
+            which = np.minimum((time[:, lane] / block).astype(int), blocks - 1)
+            for one in range(blocks):
+                here = which == one
+                part = rows[:, here].reshape(size, -1)
+                heavy = part * robust[here].ravel()
+                information[number, lane, one] = heavy @ part.T
+                score[number, lane, one] = heavy @ error[here].ravel()
+            compared = (weight[..., lane] > 0) & np.any(rows != 0, axis=0)
+            if compared.any():
+                spread[number, lane] = np.mean((robust * error**2)[compared])
+    raw = _Raw(channels, information, score, spread)
+    fitted = np.asarray(point.offsets) != 0.0 if clocks is None else clocks
+    return _without_clocks(
+        objective,
+        point,
+        stage,
+        raw,
+        clocks=fitted,
+        crashed=np.isfinite(np.asarray(jacobian.crash_time)),
+    )
+
+
+@dataclass(frozen=True)
+class _Raw:
+    """Sums with the clock offsets still in them, in the search's coordinates."""
+
+    channels: tuple[str, ...]
+    information: Array
+    score: Array
+    spread: Array
+
+
+def _block_count(objective: Objective, stage: Stage, block: float) -> int:
+    seconds = float(stage.horizon) / float(objective.schedule.log_rate)
+    return max(int(seconds / block), 1)
+
+
+def _without_clocks(
+    objective: Objective,
+    point: Point,
+    stage: Stage,
+    raw: _Raw,
+    *,
+    clocks: NDArray[np.bool_],
+    crashed: NDArray[np.bool_],
+) -> Evidence:
+    """Change to scaled coordinates and eliminate every lane's clock offsets."""
+    space, lanes = objective.space, objective.lanes.count
+    count = len(space)
+    stretch = np.concatenate(
+        [1.0 / space.slope(np.asarray(point.coefficients)), np.ones(len(clocks))]
+    )
+    information = raw.information * stretch[:, None] * stretch
+    score = raw.score * stretch
+    eliminate = np.zeros((lanes, count, count + len(clocks)))
+    clock_prior = np.zeros((count, count))
+    for lane in range(lanes):
+        whole = information[:, lane].sum(axis=(0, 1))
+        projection = _projection(whole, clocks[:, lane], count)
+        eliminate[lane] = np.hstack([np.eye(count), projection])
+        clock_prior += projection @ projection.T / OFFSET_SD**2
+    reduced = np.einsum("lap,clbpq,ldq->clbad", eliminate, information, eliminate, optimize=True)
+    return Evidence(
+        channels=raw.channels,
+        flight=np.asarray(objective.lanes.flight),
+        information=reduced,
+        score=np.einsum("lap,clbp->clba", eliminate, score),
+        spread=raw.spread,
+        clock_prior=clock_prior,
+        prior=np.diag(float(stage.prior) ** 2 / space.prior_sd**2),
+        crashed=crashed,
+    )
+
+
+def _projection(whole: Array, movable: NDArray[np.bool_], count: int) -> Array:
+    """Return (K, clocks): how a lane's best clock offsets follow the coefficients."""
+    projection = np.zeros((count, len(movable)))
+    free = np.flatnonzero(movable)
+    own = whole[np.ix_(count + free, count + free)] + np.eye(len(free)) / OFFSET_SD**2
+    projection[:, free] = -np.linalg.solve(own, whole[count + free, :count]).T
+    return projection
