@@ -84,7 +84,7 @@ def run(
         write_folder,
     )
     from tuner.job.search import parameters_of, search  # noqa: PLC0415
-    from tuner.report import render, write_report_data  # noqa: PLC0415
+    from tuner.report import render, write_traces  # noqa: PLC0415
     from tuner.search.growing import Progress  # noqa: PLC0415
 
     settings = settle(options)
@@ -116,7 +116,7 @@ def run(
     status = "converged" if fitted.converged else "stopped"
     result = result_of(job, fitted, uncertainty, errors, status=status)
     write_folder(folder, result, vehicle, job)
-    write_report_data(folder, job, fitted, uncertainty, vehicle)
+    write_traces(folder, job.flights, *errors)
     render(folder)
     return folder, result
 

@@ -1,0 +1,6 @@
+"""A run as one HTML page that works without a network, rendered from its folder alone."""
+
+from tuner.report.page import render
+from tuner.report.traces import write_traces
+
+__all__ = ["render", "write_traces"]
