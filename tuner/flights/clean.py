@@ -12,11 +12,25 @@ from tuner.flights.outliers import HONEST, excursions, frozen, sticking_out
 
 #: Signals that cannot leave a range; a value beyond it is a corrupt sample.
 RANGES: Mapping[str, tuple[float, float]] = {
+    "position": (-1e5, 1e5),
+    "velocity": (-1e3, 1e3),
+    "attitude": (-1e3, 1e3),
+    "body_rate": (-1e4, 1e4),
+    "acceleration": (-1e4, 1e4),
+    "reference_position": (-1e5, 1e5),
+    "reference_velocity": (-1e3, 1e3),
+    "reference_acceleration": (-1e4, 1e4),
+    "rate_setpoint": (-1e4, 1e4),
+    "attitude_setpoint": (-1e3, 1e3),
+    "lap": (-1e6, 1e6),
     "command": (-0.02, 1.02),
     "thrust_setpoint": (-0.02, 1.02),
     "rotor_speed": (0.0, 20_000.0),
     "battery_voltage": (0.0, 100.0),
 }
+
+#: No recording lasts longer, in s, to either side of its middle.
+LONGEST = 43_200.0
 
 
 def clean(
@@ -65,6 +79,9 @@ def clean(
     note(late, "out of order, put in order")
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
+    apart = np.abs(time - np.median(time)) > LONGEST if len(time) else np.zeros(0, dtype=np.bool_)
+    note(int(apart.sum()), "stamped hours away from the others dropped")
+    time, values = time[~apart], values[~apart]
     time, values, doubles = _merge_equal_times(time, values)
     note(doubles, "with a stamp seen before dropped")
 

@@ -109,7 +109,7 @@ def read_content(
             "give a map for this format",
         )
     chosen = choose_map(recording, candidates)
-    places, notes = locate(recording, chosen)
+    places, notes = locate(recording, chosen, strict=given is not None)
     require_pose(recording, chosen, places)
     raw, samples, noticed = extract(recording, places, chosen.clocks)
     said = [
@@ -154,8 +154,8 @@ def _clean(path: Path, raw: Mapping[str, Raw], said: list[Note]) -> tuple[dict[s
             series[signal] = Series(time, values)
     for needed in ("position", "attitude"):
         if needed not in series:
-            topic = raw[needed].topic if needed in raw else needed
-            raise RecordingError(path, f"no usable {needed} in {topic}", "inspect the recording")
+            where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
+            raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
     return series, epoch
 
 

@@ -21,7 +21,7 @@ from tuner.flights.inspection import (
     TopicReport,
 )
 from tuner.flights.mission import yaw_spin
-from tuner.flights.motion import derivative, rotate, smooth
+from tuner.flights.motion import RATE, derivative, rotate, smooth
 from tuner.flights.opening import open_recording
 from tuner.flights.recording import Recording, Samples
 from tuner.flights.resample import resample
@@ -31,6 +31,8 @@ from tuner.flights.topics import TopicMap
 
 #: Stamps before 1990 count from a start-up, not from 1970.
 NO_DATE = 631_152_000_000_000_000
+#: Seconds of a mission over which speeds are sought.
+LOOKED_AT = 3600.0
 
 
 def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) -> Inspection:
@@ -176,7 +178,7 @@ def _clock(content: Content) -> Mapping[str, float]:
 
 def _mission(content: Content, index: int) -> MissionReport:
     mission = content.missions[index]
-    clock = np.arange(mission.start, mission.end, 0.01)
+    clock = np.arange(mission.start, min(mission.end, mission.start + LOOKED_AT), 1 / RATE)
     position = resample("position", content.series["position"], clock)
     attitude = resample("attitude", content.series["attitude"], clock)
     speed = np.linalg.norm(derivative(smooth(position)), axis=1)

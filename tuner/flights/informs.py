@@ -150,11 +150,17 @@ def _during(series: Series, missions: Sequence[MissionReport]) -> Array:
 
 
 def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:
-    """Return the standard deviation of each column during the missions; zeros without samples."""
+    """Return how much each column varies during the missions; zeros without samples.
+
+    The standard deviation, or what a single step to the largest value is worth.
+    """
     if name not in series:
         return np.zeros(4)
     values = _during(series[name], missions)
-    return np.asarray(np.nanstd(values, axis=0)) if len(values) else np.zeros(values.shape[1])
+    if len(values) == 0:
+        return np.zeros(values.shape[1])
+    largest = np.nanmax(np.abs(values), axis=0)
+    return np.asarray(np.maximum(np.nanstd(values, axis=0), 0.25 * largest))
 
 
 def _largest(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:

@@ -25,64 +25,87 @@ class Place:
 
 
 def choose_map(recording: Recording, candidates: Iterable[TopicMap]) -> TopicMap:
-    """Return the map that finds most signals in a recording, then the one of higher priority."""
+    """Return the map that finds a pose and most signals, then the one of higher priority."""
     suited = [one for one in candidates if one.format == recording.format]
-    return max(suited, key=lambda one: (len(_found(recording, one)), one.priority))
+
+    def worth(one: TopicMap) -> tuple[int, int, int]:
+        found = locate(recording, one)[0]
+        return len({"position", "attitude"} & set(found)), len(found), one.priority
+
+    return max(suited, key=worth)
 
 
-def _found(recording: Recording, topics: TopicMap) -> dict[str, Place]:
-    try:
-        return locate(recording, topics)[0]
-    except RecordingError:  # a map that does not fit
-        return {}
-
-
-def locate(recording: Recording, topics: TopicMap) -> tuple[dict[str, Place], tuple[Note, ...]]:
+def locate(
+    recording: Recording, topics: TopicMap, *, strict: bool = False
+) -> tuple[dict[str, Place], tuple[Note, ...]]:
     """Return, for each signal of a map, the first source that the recording has.
+
+    Parameters
+    ----------
+    recording
+        An open recording.
+    topics
+        The map.
+    strict
+        Whether a user wrote the map, who is to be told of a topic without the fields named;
+        otherwise such a topic is passed over with a note.
 
     Raises
     ------
     RecordingError
-        A topic is there, but nobody says where it holds the signal.
+        If `strict`: a topic is there, but not what the map says of it.
     """
-    if topics.time and not any(recording.holds("", (c.field,)) for c in topics.clocks):
+    times = [recording.lacking("", (clock.field,)) for clock in topics.clocks]
+    if recording.format == "table" and all(times):
         return {}, ()
     places: dict[str, Place] = {}
     notes = []
     for signal, sources in topics.signals.items():
         for source in sources:
-            matching = _matching(recording, source.topic)
-            if not matching:
-                continue
-            topic = matching[0]
-            usual = recording.usual(topic, signal)
-            fields = source.fields or (usual.fields if usual else None)
-            if fields is None:
-                kind = next(known.type for known in recording.topics if known.name == topic)
-                raise RecordingError(
-                    recording.path,
-                    f"it is not known where {topic} ({kind}) holds the {signal}",
-                    "name the 'fields' in the topic map",
-                )
-            if not recording.holds(topic, fields):
-                continue
-            if len(matching) > 1:
-                text = f"{signal} from {topic}; {', '.join(matching[1:4])} would also match"
-                notes.append(Note("warning", topic, text, len(matching) - 1))
-            unit = source.unit or (usual.unit if usual and not source.fields else "si")
-            frame = source.frame or (usual.frame if usual else "enu_flu")
-            places[signal] = Place(source, topic, fields, unit, frame)
-            break
+            found = [_place(recording, signal, source, t) for t in _matching(recording, source)]
+            good = [place for place in found if isinstance(place, Place)]
+            if good:
+                if len(good) > 1:
+                    others = ", ".join(place.topic for place in good[1:4])
+                    text = f"{signal} from {good[0].topic}; {others} would also match"
+                    notes.append(Note("warning", good[0].topic, text, len(good) - 1))
+                places[signal] = good[0]
+                break
+            said = next((text for text in found if isinstance(text, str) and text), None)
+            if said and strict:
+                raise RecordingError(recording.path, said, "correct the topic map")
+            if said:
+                notes.append(Note("warning", source.topic, f"passed over: {said}"))
     return places, tuple(notes)
 
 
-def _matching(recording: Recording, pattern: str) -> list[str]:
+def _matching(recording: Recording, source: Source) -> list[str]:
     """Return the recorded topics of a name or pattern, the one with most messages first."""
+    pattern = source.topic
     if "*" not in pattern:
         known = [topic for topic in recording.topics if topic.name == pattern and topic.count]
     else:
         known = [t for t in recording.topics if t.count and fnmatchcase(t.name, pattern)]
     return [topic.name for topic in sorted(known, key=lambda t: (-t.count, t.name))]
+
+
+def _place(recording: Recording, signal: str, source: Source, topic: str) -> Place | str:
+    """Return where a topic holds a signal, or why it does not: empty if nobody expects it to."""
+    usual = recording.usual(topic, signal)
+    fields = source.fields or (usual.fields if usual else None)
+    if fields is None:
+        kind = next(known.type for known in recording.topics if known.name == topic)
+        wild = "*" in source.topic
+        return "" if wild else f"it is not known where {topic} ({kind}) holds the {signal}"
+    missing = recording.lacking(topic, fields)
+    if missing:
+        absent = recording.format == "table" and len(missing) == len(fields)
+        near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
+        hint = f", did you mean '{near[0]}'?" if near else ""
+        what = f"{topic} has no field" if topic else "there is no column"
+        return "" if absent else f"{what} '{missing[0]}' for the {signal}{hint}"
+    unit = source.unit or (usual.unit if usual and not source.fields else "si")
+    return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
 
 
 def require_pose(recording: Recording, topics: TopicMap, found: Mapping[str, Place]) -> None:
@@ -117,7 +140,7 @@ def require_pose(recording: Recording, topics: TopicMap, found: Mapping[str, Pla
     listed = ", ".join(dict.fromkeys(near)) if near else ", ".join(names[:12]) or "nothing at all"
     raise RecordingError(
         recording.path,
-        f"no topic {' or '.join(wanted)} for {what}; "
+        f"no topic {' or '.join(wanted[:4])} for {what}; "
         f"{'similar are' if near else 'it holds'} {listed}",
         "name the right one in a topic map (--topics FILE)",
     )

@@ -126,8 +126,12 @@ class Recording(Protocol):
         """Return where messages of this topic's type hold a signal; None if they do not."""
         ...
 
-    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:
-        """Tell whether a topic can hold these fields; only tables know before reading."""
+    def fields(self, topic: str) -> Sequence[str]:
+        """Return the names of a topic's fields, for hints; structures by their first part."""
+        ...
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return those of some fields that messages of a topic do not have."""
         ...
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,9 +63,13 @@ class Table:
         """Columns have no usual names."""
         return None
 
-    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
-        """Tell whether some of the wanted columns are there."""
-        return not set(fields).isdisjoint(self.columns)
+    def fields(self, topic: str) -> list[str]:  # noqa: ARG002
+        """Return the columns."""
+        return self.columns
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
+        """Return those of some columns that are not there."""
+        return tuple(name for name in fields if name not in self.columns)
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted columns."""
@@ -80,11 +83,6 @@ class Table:
                 f"no time column among {', '.join(self.columns[:8])}, ...",
                 "name it under 'time' in the topic map",
             )
-        for name in request.fields:
-            if name not in self.columns:
-                near = difflib.get_close_matches(name, self.columns, n=1)
-                hint = f"did you mean '{near[0]}'" if near else "correct the topic map"
-                raise RecordingError(self.path, f"no column '{name}'", hint)
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
         time = _nanoseconds(table.column(clock.field), clock)

@@ -53,9 +53,14 @@ class ULogRecording:
         """Return where a message holds a signal."""
         return USUAL.get(topic.partition("[")[0], {}).get(signal)
 
-    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
-        """Fields are looked up when they are read."""
-        return True
+    def fields(self, topic: str) -> list[str]:
+        """Return the names of a message's fields."""
+        return [name for _, _, name in self._formats.get(topic.partition("[")[0], [])]
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return those of some fields that a message does not have."""
+        kind = topic.partition("[")[0]
+        return tuple(path for path in fields if not _has(self._formats, kind, path.split(".")))
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted fields of some messages."""
@@ -130,6 +135,17 @@ def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
     return formats, start
+
+
+def _has(formats: Mapping[str, list[tuple[str, int, str]]], kind: str, path: list[str]) -> bool:
+    """Tell whether a format has a field such as ``esc[0].esc_rpm``, in its parts."""
+    name, _, index = path[0].partition("[")
+    for what, count, field in formats.get(kind, []):
+        if field == name:
+            number = int(index[:-1]) if index[:-1].isdecimal() else 0
+            inside = number < count and bool(index) == (count > 1)
+            return inside and (len(path) == 1 or _has(formats, what, path[1:]))
+    return False
 
 
 def _size(formats: Mapping[str, list[tuple[str, int, str]]], name: str, depth: int) -> int:

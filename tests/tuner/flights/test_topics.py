@@ -8,13 +8,33 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tuner.config.shipped import configs_folder
 from tuner.errors import ConfigError
 from tuner.flights.topics import load_topic_map, shipped_maps
 from tuner.flights.units import to_enu_flu
 
 
 def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:
-    assert "thesis_lab" in {topic_map.name for topic_map in shipped_maps()}
+    files = {path.stem for path in (configs_folder() / "topics").glob("*.yaml")}
+    assert {topic_map.name for topic_map in shipped_maps()} == files
+    assert {"thesis_lab", "mavros", "mocap", "gazebo", "px4_ros2", "px4_ulog", "table"} <= files
+
+
+def test_a_map_in_ten_lines_extends_a_shipped_one(tmp_path: Path) -> None:
+    (tmp_path / "lab.yaml").write_text(
+        "name: lab\nformat: ros\nextends: mavros\nsignals:\n  position: /vicon/quad/quad\n"
+    )
+    lab, mavros = load_topic_map(tmp_path / "lab.yaml"), load_topic_map("mavros")
+    assert [source.topic for source in lab.signals["position"]] == ["/vicon/quad/quad"]
+    assert lab.signals["command"] == mavros.signals["command"]
+
+
+def test_maps_that_extend_each_other_are_told(tmp_path: Path) -> None:
+    for one, other in (("a", "b"), ("b", "a")):
+        text = f"name: {one}\nformat: ros\nextends: {other}.yaml\nsignals: {{}}\n"
+        (tmp_path / f"{one}.yaml").write_text(text)
+    with pytest.raises(ConfigError, match="in a circle"):
+        load_topic_map(tmp_path / "a.yaml")
 
 
 @pytest.mark.parametrize(

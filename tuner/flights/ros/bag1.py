@@ -223,9 +223,9 @@ class Bag1:
         kept = [entry for entry in entries if entry[0] in wanted]
         if chunk.compression != "none" or chunk.packed < 4 * NEAR:
             return self._content(stream, chunk), kept
-        bounds = np.unique(np.concatenate([*(entry[2] for entry in entries), [chunk.packed]]))
+        bounds = np.unique(np.concatenate([entry[2] for entry in entries]))
         starts = np.unique(np.concatenate([entry[2] for entry in kept]))
-        content, moved = read_pieces(stream, chunk.position, starts, bounds)
+        content, moved = read_pieces(stream, chunk.position, chunk.packed, starts, bounds)
         return content, [(n, time, moved[np.searchsorted(starts, at)]) for n, time, at in kept]
 
 

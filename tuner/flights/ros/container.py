@@ -122,28 +122,31 @@ def joined(times: list[int], payloads: list[bytes]) -> Block:
     return Block(content, end - lengths, end, np.array(times, dtype=np.int64))
 
 
-def read_pieces(stream: BinaryIO, origin: int, starts: Index, bounds: Index) -> tuple[Bytes, Index]:
+def read_pieces(
+    stream: BinaryIO, origin: int, size: int, starts: Index, bounds: Index
+) -> tuple[Bytes, Index]:
     """Read the wanted records of an unpacked chunk, and not the images between them.
 
     Parameters
     ----------
     stream
         The file.
-    origin
-        Where the chunk's data begin in it.
+    origin, size
+        Where the chunk's data begin in it, and how long they are.
     starts
         (n,) increasing offsets of wanted records in the chunk.
     bounds
-        Increasing offsets of all records, and the end of the chunk.
+        Increasing offsets of all records.
 
     Returns
     -------
     tuple
         The bytes read, and (n,) where each wanted record begins in them.
     """
-    ends = bounds[np.minimum(np.searchsorted(bounds, starts, side="right"), len(bounds) - 1)]
-    if np.any(ends - starts > LARGEST_CHUNK) or np.any(starts > bounds[-1]):
+    if len(starts) == 0 or starts[0] < 0 or starts[-1] >= size:
         raise DamagedError("an index points nowhere")
+    bounds = np.append(bounds[bounds < size], size)
+    ends = bounds[np.searchsorted(bounds, starts, side="right")]
     apart = np.flatnonzero(starts[1:] - ends[:-1] > NEAR) + 1
     first = np.concatenate([[0], apart])
     last = np.concatenate([apart, [len(starts)]]) - 1

@@ -23,6 +23,8 @@ BYTES_AT_ONCE = 16 << 20
 PATIENCE = 5_000
 #: How often reading goes on behind a damaged page, each time twice as far behind it.
 ATTEMPTS = 24
+#: What SQLite makes of a damaged file; it takes absurd sizes for a lack of memory.
+BROKEN = (sqlite3.Error, MemoryError, OverflowError)
 
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
@@ -56,7 +58,7 @@ class Db3:
                         self.path, "is no ROS 2 recording", "give the recording itself"
                     )
                 self._learn(database, "message_definitions" in tables)
-        except sqlite3.Error as err:
+        except BROKEN as err:
             raise RecordingError(
                 self.path, f"cannot be read ({err})", "try sqlite3's '.recover' on it"
             ) from None
@@ -97,8 +99,8 @@ class Db3:
                         done = row[0]
                         yield row[1:]
                 break
-            except sqlite3.Error as err:
-                said = str(err)
+            except BROKEN as err:
+                said = str(err) or "out of memory"
                 attempts += 1
                 done += 1 << attempts
         if said and not self.notes:
@@ -113,7 +115,7 @@ class Db3:
                     "SELECT topic_id, count(*) FROM messages GROUP BY topic_id"
                 ).fetchall()
             )
-        except sqlite3.DatabaseError:
+        except BROKEN:
             counts: dict[int, int] = {}
             for (number,) in self._rows("topic_id FROM messages WHERE", ()):
                 counts[number] = counts.get(number, 0) + 1
@@ -146,6 +148,7 @@ class _opened:  # noqa: N801 (used like a function)
         unfinished = path.with_name(path.name + "-wal").exists()
         how = "mode=ro" if unfinished else "mode=ro&immutable=1"
         self._database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{how}", uri=True)
+        self._database.text_factory = lambda raw: raw.decode(errors="replace")
         self._cut = _is_cut(path)
         self._steps = 0
 

@@ -31,11 +31,14 @@ class Definitions:
         Message type -> definition as the recording carries it.
     files
         ``.msg`` files, or folders of them, for types that the recording does not carry.
+    standard
+        Whether types that are nowhere defined may be taken from ROS 2's own packages.
     """
 
     path: Path
     texts: dict[str, MessageDefinition]
     files: tuple[Path, ...] = ()
+    standard: bool = False
     _known: dict[str, Fields] = field(default_factory=dict)
 
     def fields(self, kind: str) -> Fields:
@@ -53,14 +56,14 @@ class Definitions:
     def _learn(self, kind: str) -> None:
         text = self.texts.get(kind)
         if text is not None and text.format is not MessageDefinitionFormat.NONE:
-            self._add(_parse(self.path, text, kind))
+            self._known.update(_parse(self.path, text, kind))
         for path in _message_files(self.files):
-            name = _type_of(path)
-            self._add(_parse(path, _read(path), name), only_new=True)
-        if kind not in self._known:
-            self._add(get_typestore(Stores.EMPTY).fielddefs, only_new=True)
-        if kind not in self._known:
-            self._add(get_typestore(Stores.ROS2_HUMBLE).fielddefs, only_new=True)
+            for name, fields in _parse(path, _read(path), _type_of(path)).items():
+                self._known.setdefault(name, fields)
+        stores = [Stores.EMPTY, Stores.ROS2_HUMBLE] if self.standard else [Stores.EMPTY]
+        for store in stores:
+            if kind not in self._known and kind in (known := get_typestore(store).fielddefs):
+                self._known[kind] = known[kind][1]
         if kind not in self._known:
             raise RecordingError(
                 self.path,
@@ -68,18 +71,14 @@ class Definitions:
                 "name its .msg file under 'messages' in the topic map",
             )
 
-    def _add(self, types: Any, *, only_new: bool = False) -> None:
-        for name, (_, fields, *_) in types.items():
-            if not only_new or name not in self._known:
-                self._known[name] = fields
 
-
-def _parse(path: Path, text: MessageDefinition, kind: str) -> Any:
+def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
     if len(text.data) > LONGEST:
         raise RecordingError(path, f"the definition of {kind} is absurdly long", "leave it out")
     parse = get_types_from_idl if text.format is MessageDefinitionFormat.IDL else None
     try:
-        return parse(text.data) if parse else get_types_from_msg(text.data, kind)
+        found = parse(text.data) if parse else get_types_from_msg(text.data, kind)
+        return {name: fields for name, (_, fields) in found.items()}
     except InputError:
         raise
     except Exception as err:  # the parser meets hostile text and has no common error class

@@ -8,10 +8,10 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import mkdtemp
+from typing import Any
 
-import yaml
-
-from tuner.errors import RecordingError
+from tuner.config.yaml_file import read_yaml
+from tuner.errors import ConfigError, RecordingError
 from tuner.flights.flight import Note
 from tuner.flights.ros.container import (
     LARGEST_CHUNK,
@@ -26,8 +26,6 @@ from tuner.flights.ros.db3 import Db3
 from tuner.flights.ros.mcap import Mcap
 from tuner.flights.ros.wire import Block
 
-#: No honest description of a recording is longer.
-LONGEST_METADATA = 8 << 20
 #: Files compressed as a whole are unpacked beside the others up to this size.
 LARGEST_UNPACKED = 32 << 30
 
@@ -92,23 +90,19 @@ class Folder:
         """Return the files and the compression mode, from the metadata or from what lies there."""
         path = self.path / "metadata.yaml"
         try:
-            if path.stat().st_size > LONGEST_METADATA:
-                raise ValueError("it is absurdly long")
-            loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-            content = yaml.load(path.read_text(encoding="utf-8"), Loader=loader)
-            about = content["rosbag2_bagfile_information"]
-            names = [str(name) for name in about["relative_file_paths"]]
-            mode = str(about.get("compression_mode") or "").lower()
-            if names:
-                return names, mode
+            about: Any = read_yaml(path).data
+            about = about["rosbag2_bagfile_information"]
+            names, mode = about["relative_file_paths"], about.get("compression_mode") or ""
+            if names and all(isinstance(name, str) for name in (*names, mode)):
+                return names, mode.lower()
             raise ValueError("it names no file")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as err:
+        except (ConfigError, ValueError, KeyError, TypeError, AttributeError):
             names = sorted(
                 file.name
                 for file in self.path.iterdir()
                 if file.suffix in (".db3", ".mcap") or file.name.endswith(".db3.zstd")
             )
-            said = "is missing" if isinstance(err, FileNotFoundError) else "cannot be understood"
+            said = "cannot be understood" if path.exists() else "is missing"
             text = f"metadata.yaml {said}; the {len(names)} data files beside it are read"
             self._found.append(Note("warning", "", text, len(names)))
             return names, ""

@@ -6,6 +6,7 @@ never closed; here messages are located with array operations and a broken file 
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
@@ -154,7 +155,8 @@ class Mcap:
                 self._loose.setdefault(number, []).append((at, end, time))
                 counts[number] = counts.get(number, 0) + 1
             elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
-                self._learn(op, stream.read(length))
+                with contextlib.suppress(DamagedError):
+                    self._learn(op, stream.read(length))
             at = end
         self._count(counts)
         total = sum(counts.values())
@@ -175,7 +177,8 @@ class Mcap:
                 (number,) = struct.unpack_from("<H", content, at)
                 counts[number] = counts.get(number, 0) + 1
             elif op in (SCHEMA, CHANNEL):
-                self._learn(op, content[at:end])
+                with contextlib.suppress(DamagedError):
+                    self._learn(op, content[at:end])
         return counts
 
     def _learn(self, op: int, content: bytes) -> None:
@@ -226,9 +229,9 @@ class Mcap:
                 content = np.frombuffer(self._content(stream, chunk), dtype=np.uint8)
             else:
                 offsets = [entry[1] for entry in entries.values()]
-                bounds = np.unique(np.concatenate([*offsets, [packed]]))
+                bounds = np.unique(np.concatenate(offsets))
                 starts = np.unique(np.concatenate([entry[1] for entry in kept.values()]))
-                content, moved = read_pieces(stream, position, starts, bounds)
+                content, moved = read_pieces(stream, position, packed, starts, bounds)
                 kept = {
                     n: (time, moved[np.searchsorted(starts, at)]) for n, (time, at) in kept.items()
                 }
@@ -252,7 +255,9 @@ class Mcap:
         loose = np.array(self._loose[number], dtype=np.int64)
         for rows in np.array_split(loose, max(1, len(loose) // 4096)):
             starts, ends, time = rows.T
-            content, moved = read_pieces(stream, 0, starts, np.unique([*starts, *ends]))
+            content, moved = read_pieces(
+                stream, 0, self.path.stat().st_size, starts, np.unique([*starts, *ends])
+            )
             yield number, _block(content, number, time, moved)
 
 

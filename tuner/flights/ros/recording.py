@@ -25,7 +25,7 @@ from tuner.flights.recording import (
 from tuner.flights.ros.container import Connection, Container
 from tuner.flights.ros.definitions import Definitions
 from tuner.flights.ros.usual import USUAL
-from tuner.flights.ros.wire import UnknownFieldError, Walk, decode, has_field, plan
+from tuner.flights.ros.wire import UnknownFieldError, Walk, decode, missing_fields, plan
 
 _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
 
@@ -52,7 +52,7 @@ class RosRecording:
         self.path = path
         self._container = container
         texts = {c.type: c.definition for c in container.connections.values()}
-        self._definitions = Definitions(path, texts, messages)
+        self._definitions = Definitions(path, texts, messages, standard=container.aligned)
         counts: dict[tuple[str, str], int] = {}
         for connection in container.connections.values():
             key = (connection.topic, connection.type)
@@ -68,14 +68,27 @@ class RosRecording:
 
     def usual(self, topic: str, signal: str) -> Usual | None:
         """Return where messages of this topic's type hold a signal."""
-        kind = next((known.type for known in self.topics if known.name == topic), "")
+        kind = self._kind(topic)
         if kind.startswith("px4_msgs/"):
             return px4.USUAL.get(px4.log_name(kind), {}).get(signal)
         return USUAL.get(kind, {}).get(signal)
 
-    def holds(self, topic: str, fields: tuple[str, ...]) -> bool:  # noqa: ARG002
-        """Fields are looked up when they are read."""
-        return True
+    def fields(self, topic: str) -> list[str]:
+        """Return the names of the fields of a topic's messages."""
+        try:
+            return [name for name, _ in self._definitions.fields(self._kind(topic))]
+        except RecordingError:
+            return []
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return those of some fields that a topic's messages do not have."""
+        try:
+            return missing_fields(self._definitions, self._kind(topic), fields)
+        except (UnknownFieldError, RecordingError):
+            return fields
+
+    def _kind(self, topic: str) -> str:
+        return next((known.type for known in self.topics if known.name == topic), "")
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted fields of some topics."""
@@ -99,17 +112,18 @@ class RosRecording:
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
         return Contents(samples, (*self.notes, *notes))
 
+    def _has(self, kind: str, path: str) -> bool:
+        return not missing_fields(self._definitions, kind, (path,))
+
     def _plan(self, connection: Connection, request: Request) -> tuple[Walk, Clock | None]:
         """Plan how to reach the wanted fields and the time."""
         kind = connection.type
         fields = list(request.fields)
-        clock = next(
-            (c for c in request.clocks if has_field(self._definitions, kind, c.field)), None
-        )
         try:
+            clock = next((c for c in request.clocks if self._has(kind, c.field)), None)
             if clock is not None:
                 fields.append(clock.field)
-            elif has_field(self._definitions, kind, _SECONDS):
+            elif self._has(kind, _SECONDS):
                 fields += [_SECONDS, _NANOSECONDS]
             walk = plan(self._definitions, kind, fields, aligned=self._container.aligned)
         except UnknownFieldError as err:

@@ -101,7 +101,7 @@ _Step = _Number | _Text | _Numbers | _Structures
 
 
 class UnknownFieldError(Exception):
-    """A message type has no such field; the message lists those that it has."""
+    """A message type has no such field, or cannot be walked through to it."""
 
 
 @dataclass(frozen=True)
@@ -124,27 +124,29 @@ class Walk:
 
 
 def plan(definitions: Definitions, kind: str, fields: Sequence[str], *, aligned: bool) -> Walk:
-    """Plan the walk through messages of a type to some fields.
+    """Plan the walk through messages of a type to some of its fields.
 
     Raises
     ------
     UnknownFieldError
         The type lacks one of them, or is too involved for an honest one.
     """
-    steps = tuple(_Planner(definitions, frozenset(fields)).steps((Nodetype.NAME, kind), "", 0))
-    missing = sorted(set(fields) - set(_paths(steps)))
-    if missing:
-        names = ", ".join(name for name, _ in definitions.fields(kind)[:12])
-        raise UnknownFieldError(f"{kind} has no field '{missing[0]}', it has {names}")
+    steps = _all_steps(definitions, kind, fields)
+    if missing := set(fields) - set(_paths(steps)):
+        raise UnknownFieldError(f"{kind} has no field '{min(missing)}'")
     while steps and not any(True for _ in _paths(steps[-1:])):
         steps = steps[:-1]
     return Walk(steps, tuple(dict.fromkeys(fields)), aligned)
 
 
-def has_field(definitions: Definitions, kind: str, path: str) -> bool:
-    """Tell whether a message type has a field."""
-    planner = _Planner(definitions, frozenset([path]))
-    return path in set(_paths(planner.steps((Nodetype.NAME, kind), "", 0)))
+def missing_fields(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[str, ...]:
+    """Return those of some fields that a message type does not have."""
+    found = set(_paths(_all_steps(definitions, kind, fields)))
+    return tuple(path for path in fields if path not in found)
+
+
+def _all_steps(definitions: Definitions, kind: str, fields: Sequence[str]) -> tuple[_Step, ...]:
+    return tuple(_Planner(definitions, frozenset(fields)).steps((Nodetype.NAME, kind), "", 0))
 
 
 def _paths(steps: Iterable[_Step]) -> Iterator[str]:
