@@ -52,6 +52,10 @@ COMMANDS = {
         "tune export runs/x --format sdf --into models/quad.sdf",
         "tune export runs/x --format px4 --out quad.params",
     ),
+    "report": (
+        "Render the page of a run again.",
+        "tune report runs/demo",
+    ),
     "simulate": (
         "Fly a trajectory and write the flight as CSV or ROS 1 bag.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",

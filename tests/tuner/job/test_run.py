@@ -1,0 +1,145 @@
+"""The whole job on the shipped recordings, held against the truth that they were flown with."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from tuner.config import Options, read_vehicle, values_of
+from tuner.errors import InputError
+from tuner.job.run import SILENT, Listener, run
+from tuner.report import render
+
+FLIGHTS = Path(__file__).parents[3] / "reference_flights"
+MECHANICAL = (
+    "inertia_xx",
+    "inertia_yy",
+    "inertia_zz",
+    "input_scaling",
+    "zero_position_armed",
+    "motor_constant",
+    "moment_constant",
+    "rotor_drag_coefficient",
+)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return yaml.safe_load((FLIGHTS / "truth.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    bags = [str(path) for path in sorted(FLIGHTS.glob("*.bag"))]
+    return run(Options(bags), out=tmp_path_factory.mktemp("run") / "demo")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MECHANICAL)
+def test_mechanical_coefficients_within_one_percent(finished, truth, name):
+    assert finished[1].coefficients[name].best == pytest.approx(truth[name], rel=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["time_constant_up", "time_constant_down"])
+def test_time_constants_within_four_percent(finished, truth, name):
+    assert finished[1].coefficients[name].best == pytest.approx(truth[name], rel=0.04)
+
+
+@pytest.mark.slow
+def test_estimate_latency_within_half_a_millisecond(finished, truth):
+    found = finished[1].coefficients["estimate_latency"].best
+    assert found == pytest.approx(truth["estimate_latency"], abs=5e-4)
+
+
+@pytest.mark.slow
+def test_the_held_out_flight_is_met_to_its_measurement_noise(finished):
+    (held,) = [flight for flight in finished[1].flights if flight.split == "holdout"]
+    assert held.name == "circle_4mps"
+    for axis in ("x", "y", "z"):
+        before, after = getattr(held.rmse_initial, axis), getattr(held.rmse_best, axis)
+        assert after < 0.0007
+        assert after < before / 50
+
+
+@pytest.mark.slow
+def test_mass_and_rolling_moment_stay_as_given(finished):
+    for name in ("mass", "rolling_moment_coefficient"):
+        one = finished[1].coefficients[name]
+        assert not one.fitted
+        assert one.best == one.initial
+
+
+@pytest.mark.slow
+def test_the_set_ups_integrator_is_found_and_said(finished):
+    said = [f for f in finished[1].settings["findings"] if f["subject"] == "saturation_feedback"]
+    assert len(said) == 1
+    assert finished[1].settings["controller"]["mixer"]["saturation_feedback"] is False
+
+
+@pytest.mark.slow
+def test_the_folder_holds_what_later_commands_read(finished):
+    folder, result = finished
+    vehicle = read_vehicle(folder / "best_fit.yaml")
+    for name, value in values_of(vehicle).items():
+        assert value == result.coefficients[name].best
+    assert json.loads((folder / "result.json").read_text())["status"] == "converged"
+    assert len((folder / "metrics.csv").read_text().splitlines()) == 1 + 6 * 5
+    page = render(folder).read_text()
+    assert len(page) < 5_000_000
+    assert "http://" not in page.split('id="library"')[0]
+    assert "circle_4mps" in page
+
+
+SHORT = {"fit": ["inertia_zz", "moment_constant", "time_constant_up"], "mass": 2.243}
+
+
+def short_job():
+    return Options([str(FLIGHTS / "yaw_spin_3rps.bag")], **SHORT)
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
+    _, whole = run(short_job(), out=tmp_path / "whole")
+    told = []
+
+    def interrupt(*what):
+        told.append(what)
+        if len(told) == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(
+            short_job(),
+            out=tmp_path / "cut",
+            listener=Listener(SILENT.settled, interrupt, SILENT.message),
+        )
+    assert (tmp_path / "cut" / "best_fit.yaml").exists()
+    assert not (tmp_path / "cut" / "result.json").exists()
+    _, resumed = run(short_job(), out=tmp_path / "cut", resume=True)
+    for name, one in whole.coefficients.items():
+        assert resumed.coefficients[name].best == one.best
+    assert resumed.search.evaluations == whole.search.evaluations
+
+
+def test_resume_without_a_checkpoint_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--out"):
+        run(short_job(), resume=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_flight_writes_nothing(tmp_path):
+    with pytest.raises(InputError, match="nowhere"):
+        run(Options(["nowhere/*.bag"]), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_check_sees_that_nothing_moves():
+    from tuner.job.check import singular_directions  # noqa: PLC0415
+
+    towards = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-9]])
+    (direction,) = singular_directions(towards)
+    assert direction[0] == pytest.approx(-direction[1], rel=1e-3)
+    assert singular_directions(np.eye(2)) == []
