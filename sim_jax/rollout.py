@@ -19,13 +19,13 @@ from sim_jax.control.position import (
 )
 from sim_jax.crash import Limits
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
-from sim_jax.motor import Lag, reference_speed
+from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
-from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, unpacked
+from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switched, unpacked
 from sim_jax.state import Setpoints, Start, State, first_state
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
@@ -74,7 +74,7 @@ class _Plant(eqx.Module):
     limits: Limits = eqx.field(static=True)
     gravity: float = eqx.field(static=True)
     inlet: Inlet
-    lag: Lag
+    lag: Lag | SwitchedLag
     gyro: GyroFilter
 
     def steer(self, state: State, step: Int[Array, ""]) -> Setpoints:
@@ -175,19 +175,24 @@ class _Plant(eqx.Module):
             after = _like(_row(self.inlet.speed, step + 1), state.rotor_speed)
             a, b, c, d = (0.5 * (old + new) for old, new in zip(now, after, strict=True))
             return after, (a, b, c, d)
-        commands = state.command
-        if state.commands is not None:
+        motor = self.vehicle.motor
+        if isinstance(self.lag, SwitchedLag) and state.commands is not None:
             age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
             age = jnp.broadcast_to(age, state.crash_time.shape)
-            rows = look_back(state.commands, step, age)
-            commands = (rows[0], rows[1], rows[2], rows[3])
-        moves = [
-            self.lag.advance(speed, reference_speed(self.vehicle.motor, command))
-            for speed, command in zip(state.rotor_speed, commands, strict=True)
-        ]
-        after = (moves[0][0], moves[1][0], moves[2][0], moves[3][0])
+            before, after = switched(state.commands, step, age)
+            moves = [
+                self.lag.advance(speed, reference_speed(motor, old), reference_speed(motor, new))
+                for speed, old, new in zip(state.rotor_speed, before, after, strict=True)
+            ]
+        else:
+            assert isinstance(self.lag, Lag)
+            moves = [
+                self.lag.advance(speed, reference_speed(motor, command))
+                for speed, command in zip(state.rotor_speed, state.command, strict=True)
+            ]
+        speeds = (moves[0][0], moves[1][0], moves[2][0], moves[3][0])
         mean = (moves[0][1], moves[1][1], moves[2][1], moves[3][1])
-        return after, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
+        return speeds, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
 
     def physics(self, state: State, step: Int[Array, ""]) -> State:
         """Advance rotors and body by one step; a vehicle that breaks the limits stays frozen."""
@@ -255,6 +260,13 @@ def _replace(state: State, **changes: object) -> State:
     return changed
 
 
+def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
+    if schedule.longest_actuator_latency == 0:
+        return Lag.over(vehicle.motor, schedule.step)
+    age = vehicle.setup.actuator_latency * schedule.physics_rate
+    return SwitchedLag.over(vehicle.motor, schedule.step, age - jnp.floor(age))
+
+
 def _batch_shape(
     vehicle: Vehicle, controller: Controller, inlet: Inlet, start: Start
 ) -> tuple[int, ...]:
@@ -313,7 +325,7 @@ def rollout(
         limits=Limits() if limits is None else limits,
         gravity=gravity,
         inlet=inlet,
-        lag=Lag.over(vehicle.motor, schedule.step),
+        lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
     state = first_state(start, schedule, plant.gyro, shape)

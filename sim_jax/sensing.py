@@ -54,6 +54,25 @@ def look_back(
     return jnp.sum(history * weights[:, None], axis=0)
 
 
+def switched(
+    history: Float[Array, "length rows *batch"], step: Int[Array, ""], age: Scalar
+) -> tuple[Float[Array, "rows *batch"], Float[Array, "rows *batch"]]:
+    """Read a delay line of held values ``age`` steps back, over the step that begins now.
+
+    Returns the value at the start of the step, and the one that replaces it when a fraction
+    age - ⌊age⌋ of the step has passed.
+    """
+    length = history.shape[0]
+    ages = (step - jnp.arange(length)) % length
+    ages = ages.reshape((length,) + (1,) * jnp.ndim(age))
+    whole = jnp.floor(lax.stop_gradient(age))
+
+    def at(back: Scalar) -> Float[Array, "rows *batch"]:
+        return jnp.sum(jnp.where(ages == back, 1.0, 0.0)[:, None] * history, axis=0)
+
+    return at(whole + 1.0), at(whole)
+
+
 def packed(motion: Motion) -> Float[Array, "10 *batch"]:
     """Return what an estimator delivers (position, velocity, attitude) as rows."""
     return jnp.concatenate(
