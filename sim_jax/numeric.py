@@ -22,6 +22,21 @@ def saturate(value: Scalar, lower: Scalar | float, upper: Scalar | float) -> Sca
     return jnp.where(value < lower, lower, jnp.where(value > upper, upper, value))
 
 
+def smaller(one: Scalar, other: Scalar) -> Scalar:
+    """Return the smaller of two; where they are equal the derivative is the second's."""
+    return jnp.where(one < other, one, other)
+
+
+def larger(one: Scalar, other: Scalar) -> Scalar:
+    """Return the larger of two; where they are equal the derivative is the second's."""
+    return jnp.where(one > other, one, other)
+
+
+def magnitude(value: Scalar) -> Scalar:
+    """Return the absolute value; at zero the derivative is that from above."""
+    return jnp.where(value < 0, -value, value)
+
+
 def safe_sqrt(square: Scalar) -> Scalar:
     """Return the square root, with derivative zero instead of infinite at zero."""
     positive = square > 0

@@ -6,8 +6,9 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.rotor import Wrench
 from sim_jax.vector import Vec3
@@ -127,16 +128,18 @@ def step_rk4(
             body_rate=angular_acceleration(body, at.body_rate, wrench.moment),
         )
 
-    def moved(along: Motion, duration: float) -> Motion:
-        there: Motion = jax.tree.map(lambda here, rate: here + rate * duration, motion, along)
-        return there
+    def stage(
+        so_far: tuple[Motion, Motion], numbers: tuple[Scalar, Scalar]
+    ) -> tuple[tuple[Motion, Motion], None]:
+        last, change = so_far
+        reach, weight = numbers
+        here = slope(jax.tree.map(lambda at, rate: at + rate * reach, motion, last))
+        return (here, jax.tree.map(lambda sum_, rate: sum_ + rate * weight, change, here)), None
 
-    first = slope(motion)
-    second = slope(moved(first, 0.5 * step))
-    third = slope(moved(second, 0.5 * step))
-    fourth = slope(moved(third, step))
-    mean = jax.tree.map(
-        lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, first, second, third, fourth
-    )
-    after = moved(mean, step)
+    still = jax.tree.map(jnp.zeros_like, motion)
+    dtype = motion.position.x.dtype
+    reaches = jnp.asarray([0.0, 0.5, 0.5, 1.0], dtype) * step
+    weights = jnp.asarray([1.0, 2.0, 2.0, 1.0], dtype) * (step / 6.0)
+    (_, change), _ = jax.lax.scan(stage, (still, still), (reaches, weights))
+    after: Motion = jax.tree.map(jnp.add, motion, change)
     return Motion(after.position, after.velocity, after.attitude.normalized(), after.body_rate)

@@ -1,0 +1,124 @@
+"""PX4's desaturation step by step, to the rounding: what `mixer` says in closed form.
+
+Four outputs are shifted along one direction after the other until what overshoots on either side is
+balanced. It gives the same commands as the closed form, but for the rounding of single precision,
+on which the last microsecond of a PWM pulse can hang; it is several times slower.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+
+from sim_jax.numeric import Scalar, safe_sqrt, saturate
+from sim_jax.vector import Vec3
+
+#: One value per rotor, PX4 order: front right, rear left, front left, rear right.
+PerRotor: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
+Scales: TypeAlias = tuple[float, float, float, float]
+Rounding: TypeAlias = Callable[[Scalar], Scalar]
+
+HALF_SQRT2 = 0.7071070075035095
+"""PX4's own rounding in its generated mixer table: 0.707107 in single precision."""
+ROLL: Scales = (-HALF_SQRT2, HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
+PITCH: Scales = (HALF_SQRT2, -HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
+YAW: Scales = (1.0, 1.0, -1.0, -1.0)
+THRUST: Scales = (1.0, 1.0, 1.0, 1.0)
+
+YAW_HEADROOM = 1.149999976158142
+"""Upper limit while yaw is mixed in, 1.15 in single precision: some yaw response is left at full
+thrust."""
+
+
+def single(value: Scalar) -> Scalar:
+    """Round to single precision, whatever precision the rollout runs in."""
+    return jax.lax.reduce_precision(value, exponent_bits=8, mantissa_bits=23)
+
+
+def exact(value: Scalar) -> Scalar:
+    """Do not round."""
+    return value
+
+
+def desaturated(rounded: Rounding, airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
+    """Return four outputs, which may still overshoot 0..1 where nothing can give way any more.
+
+    Parameters
+    ----------
+    rounded
+        What is done after every operation: `single` or `exact`.
+    airmode
+        0, 1 or 2.
+    torque, thrust
+        Normalised, within -1..1 and 0..1; FRD.
+    """
+    still = jnp.zeros_like(torque.x)
+    tilting = _add(rounded, (still, still, still, still), torque.x, ROLL)
+    tilting = _add(rounded, tilting, torque.y, PITCH)
+    if airmode == 2:  # thrust may rise to keep all three, then yaw gives way
+        outputs = _add(rounded, _add(rounded, tilting, torque.z, YAW), thrust, THRUST)
+        return _unsaturate(rounded, _unsaturate(rounded, outputs, THRUST), YAW)
+    outputs = _add(rounded, tilting, thrust, THRUST)
+    if airmode == 1:  # thrust may rise to keep roll and pitch
+        return _mix_yaw(rounded, _unsaturate(rounded, outputs, THRUST), torque.z)
+    # thrust may only be reduced; then roll, then pitch give way
+    outputs = _unsaturate(rounded, outputs, THRUST, reduce_only=True)
+    outputs = _unsaturate(rounded, _unsaturate(rounded, outputs, ROLL), PITCH)
+    return _mix_yaw(rounded, outputs, torque.z)
+
+
+def linearised(rounded: Rounding, output: Scalar, thrust_factor: float) -> Scalar:
+    """Invert thrust = (1 - f)·u + f·u², PX4's model of the command's curve."""
+    factor = jnp.asarray(thrust_factor, output.dtype)
+    linear = rounded(1.0 - factor)
+    square = rounded(rounded(linear * linear) / rounded(4.0 * factor * factor))
+    positive = jnp.where(output < 0, 0.0, output)
+    root = rounded(safe_sqrt(rounded(square + rounded(positive / factor))))
+    return rounded(root - rounded(linear / (2.0 * factor)))
+
+
+def _mix_yaw(rounded: Rounding, outputs: PerRotor, yaw: Scalar) -> PerRotor:
+    outputs = _unsaturate(rounded, _add(rounded, outputs, yaw, YAW), YAW, YAW_HEADROOM)
+    return _unsaturate(rounded, outputs, THRUST, reduce_only=True)
+
+
+def _unsaturate(
+    rounded: Rounding,
+    outputs: PerRotor,
+    scales: Scales,
+    upper: float = 1.0,
+    *,
+    reduce_only: bool = False,
+) -> PerRotor:
+    """Shift the outputs along a direction until the saturation on both sides is balanced."""
+    first = _gain_to_unsaturate(rounded, outputs, scales, upper)
+    shifted = _add(rounded, outputs, first, scales)
+    second = 0.5 * _gain_to_unsaturate(rounded, shifted, scales, upper)
+    balanced = _add(rounded, shifted, second, scales)
+    if not reduce_only:
+        return balanced
+    a, b, c, d = (
+        jnp.where(first > 0, out, new) for out, new in zip(outputs, balanced, strict=True)
+    )
+    return a, b, c, d
+
+
+def _gain_to_unsaturate(
+    rounded: Rounding, outputs: PerRotor, scales: Scales, upper: float
+) -> Scalar:
+    least = most = jnp.zeros_like(outputs[0])
+    for out, scale in zip(outputs, scales, strict=True):
+        needed = rounded(rounded(saturate(out, 0.0, upper) - out) / scale)
+        least = jnp.where(needed < least, needed, least)
+        most = jnp.where(needed > most, needed, most)
+    return rounded(least + most)
+
+
+def _add(rounded: Rounding, outputs: PerRotor, amount: Scalar, scales: Scales) -> PerRotor:
+    a, b, c, d = (
+        rounded(out + rounded(amount * scale)) for out, scale in zip(outputs, scales, strict=True)
+    )
+    return a, b, c, d
