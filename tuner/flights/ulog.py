@@ -21,6 +21,8 @@ from tuner.flights.recording import NANOSECONDS, Clock, Contents, Request, Sampl
 LONGEST_MESSAGE = 65_535
 #: Logs are read into memory; PX4 writes some 10 MB a minute.
 LARGEST = 4 << 30
+#: Bytes that are looked through at once.
+READ_AT_ONCE = 1 << 22
 
 
 class ULogRecording:
@@ -102,18 +104,20 @@ class ULogRecording:
         return Samples(receive, stamp, fields)
 
 
-def _records(path: Path, at: int) -> Iterator[tuple[int, int, bytes, int]]:
-    """Yield type, length, first bytes and position of the messages of a log, until one is cut."""
-    size = path.stat().st_size
-    with path.open("rb", buffering=1 << 20) as stream:
+def _records(path: Path, at: int) -> Iterator[tuple[int, bytes, int, int]]:
+    """Yield type, buffer, start and end of the content of each message, until one is cut."""
+    with path.open("rb") as stream:
         stream.seek(at)
-        while len(head := stream.read(3)) == 3:
-            length, kind = struct.unpack("<HB", head)
-            content = stream.read(length)
-            if len(content) < length:
-                return
-            yield kind, length, content, min(at, size)
-            at += 3 + length
+        buffer, at = b"", 0
+        while block := stream.read(READ_AT_ONCE):
+            buffer, at = buffer[at:] + block, 0
+            size = len(buffer)
+            while at + 3 <= size:
+                end = at + 3 + (buffer[at] | buffer[at + 1] << 8)
+                if end > size:
+                    break
+                yield buffer[at + 2], buffer, at + 3, end
+                at = end
 
 
 def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
@@ -123,14 +127,14 @@ def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
             raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
     formats: dict[str, list[tuple[str, int, str]]] = {}
     start = 16
-    for kind, _, content, at in _records(path, 16):
-        start = at
+    for kind, buffer, at, end in _records(path, 16):
         if kind == ord("F"):
-            name, _, fields = content.decode(errors="replace").partition(":")
+            name, _, fields = buffer[at:end].decode(errors="replace").partition(":")
             found = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
             formats[name] = [(what, int(count or 1), field) for what, count, field in found]
         elif kind in (ord("A"), ord("L"), ord("C"), ord("D")):
             break
+        start += 3 + end - at
     for name in formats:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
@@ -166,13 +170,14 @@ def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: dict[int, int] = {}
-    for kind, length, content, _ in _records(path, start):
-        if kind == ord("D") and length >= 2:
-            number = content[0] | content[1] << 8
+    data, added = ord("D"), ord("A")
+    for kind, buffer, at, end in _records(path, start):
+        if kind == data and end - at >= 2:
+            number = buffer[at] | buffer[at + 1] << 8
             counts[number] = counts.get(number, 0) + 1
-        elif kind == ord("A") and length >= 4:
-            instance, number = struct.unpack_from("<BH", content)
-            kinds[number] = content[3:].decode(errors="replace")
+        elif kind == added and end - at >= 4:
+            instance, number = struct.unpack_from("<BH", buffer, at)
+            kinds[number] = buffer[at + 3 : end].decode(errors="replace")
             names[number] = kinds[number] if instance == 0 else f"{kinds[number]}[{instance}]"
     return {number: (name, counts.get(number, 0)) for number, name in names.items()}, kinds
 

@@ -14,6 +14,8 @@ from tuner.flights import Flight, load_flight
 from tuner.flights.opening import open_recording
 from tuner.flights.recording import Request
 
+SLOW = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def circle() -> Flight:
@@ -34,7 +36,14 @@ def assert_same(got: Flight, expected: Flight, *, without: tuple[str, ...] = ())
     assert got.initial.attitude == pytest.approx(expected.initial.attitude, abs=1e-6)
 
 
-@pytest.mark.parametrize("bag", sorted(making.FLIGHTS.glob("*.bag")), ids=lambda bag: bag.stem)
+@pytest.mark.parametrize(
+    "bag",
+    [
+        bag if bag.stem in ("circle_3mps", "yaw_spin_3rps") else pytest.param(bag, marks=SLOW)
+        for bag in sorted(making.FLIGHTS.glob("*.bag"))
+    ],
+    ids=lambda bag: bag.stem,
+)
 @pytest.mark.parametrize("storage", StoragePlugin, ids=lambda storage: storage.name)
 def test_ros2_holds_the_same_flight(bag: Path, storage: StoragePlugin, tmp_path: Path) -> None:
     folder = making.to_ros2(bag, tmp_path / bag.stem, storage)

@@ -10,8 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from tuner.config.shipped import configs_folder
 from tuner.errors import ConfigError
+from tuner.flights import SIGNALS
+from tuner.flights.sidecar import read_sidecar
 from tuner.flights.topics import load_topic_map, shipped_maps
-from tuner.flights.units import to_enu_flu
+from tuner.flights.units import UNITS, to_enu_flu
 
 
 def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:
@@ -77,3 +79,20 @@ def test_ned_frd_attitude_becomes_enu_flu() -> None:
     got = to_enu_flu(q.as_quat(scalar_first=True), "attitude")
     matrices = Rotation.from_quat(got, scalar_first=True).as_matrix()
     assert np.allclose(matrices, world @ q.as_matrix() @ body)
+
+
+def test_what_the_guide_shows_is_valid(tmp_path: Path) -> None:
+    guide = (configs_folder() / "topics" / "README.md").read_text()
+    topic_map, sidecar = (block.split("```")[0] for block in guide.split("```yaml\n")[1:])
+    (tmp_path / "my_lab.yaml").write_text(topic_map)
+    lab = load_topic_map(tmp_path / "my_lab.yaml")
+    assert lab.signals["rotor_speed"][0].rotor == "motor"
+    assert "command" in lab.signals
+    (tmp_path / "flight.yaml").write_text(sidecar)
+    assert read_sidecar(tmp_path / "flight.bag").start == 12.5
+    for topic_map in shipped_maps():
+        assert f"`{topic_map.name}`" in guide
+    for signal in SIGNALS:
+        assert f"`{signal}`" in guide
+    for unit in UNITS:
+        assert f"`{unit}`" in guide

@@ -1,0 +1,1 @@
+"""What measures speed: each module prints a table, `python -m benchmarks` all of them."""
