@@ -49,7 +49,7 @@ def refused(path: Path) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("cases", [10, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("cases", [8, pytest.param(100, marks=pytest.mark.slow)])
 def test_broken_files_are_read_or_refused(cases: int) -> None:
     run = subprocess.run(
         [sys.executable, "-m", "tests.tuner.flights.fuzz", "all", "--cases", str(cases)],
