@@ -114,7 +114,7 @@ def fit(
 
 def compare(
     flights: Sequence[Named],
-    vehicles: Sequence[Named] | Mapping[str, VehicleFile],
+    vehicles: Sequence[Named] | Mapping[str, Named | VehicleFile],
     *,
     controller: Named | ControllerFile | None = None,
     config: Named | None = None,
@@ -129,7 +129,7 @@ def compare(
     flights
         Recordings, or globs.
     vehicles
-        Files or names of shipped ones; or name -> vehicle.
+        Files or names of shipped ones; or label -> one of those, or a vehicle.
     controller, config, topics, namespace
         As of `fit`.
     out
@@ -155,7 +155,9 @@ def compare(
         topics=None if topics is None else str(topics),
         namespace=namespace,
     )
-    named = vehicles if isinstance(vehicles, Mapping) else [str(word) for word in vehicles]
+    if not isinstance(vehicles, Mapping):
+        vehicles = {str(word): word for word in vehicles}
+    named = {label: str(v) if isinstance(v, Path) else v for label, v in vehicles.items()}
     table, _ = compare_vehicles(options, named, [Path(path) for path in out])
     return table
 

@@ -26,7 +26,7 @@ from tuner.simulation.trajectory import with_named_reference
 
 def compare(
     options: Options,
-    vehicles: Sequence[str] | Mapping[str, VehicleFile],
+    vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
     out: Sequence[Path] = (),
 ) -> tuple[Table, Settings]:
     """Fly recordings with several vehicles, and tabulate how closely each meets them.
@@ -36,7 +36,7 @@ def compare(
     options
         Flights, controller, job file and topics; the vehicle's mass is each vehicle file's own.
     vehicles
-        Vehicle files or names of shipped ones; or name -> vehicle.
+        Vehicle files or names of shipped ones; or label -> one of those, or a vehicle.
     out
         Files to write, by suffix .csv, .json or .html.
 
@@ -56,14 +56,21 @@ def compare(
     if not vehicles:
         raise InputError("--vehicle", "names no vehicle", "name those to compare")
     if not isinstance(vehicles, Mapping):
-        vehicles = {w: read_vehicle(find_config("vehicles", w, Path())) for w in vehicles}
+        vehicles = {word: word for word in vehicles}
+    named = {label: _vehicle(said) for label, said in vehicles.items()}
     flights = flights_of(settings)
     offsets = {flight.name: offset_of(settings, flight.name) for flight in flights}
     comparison = Comparison(flights, settings.controller, offsets)
-    table = table_of({word: comparison.fly(vehicle) for word, vehicle in vehicles.items()})
+    table = table_of({word: comparison.fly(vehicle) for word, vehicle in named.items()})
     for path in out:
         write_table(table, path)
     return table, settings
+
+
+def _vehicle(said: str | VehicleFile) -> VehicleFile:
+    if isinstance(said, VehicleFile):
+        return said
+    return read_vehicle(find_config("vehicles", said, Path()))
 
 
 def flights_of(settings: Settings) -> tuple[Flight, ...]:

@@ -74,6 +74,8 @@ def run(
     from tuner.runtime import configure  # noqa: PLC0415 (jax starts here)
 
     configure()
+    from tuner.export.after_run import export_as_asked  # noqa: PLC0415
+    from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.identifiability import uncertainty as uncertainty_of  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.prepare import Job, prepare  # noqa: PLC0415
@@ -118,6 +120,10 @@ def run(
     write_folder(folder, result, vehicle, job)
     write_traces(folder, job.flights, *errors)
     render(folder)
+    for line in export_as_asked(
+        folder, settings.job.export, refly=refly, today=datetime.date.today()
+    ):
+        listener.message(line)
     return folder, result
 
 
