@@ -12,6 +12,7 @@ from tuner.cli.options import Quiet
 
 def export(
     run: Path,
+    /,
     *,
     format: Literal["yaml", "sdf", "px4"],  # noqa: A002 (the option's name)
     into: Path | None = None,
