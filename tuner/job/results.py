@@ -38,6 +38,7 @@ from tuner.result import (
 )
 from tuner.search.fitted import Fitted
 
+INERTIA = ("inertia_xx", "inertia_yy", "inertia_zz")
 METRICS_FILE = "metrics.csv"
 LIBRARIES = ("multirotor-tune", "jax", "jaxlib", "equinox", "optimistix", "numpy", "rosbags")
 UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
@@ -62,10 +63,23 @@ def best_values(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> dict[str,
     """Return the coefficients that are reported: the fitted ones, where they are identifiable."""
     start = values_of(job.settings.vehicle)
     found = job.space.values(fitted.point.coefficients)
+    kept = impossible(job, fitted)
     return {
-        name: float(value) if uncertainty.estimates[name].identifiable else start[name]
+        name: float(value)
+        if uncertainty.estimates[name].identifiable and name not in kept
+        else start[name]
         for name, value in found.items()
     }
+
+
+def impossible(job: Job, fitted: Fitted) -> tuple[str, ...]:
+    """Return the fitted moments of inertia, if together they are no rigid body's."""
+    found = job.space.values(fitted.point.coefficients)
+    start = values_of(job.settings.vehicle)
+    moments = {name: float(found.get(name, start[name])) for name in INERTIA}
+    if 2 * max(moments.values()) <= sum(moments.values()):
+        return ()
+    return tuple(name for name in INERTIA if name in found)
 
 
 def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
@@ -136,6 +150,7 @@ def _coefficients(
     if cutoff is not None:
         start.setdefault("gyro_cutoff", float(cutoff))
     best = best_values(job, fitted, uncertainty)
+    raw, kept = job.space.values(fitted.point.coefficients), impossible(job, fitted)
     bounds = {
         name: (parameter.lower * ratio, parameter.upper * ratio)
         for parameter in job.space.parameters
@@ -160,8 +175,13 @@ def _coefficients(
             upper=high,
             std_error=_finite(estimate.std_error),
             ci95=_interval(estimate.ci95),
-            identifiable=estimate.identifiable,
-            note=f"{estimate.verdict.value}: {estimate.reason}",
+            identifiable=estimate.identifiable and name not in kept,
+            note=(
+                f"kept as given: fitted to {float(raw[name]):.4g}, which with the other moments no "
+                "rigid body has"
+                if name in kept
+                else f"{estimate.verdict.value}: {estimate.reason}"
+            ),
         )
     return found
 

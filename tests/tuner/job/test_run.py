@@ -93,7 +93,7 @@ def test_the_folder_holds_what_later_commands_read(finished):
     assert "circle_4mps" in page
 
 
-SHORT = {"fit": ["inertia_zz", "moment_constant", "time_constant_up"], "mass": 2.243}
+SHORT = {"fit": ["inertia_zz", "moment_constant"], "vehicle": "hovergames_updated"}
 
 
 def short_job():
