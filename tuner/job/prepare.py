@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,8 +11,8 @@ from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients import Space, space_of
 from tuner.comparison.compare import flights_of
 from tuner.config import Settings
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight
+from tuner.errors import ConfigError, RecordingError
+from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.lanes import lanes_of, noise_of
 from tuner.objective.noise import CHANNELS
@@ -74,6 +74,7 @@ def prepare(settings: Settings) -> Job:
     InputError
         A recording cannot be read or used, or the job leaves nothing to fit.
     """
+    _refuse_what_is_not_built(settings)
     flights = flights_of(settings)
     held = set(settings.job.holdout)
     fitted = tuple(flight for flight in flights if flight.name not in held)
@@ -90,7 +91,8 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     noise = noise_of(fitted, channels)
     space = space_of(settings.vehicle, job)
     schedule = schedule_of(settings.controller)
-    lanes = lanes_of(fitted, noise=noise, weights=_weights(settings, fitted))
+    on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
+    lanes = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted))
     steps = max(len(flight.time) for flight in fitted) * schedule.log_rate
     objective = Objective(
         model=model_of(settings.vehicle, settings.controller),
@@ -101,6 +103,39 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
         limits=limits_for(fitted),
     )
     return Job(settings, fitted, held_out, noise, space, objective)
+
+
+def given_offset(settings: Settings, name: str) -> float | None:
+    """Return the s by which a flight's clocks are said to be late; None where that is fitted."""
+    own = settings.job.flights.get(name)
+    said = settings.job.time_offset if own is None or own.time_offset is None else own.time_offset
+    return None if said == "free" else float(said)
+
+
+def _shifted(flight: Flight, late: float) -> Flight:
+    """Return a flight whose measurements are stamped as if its clocks had not been late."""
+    if late == 0.0:
+        return flight
+    series = {
+        name: Series(one.time - late, one.values) if name in CHANNELS else one
+        for name, one in flight.series.items()
+    }
+    return replace(flight, series=series)
+
+
+def _refuse_what_is_not_built(settings: Settings) -> None:
+    """Say so rather than ignore a setting."""
+    method = settings.job.search.method
+    if method in ("cma", "hybrid"):
+        raise ConfigError("--method", f"'{method}' is not available yet", "use auto or gradient")
+    inlets = {"job": settings.job.inlet} | {
+        name: flight.inlet or "auto" for name, flight in settings.job.flights.items()
+    }
+    for name, inlet in inlets.items():
+        if inlet not in ("auto", "reference"):
+            raise ConfigError(
+                f"inlet of {name}", f"'{inlet}' is not available yet", "use auto or reference"
+            )
 
 
 def limits_for(flights: Sequence[Flight]) -> Limits:

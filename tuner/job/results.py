@@ -23,7 +23,7 @@ from tuner.config import (
 from tuner.config.yaml_file import write_text
 from tuner.flights.flight import Flight
 from tuner.identifiability import Uncertainty
-from tuner.job.prepare import Job
+from tuner.job.prepare import Job, given_offset
 from tuner.objective.lanes import CLOCKS
 from tuner.objective.normal import OFFSET_UNIT
 from tuner.result import (
@@ -85,7 +85,10 @@ def impossible(job: Job, fitted: Fitted) -> tuple[str, ...]:
 def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
     """Return flight -> s by which its pose stamps are late."""
     pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
-    return {flight.name: float(late) for flight, late in zip(job.fitted, pose, strict=True)}
+    found = {flight.name: given_offset(job.settings, flight.name) or 0.0 for flight in job.flights}
+    for flight, late in zip(job.fitted, pose, strict=True):
+        found[flight.name] += float(late)
+    return found
 
 
 def validate(

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.errors import InputError
-from tuner.job.prepare import Job
+from tuner.job.prepare import Job, given_offset
 from tuner.objective.normal import Objective, Point
 from tuner.search.fitted import Finding, Fitted, Iteration, Outcome
 from tuner.search.growing import (
@@ -87,18 +87,13 @@ def search(
         objective,
         legs,
         progress,
-        free_offsets=settings_of_offsets(job),
+        free_offsets=np.array([given_offset(job.settings, f.name) is None for f in job.fitted]),
         clipped=job.clipped,
         tell=keep,
     ):
         progress = reached
     spent += time.perf_counter() - clock
     return _fitted(job, legs[-1], progress, starts, wall_time=spent, findings=findings)
-
-
-def settings_of_offsets(job: Job) -> bool:
-    """Tell whether clock offsets are fitted."""
-    return job.settings.job.time_offset == "free"
 
 
 def starting_vectors(job: Job) -> NDArray[np.float64]:

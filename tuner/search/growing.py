@@ -157,7 +157,7 @@ def grow(
     legs: tuple[Leg, ...],
     progress: Progress,
     *,
-    free_offsets: bool,
+    free_offsets: NDArray[np.bool_],
     clipped: bool,
     tell: Callable[[Progress], None],
 ) -> Iterator[Progress]:
@@ -172,7 +172,7 @@ def grow(
     progress
         Where to begin: `beginning`, or what an earlier call yielded.
     free_offsets
-        Whether clock offsets may be fitted at all.
+        (F,) whether a flight's clock offsets may be fitted at all.
     clipped
         Whether rotors were clipped low in a recording: whether the rate integrator then stops is
         tried both ways, for set-ups differ in it and a saturated yaw step shows it.
@@ -196,7 +196,7 @@ def run_leg(
     objective: Objective,
     leg: Leg,
     progress: Progress,
-    free_offsets: bool,
+    free_offsets: NDArray[np.bool_],
     tell: Callable[[Progress], None],
 ) -> Progress:
     """Run one leg to its end for every start at once."""
@@ -205,7 +205,7 @@ def run_leg(
     best = int(np.argmin(progress.losses))
     stage = on_host(stage_of(leg, progress.scales, np.asarray(points.offsets[best])))
     count = len(objective.space)
-    free = np.concatenate([np.ones(count), kept.ravel() * float(leg.offsets and free_offsets)])
+    free = np.concatenate([np.ones(count), (kept * free_offsets).ravel() * float(leg.offsets)])
     step = progress.step
     if step is None:
         step = on_host(begin(objective, on_host(points), stage, free))

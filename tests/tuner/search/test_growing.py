@@ -20,7 +20,9 @@ def searched(fit, vectors, *, offsets=False):
     legs = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
     told = []
     progress = beginning(fit, np.asarray(vectors))
-    for state in grow(fit, legs, progress, free_offsets=offsets, clipped=False, tell=told.append):
+    for state in grow(
+        fit, legs, progress, free_offsets=np.full(2, offsets), clipped=False, tell=told.append
+    ):
         progress = state
     return progress, told
 
