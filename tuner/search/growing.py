@@ -181,15 +181,30 @@ def grow(
     """
     while progress.leg < len(legs):
         leg = legs[progress.leg]
-        after = run_leg(objective, leg, progress, free_offsets, tell)
-        if leg.horizon / objective.schedule.log_rate == FEEDBACK_AT and clipped:
-            other = replace(progress, feedback=1.0 - progress.feedback)
-            rival = run_leg(objective, leg, other, free_offsets, tell)
-            spent = after.evaluations + rival.evaluations - progress.evaluations
-            better = after if after.losses.min() <= FEEDBACK_GAIN * rival.losses.min() else rival
-            after = replace(better, evaluations=spent)
-        progress = after
+        tried = leg.horizon / objective.schedule.log_rate == FEEDBACK_AT and clipped
+        run = _both_ways if tried else run_leg
+        progress = run(objective, leg, progress, free_offsets, tell)
         yield progress
+
+
+def _both_ways(
+    objective: Objective,
+    leg: Leg,
+    progress: Progress,
+    free_offsets: NDArray[np.bool_],
+    tell: Callable[[Progress], None],
+) -> Progress:
+    """Run one leg with and without the mixer's saturation feedback, and keep the better."""
+    other = replace(progress, feedback=1.0 - progress.feedback)
+
+    def tell_of_rival(now: Progress) -> None:
+        tell(replace(now, feedback=progress.feedback))  # a checkpoint begins with both again
+
+    after = run_leg(objective, leg, progress, free_offsets, tell)
+    rival = run_leg(objective, leg, other, free_offsets, tell_of_rival)
+    spent = after.evaluations + rival.evaluations - progress.evaluations
+    better = after if after.losses.min() <= FEEDBACK_GAIN * rival.losses.min() else rival
+    return replace(better, evaluations=spent)
 
 
 def run_leg(
