@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +57,9 @@ def clean(
     """
     notes = []
 
-    def note(count: int, text: str) -> None:
+    def note(count: int, text: str, kind: Literal["info", "warning"] = "info") -> None:
         if count:
-            notes.append(Note("info", topic, f"{count} {signal} samples {text}", int(count)))
+            notes.append(Note(kind, topic, f"{count} {signal} samples {text}", int(count)))
 
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
@@ -84,35 +85,52 @@ def clean(
     time, values = time[~apart], values[~apart]
     time, values, doubles = _merge_equal_times(time, values)
     note(doubles, "with a stamp seen before dropped")
+    note(_missing(time), "seem to be missing between those recorded")
 
     if signal == "attitude":
         time, values, odd = _unit_quaternions(time, values)
         note(odd, "that are no unit quaternion dropped or normalised")
 
-    if signal in ("position", "attitude"):
-        stuck = frozen(time, values, HONEST[signal])
-        note(int(stuck.sum()), "repeat the one before while the vehicle moves: dropped")
-        away, lasting = excursions(time[~stuck], values[~stuck], HONEST[signal])
-        note(int(away.sum()), "jump away and back within a second: dropped")
-        if lasting:
-            text = f"the {signal} jumps {lasting} times and stays there: check the recording"
-            notes.append(Note("warning", topic, text, lasting))
-        time, values = time[~stuck][~away], values[~stuck][~away]
     if signal in HONEST:
-        outlier = np.zeros(values.shape, dtype=np.bool_)
-        for column in range(values.shape[1]):
-            measured = np.flatnonzero(np.isfinite(values[:, column]))
-            outlier[measured, column] = sticking_out(
-                time[measured], values[measured, column], HONEST[signal]
-            )
-        note(int(outlier.any(axis=1).sum()), "far from their neighbours dropped as outliers")
-        if one_per_row:
-            values = np.where(outlier, np.nan, values)
-            keep = np.isfinite(values).any(axis=1)
-        else:
-            keep = np.asarray(~outlier.any(axis=1))
-        time, values = time[keep], values[keep]
+        time, values = _without_outliers(signal, time, values, note)
     return time, values, tuple(notes)
+
+
+def _without_outliers(
+    signal: str, time: Array, values: Array, note: Callable[..., None]
+) -> tuple[Array, Array]:
+    """Drop what cannot be true, and note it."""
+    honest = HONEST[signal]
+    if signal in ("position", "attitude"):
+        stuck = frozen(time, values, honest)
+        note(int(stuck.sum()), "repeat the one before while the vehicle moves: dropped")
+        away, lasting = excursions(time[~stuck], values[~stuck], honest)
+        note(int(away.sum()), "jump away and back within a second: dropped")
+        note(lasting, "leap and do not come back: check the recording", kind="warning")
+        time, values = time[~stuck][~away], values[~stuck][~away]
+    outlier = np.zeros(values.shape, dtype=np.bool_)
+    for column in range(values.shape[1]):
+        measured = np.flatnonzero(np.isfinite(values[:, column]))
+        outlier[measured, column] = sticking_out(time[measured], values[measured, column], honest)
+    note(int(outlier.any(axis=1).sum()), "far from their neighbours dropped as outliers")
+    if signal == "rotor_speed":
+        values = np.where(outlier, np.nan, values)
+        keep = np.isfinite(values).any(axis=1)
+    else:
+        keep = np.asarray(~outlier.any(axis=1))
+    return time[keep], values[keep]
+
+
+def _missing(time: Array) -> int:
+    """Return how many samples a steady publisher lost; 0 where the rate is not steady."""
+    if len(time) < 20:
+        return 0
+    steps = np.diff(time)
+    usual = np.median(steps)
+    near = np.abs(steps - usual) < 0.5 * usual
+    if near.mean() < 0.75:
+        return 0
+    return int(np.sum(np.rint(steps[~near] / usual) - 1, where=steps[~near] > usual))
 
 
 def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int]:

@@ -13,6 +13,9 @@ from tuner.flights.recording import Clock, Nanoseconds, Recording, Request, Samp
 from tuner.flights.stamps import believe
 from tuner.flights.units import to_enu_flu, to_si
 
+#: Signals for which the time of recording is as good as a stamp.
+UNHURRIED = {"lap", "battery_voltage"}
+
 
 @dataclass(frozen=True)
 class Raw:
@@ -52,12 +55,20 @@ def extract(
         {topic: Request(tuple(names), clocks) for topic, names in wanted.items()}
     )
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
-    times, notes = believe(contents.samples, receive_only)
+    kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
+    unhurried = {topic for topic, held in kinds.items() if held <= UNHURRIED}
+    times, notes = believe(contents.samples, receive_only, unhurried)
     signals = {}
     for signal, place in places.items():
         samples = contents.samples.get(place.topic)
-        if samples is not None and len(samples.receive):
-            signals[signal] = Raw(place.topic, times[place.topic], _values(samples, signal, place))
+        if samples is None or not len(samples.receive):
+            continue
+        time, values = times[place.topic], _values(samples, signal, place)
+        if recording.format == "table":  # a row without the signal is no sample of it
+            there = np.isfinite(values).any(axis=1)
+            time, values = time[there], values[there]
+        if len(time):
+            signals[signal] = Raw(place.topic, time, values)
     return signals, contents.samples, (*contents.notes, *notes)
 
 

@@ -17,7 +17,7 @@ from tuner.flights.flight import SIGNALS, Array, Flight, Note, Series
 from tuner.flights.flight_cache import from_parquet, to_parquet
 from tuner.flights.initial import initial_state
 from tuner.flights.mission import Mission, yaw_spin
-from tuner.flights.resample import resample
+from tuner.flights.resample import GAP, resample
 from tuner.flights.sidecar import Sidecar, read_sidecar
 from tuner.flights.topics import TopicMap
 
@@ -62,6 +62,8 @@ def make_flight(
     if len(content.missions) > 1:
         text = f"mission {index + 1} of {len(content.missions)} in this recording"
         notes.append(Note("info", "", text, len(content.missions)))
+    signals = {name: _on_clock(name, around[name], clock, ticks) for name in own}
+    notes.extend(_gaps(signals, rate))
     rates = own.get("rate_setpoint")
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
@@ -69,13 +71,30 @@ def make_flight(
         sha256=sha256,
         rate=rate,
         time=clock,
-        signals={name: _on_clock(name, around[name], clock, ticks) for name in own},
+        signals=signals,
         series=own,
         initial=initial_state(around),
         yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
         trajectory=sidecar.trajectory.model_dump() if sidecar.trajectory else None,
         notes=tuple(notes),
     )
+
+
+def _gaps(signals: Mapping[str, Array], rate: float) -> list[Note]:
+    """Say where a signal is unknown for longer than at the ends of its recording."""
+    notes = []
+    for name, values in signals.items():
+        if SIGNALS[name][2] == "hold":
+            continue
+        known = np.isfinite(values).any(axis=1)
+        unknown = int((~known).sum())
+        if unknown > GAP * rate:
+            edges = np.diff(np.concatenate([[0], ~known, [0]]).astype(np.int8))
+            runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
+            longest = runs.max() / rate
+            text = f"{name} is unknown for {unknown / rate:.2f} s, {longest:.2f} s at a time"
+            notes.append(Note("warning", "", text, unknown))
+    return notes
 
 
 def _mission_grid(series: Mapping[str, Series], mission: Mission, rate: float) -> Grid | None:

@@ -62,16 +62,23 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
         if not whole:
             for start, end in spans:
                 for up, down in flying:
-                    begin = max(start, up)
-                    missions.append(Mission(begin, min(end, down, last), "attitude set-points"))
+                    if start < up:  # they began on the ground
+                        begin, told_by = _motion_or_flight(series, up, min(end, down))
+                    else:
+                        begin, told_by = start, "attitude set-points"
+                    missions.append(Mission(begin, min(end, down, last), told_by))
             return _long_enough(missions)
         flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
     for up, down in flying:
-        moves = _first_motion(series, up, down)
-        told_by = "the reference's motion" if moves > up else "flight"
+        begin, told_by = _motion_or_flight(series, up, down)
         end = min(down, last, _reference_end(series, last))
-        missions.append(Mission(max(moves, up), end, told_by))
+        missions.append(Mission(begin, end, told_by))
     return _long_enough(missions)
+
+
+def _motion_or_flight(series: Mapping[str, Series], up: float, down: float) -> tuple[float, str]:
+    moves = _first_motion(series, up, down)
+    return (moves, "the reference's motion") if moves > up else (up, "flight")
 
 
 def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
@@ -118,31 +125,29 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     """
     position = series["position"]
     time, height = position.time, position.values[:, 2]
-    idle = _idle(series, time)
-    if idle is None:
-        idle = _resting(time, height)
-    if not idle.any():
+    idle, told = _idle(series, time)
+    grounded = idle | (_resting(time, height) & ~told)
+    if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
-    ground = _ground(time, height, idle)
-    return _stretches(time, ~idle & (height > ground + CLEAR))
+    ground = _ground(time, height, grounded)
+    return _stretches(time, ~grounded & (height > ground + CLEAR))
 
 
-def _idle(series: Mapping[str, Series], time: Array) -> NDArray[np.bool_] | None:
-    """Tell at which times the motors idle; None where nothing recorded tells."""
+def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tell at which times the motors idle, and at which times anything tells."""
     for name, limit in (
         ("command", IDLE), ("rotor_speed", IDLE_SPEED), ("thrust_setpoint", IDLE),
     ):  # fmt: skip
         if name in series and len(series[name].time) > 1:
             own = series[name]
             known = np.isfinite(own.values).any(axis=1)
-            level = np.nanmean(own.values[known], axis=1)
-            at = np.interp(time, own.time[known], level)
-            inside = (time >= own.time[0] - PAUSE) & (time <= own.time[-1] + PAUSE)
-            if name == "thrust_setpoint":
-                # Set-points that pause say nothing of the motors.
-                inside = (time >= own.time[0]) & (time <= own.time[-1])
-            return np.asarray(inside & (at < limit), dtype=np.bool_)
-    return None
+            if not known.any():
+                continue
+            at = np.interp(time, own.time[known], np.nanmean(own.values[known], axis=1))
+            told = (time >= own.time[0] - MOMENT) & (time <= own.time[-1] + MOMENT)
+            return told & np.asarray(at < limit, dtype=np.bool_), told
+    nothing = np.zeros(len(time), dtype=np.bool_)
+    return nothing, nothing
 
 
 def _resting(time: Array, height: Array) -> NDArray[np.bool_]:

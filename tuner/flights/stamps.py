@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +19,9 @@ APART = SECOND // 2
 
 
 def believe(
-    samples: Mapping[str, Samples], receive_only: Collection[str] = ()
+    samples: Mapping[str, Samples],
+    receive_only: Collection[str] = (),
+    unhurried: Collection[str] = (),
 ) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:
     """Return the times of every topic's messages, all on one clock.
 
@@ -33,6 +36,8 @@ def believe(
         Topic -> messages.
     receive_only
         Topics whose stamps are not to be used.
+    unhurried
+        Topics for which the time of recording is as good as a stamp.
     """
     notes: list[Note] = []
     unset: list[str] = []
@@ -63,7 +68,8 @@ def believe(
                 notes.append(Note("warning", topic, text, len(of.receive)))
             elif topic not in receive_only:
                 text = "has no header: its times are those of recording"
-                notes.append(Note("info", topic, text, len(of.receive)))
+                kind: Literal["info", "warning"] = "info" if topic in unhurried else "warning"
+                notes.append(Note(kind, topic, text, len(of.receive)))
     return times, tuple(notes)
 
 
