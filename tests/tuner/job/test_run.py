@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tuner.config import Options, read_vehicle, values_of
+from tuner.comparison.errors import Comparison
+from tuner.config import ControllerFile, Options, read_vehicle, values_of
 from tuner.errors import InputError
+from tuner.flights.load import load_flight
 from tuner.job.run import SILENT, Listener, run
 from tuner.report import render
 
@@ -91,6 +93,18 @@ def test_the_folder_holds_what_later_commands_read(finished):
     assert len(page) < 5_000_000
     assert "http://" not in page.split('id="library"')[0]
     assert "circle_4mps" in page
+
+
+@pytest.mark.slow
+def test_a_run_started_from_best_fit_starts_where_the_fit_ended(finished):
+    folder, result = finished
+    controller = ControllerFile.model_validate(result.settings["controller"])
+    flights = [load_flight(flight.path) for flight in result.flights]
+    offsets = {flight.name: flight.time_offset for flight in result.flights}
+    flown = Comparison(flights, controller, offsets).fly(read_vehicle(folder / "best_fit.yaml"))
+    for flight in result.flights:
+        for axis, value in flight.rmse_best:
+            assert getattr(flown[flight.name].rmse, axis) == pytest.approx(value, rel=1e-9)
 
 
 SHORT = {"fit": ["inertia_zz", "moment_constant"], "vehicle": "hovergames_updated"}
