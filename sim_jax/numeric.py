@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TypeAlias
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
@@ -47,3 +48,17 @@ def safe_divide(numerator: Scalar, denominator: Scalar) -> Scalar:
     """Divide, giving zero with derivative zero where the denominator is zero."""
     nonzero = denominator != 0
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1.0), 0.0)
+
+
+@jax.custom_batching.custom_vmap
+def anyone(flags: Flag) -> Bool[Array, ""]:
+    """Tell whether any vehicle is flagged, those of an outer `jax.vmap` included.
+
+    One truth value for all, so that a `lax.cond` on it remains a branch under `jax.vmap`.
+    """
+    return jnp.any(flags)
+
+
+@anyone.def_vmap
+def _(_: int, __: list[bool], flags: Flag) -> tuple[Bool[Array, ""], bool]:
+    return anyone(flags), False

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,6 +32,8 @@ from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switc
 from sim_jax.state import Setpoints, Start, State, first_state
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
+
+T = TypeVar("T")
 
 
 class Sample(eqx.Module):
@@ -100,15 +105,14 @@ class _Plant(eqx.Module):
         )
 
     def _estimate(self, state: State, step: Int[Array, ""]) -> tuple[Vec3, Vec3, Quaternion]:
+        motion = state.motion
         if state.estimates is None:
-            motion = state.motion
             return motion.position, motion.velocity, motion.attitude
         age = self.vehicle.setup.estimate_latency * self.schedule.physics_rate
         if self.schedule.pose_rate is not None:
             poses = step * self.schedule.step * self.schedule.pose_rate
             held = (poses - jnp.floor(poses + 1e-9)) / self.schedule.pose_rate
             age = age + held * self.schedule.physics_rate
-        age = jnp.broadcast_to(age, state.crash_time.shape)
         return unpacked(look_back(state.estimates, step, age))
 
     def stabilise(self, state: State) -> State:
@@ -131,54 +135,48 @@ class _Plant(eqx.Module):
             saturation=mixer.saturation(controller.mixer, state.command),
             step=1.0 / rate_hz,
         )
-        command = mixer.mix(controller.mixer, torque, state.setpoints.thrust)
+        flying = ~jnp.isfinite(state.crash_time)
+        command = mixer.mix(controller.mixer, torque, state.setpoints.thrust, counts=flying)
         return _replace(state, gyro=gyro, integral=integral, command=command)
 
-    def control(self, state: State, step: Int[Array, ""]) -> State:
-        """Run every controller that is due at a physics step, before the physics of that step."""
-        if state.estimates is not None:
-            estimates = push(state.estimates, packed(state.motion), step)
-            state = _replace(state, estimates=estimates)
-        if isinstance(self.inlet, ReferenceInlet):
-            schedule = self.schedule
-            if schedule.position_control_rate == schedule.physics_rate:
-                setpoints = self.steer(state, step)
-            else:
-                setpoints = lax.cond(
-                    schedule.control_due(step),
-                    lambda: self.steer(state, step),
-                    lambda: state.setpoints,
-                )
-            state = _replace(state, setpoints=setpoints)
-        elif isinstance(self.inlet, BodyRateInlet):
+    def setpoints(self, state: State, step: Int[Array, ""]) -> Setpoints:
+        """Return what the rate controller is to follow: from position control or the inlet."""
+        if isinstance(self.inlet, BodyRateInlet):
             given = Setpoints(self.inlet.rate, self.inlet.thrust)
-            state = _replace(state, setpoints=_like(_row(given, step), state.setpoints))
-        if isinstance(self.inlet, ReferenceInlet | BodyRateInlet):
-            if self.schedule.rate_control_rate == self.schedule.physics_rate:
-                state = self.stabilise(state)
-            else:
-                state = lax.cond(
-                    self.schedule.rate_due(step), lambda: self.stabilise(state), lambda: state
-                )
-        elif isinstance(self.inlet, ActuatorInlet):
+            return _like(_row(given, step), state.setpoints)
+        if not isinstance(self.inlet, ReferenceInlet):
+            return state.setpoints
+        if self.schedule.block_rate == self.schedule.position_control_rate:
+            return self.steer(state, step)
+        due = self.schedule.control_due(step)
+        aimed: Setpoints = lax.cond(due, lambda: self.steer(state, step), lambda: state.setpoints)
+        return aimed
+
+    def command(self, state: State, step: Int[Array, ""]) -> State:
+        """Bring the motor commands up to date, by rate control or from the inlet."""
+        if isinstance(self.inlet, BodyRateInlet):
+            state = _replace(state, setpoints=self.setpoints(state, step))
+        if isinstance(self.inlet, ActuatorInlet):
             command = _like(_row(self.inlet.command, step), state.command)
-            state = _replace(state, command=command)
-        if state.commands is not None:
-            commands = push(state.commands, jnp.stack(state.command), step)
-            state = _replace(state, commands=commands)
-        return state
+            return _replace(state, command=command)
+        if isinstance(self.inlet, RotorSpeedInlet):
+            return state
+        if self.schedule.rate_control_rate == self.schedule.physics_rate:
+            return self.stabilise(state)
+        due = self.schedule.rate_due(step)
+        commanded: State = lax.cond(due, lambda: self.stabilise(state), lambda: state)
+        return commanded
 
     def _spin_up(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor, PerRotor]:
         """Return the rotor speeds after this step and those that act during it, in rad/s."""
         if isinstance(self.inlet, RotorSpeedInlet):
             now = _like(_row(self.inlet.speed, step), state.rotor_speed)
-            after = _like(_row(self.inlet.speed, step + 1), state.rotor_speed)
-            a, b, c, d = (0.5 * (old + new) for old, new in zip(now, after, strict=True))
-            return after, (a, b, c, d)
+            later = _like(_row(self.inlet.speed, step + 1), state.rotor_speed)
+            a, b, c, d = (0.5 * (old + new) for old, new in zip(now, later, strict=True))
+            return later, (a, b, c, d)
         motor = self.vehicle.motor
         if isinstance(self.lag, SwitchedLag) and state.commands is not None:
             age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
-            age = jnp.broadcast_to(age, state.crash_time.shape)
             before, after = switched(state.commands, step, age)
             moves = [
                 self.lag.advance(speed, reference_speed(motor, old), reference_speed(motor, new))
@@ -195,7 +193,7 @@ class _Plant(eqx.Module):
         return speeds, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
 
     def physics(self, state: State, step: Int[Array, ""]) -> State:
-        """Advance rotors and body by one step; a vehicle that breaks the limits stays frozen."""
+        """Advance rotors and body by one step."""
         speeds, acting = self._spin_up(state, step)
 
         def wrench_at(rotation: Matrix3, velocity: Vec3, body_rate: Vec3) -> Wrench:
@@ -212,29 +210,76 @@ class _Plant(eqx.Module):
         motion = advance(
             self.vehicle.body, state.motion, wrench_at, self.schedule.step, gravity=self.gravity
         )
-        broken = self.limits.broken_by(motion) | jnp.isfinite(state.crash_time)
+        return _replace(state, motion=motion, rotor_speed=speeds)
 
-        def frozen(old: Array, new: Array) -> Array:
-            return jnp.where(broken, old, new)
+    def step(self, state: State, step: Int[Array, ""]) -> State:
+        """Advance by one physics step, rate control before it; remember what is seen later."""
+        state = self.command(state, step)
+        if state.commands is not None:
+            commands = push(state.commands, jnp.stack(state.command), step)
+            state = _replace(state, commands=commands)
+        state = self.physics(state, step)
+        if state.estimates is not None:
+            estimates = push(state.estimates, packed(state.motion), step + 1)
+            state = _replace(state, estimates=estimates)
+        return state
 
-        now = (step + 1) * self.schedule.step
-        first = jnp.where(jnp.isfinite(state.crash_time), state.crash_time, now)
-        return _replace(
-            state,
-            motion=jax.tree.map(frozen, state.motion, motion),
-            rotor_speed=jax.tree.map(frozen, state.rotor_speed, speeds),
-            crash_time=jnp.where(broken, first, state.crash_time).astype(state.crash_time.dtype),
+    def block(self, state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
+        """Run position control, then the physics up to its next tick.
+
+        Returns the next state and what is to be logged for the time before it. A vehicle that
+        breaks the limits stays as it was at the last tick.
+        """
+        schedule, start = self.schedule, state
+        count = schedule.steps_per_block
+        gone = jnp.isfinite(state.crash_time)
+        setpoints = self.setpoints(state, number * count)
+        state = _replace(state, setpoints=_where(gone, start.setpoints, setpoints))
+
+        def one(offset: Int[Array, ""], carried: tuple[State, PerRotor]) -> tuple[State, PerRotor]:
+            before, command = carried
+            after = self.step(before, number * count + offset)
+            return after, _where(offset == 0, after.command, command)
+
+        end, command = _repeat(count, one, (state, state.command))
+        row = Sample(
+            start.motion, start.rotor_speed, _where(gone, start.command, command), state.setpoints
         )
+        broken = gone | self.limits.broken_by(end.motion)
+        now = (number + 1) / schedule.block_rate
+        crash_time = jnp.where(broken & ~gone, now, start.crash_time).astype(start.crash_time.dtype)
+        kept = _where(broken, _flight(state), _flight(end))
+        return _replace(end, **kept, crash_time=crash_time), row
 
-    def until_next_sample(self, state: State, sample: Int[Array, ""]) -> State:
-        """Advance from one logged sample to the next."""
-        count = self.schedule.steps_per_sample
+    def sample(self, state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
+        """Advance to the next sample; return the state there and what is logged for before."""
+        count = self.schedule.blocks_per_sample
+        if count == 1:
+            return self.block(state, number)
 
-        def one(state: State, offset: Int[Array, ""]) -> tuple[State, None]:
-            step = sample * count + offset
-            return self.control(self.physics(state, step), step + 1), None
+        def one(state: State, offset: Int[Array, ""]) -> tuple[State, Sample]:
+            return self.block(state, number * count + offset)
 
-        return lax.scan(one, state, jnp.arange(count))[0]
+        state, rows = lax.scan(one, state, jnp.arange(count))
+        return state, jax.tree.map(lambda leaf: leaf[0], rows)
+
+
+def _flight(state: State) -> dict[str, PyTree[Array]]:
+    """Return what stays as it is once a vehicle has crashed."""
+    names = ("motion", "rotor_speed", "integral", "gyro", "command")
+    return {name: getattr(state, name) for name in names}
+
+
+def _where(flag: Array, first: T, second: T) -> T:
+    chosen: T = jax.tree.map(lambda a, b: jnp.where(flag, a, b), first, second)
+    return chosen
+
+
+def _repeat(count: int, body: Callable[[Array, T], T], start: T) -> T:
+    if count == 1:
+        return body(jnp.asarray(0), start)
+    end: T = lax.fori_loop(0, count, body, start)
+    return end
 
 
 def _frd(flu: Vec3) -> Vec3:
@@ -245,8 +290,9 @@ def _row(tree: PyTree[Array], index: Int[Array, ""]) -> PyTree[Array]:
     return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, keepdims=False), tree)
 
 
-def _like(tree: PyTree[Array], other: PyTree[Array]) -> PyTree[Array]:
-    return jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), tree, other)
+def _like(tree: PyTree[Array], other: T) -> T:
+    same: T = jax.tree.map(lambda a, b: jnp.broadcast_to(a, b.shape).astype(b.dtype), tree, other)
+    return same
 
 
 def _replace(state: State, **changes: object) -> State:
@@ -329,30 +375,23 @@ def rollout(
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
     state = first_state(start, schedule, plant.gyro, shape)
-    state = plant.control(state, jnp.asarray(0))
 
-    def sample_of(state: State) -> Sample:
-        return Sample(state.motion, state.rotor_speed, state.command, state.setpoints)
+    def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
+        return plant.sample(state, number)
 
     if horizon is None:
-
-        def scanned(state: State, sample: Int[Array, ""]) -> tuple[State, Sample]:
-            return plant.until_next_sample(state, sample), sample_of(state)
-
-        state, log = lax.scan(scanned, state, jnp.arange(samples))
+        state, log = lax.scan(sample, state, jnp.arange(samples))
         return Rollout(log, state.crash_time)
 
-    def logged(sample: Int[Array, ""], carried: tuple[State, Sample]) -> tuple[State, Sample]:
+    def logged(number: Int[Array, ""], carried: tuple[State, Sample]) -> tuple[State, Sample]:
         state, log = carried
+        state, row = sample(state, number)
         log = jax.tree.map(
-            lambda rows, now: lax.dynamic_update_index_in_dim(rows, now, sample, 0),
-            log,
-            sample_of(state),
+            lambda rows, now: lax.dynamic_update_index_in_dim(rows, now, number, 0), log, row
         )
-        return plant.until_next_sample(state, sample), log
+        return state, log
 
-    empty = jax.tree.map(
-        lambda leaf: jnp.zeros((samples, *leaf.shape), leaf.dtype), sample_of(state)
-    )
+    row = jax.eval_shape(sample, state, jnp.asarray(0))[1]
+    empty = jax.tree.map(lambda leaf: jnp.zeros((samples, *leaf.shape), leaf.dtype), row)
     state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, (state, empty))
     return Rollout(log, state.crash_time)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import lcm
 from typing import Literal
 
 import equinox as eqx
@@ -45,9 +46,23 @@ class Schedule(eqx.Module):
         return 1.0 / self.physics_rate
 
     @property
-    def steps_per_sample(self) -> int:
-        """Physics steps from one logged sample to the next."""
-        return self.physics_rate // self.log_rate
+    def block_rate(self) -> int:
+        """Hz of the outer loop, on whose ticks position control runs and samples are logged.
+
+        The slowest such rate; that of physics where the two do not fit into it.
+        """
+        both = lcm(self.position_control_rate, self.log_rate)
+        return self.physics_rate if self.physics_rate % both else both
+
+    @property
+    def steps_per_block(self) -> int:
+        """Physics steps in one turn of the outer loop."""
+        return self.physics_rate // self.block_rate
+
+    @property
+    def blocks_per_sample(self) -> int:
+        """Turns of the outer loop from one logged sample to the next."""
+        return self.block_rate // self.log_rate
 
     def control_tick(self, step: Int[Array, ""]) -> Int[Array, ""]:
         """Return the number of the position controller's tick that is current at a physics step."""

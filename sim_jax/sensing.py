@@ -21,21 +21,6 @@ def history_length(longest: float, step: float) -> int:
     return ceil(longest / step - 1e-9) + 2
 
 
-def _weights(length: int, cursor: Int[Array, ""], age: Scalar) -> Float[Array, "length *batch"]:
-    """Return the share of each slot in a linear interpolation at a continuous age in steps.
-
-    The slot at ``cursor`` is the newest. Right-sided derivative at whole steps, and the shares and
-    their derivatives always sum to one and to zero.
-    """
-    ages = (cursor - jnp.arange(length)) % length
-    ages = ages.reshape((length,) + (1,) * jnp.ndim(age))
-    apart = age - ages
-    rising, falling = 1.0 + apart, 1.0 - apart
-    share = jnp.where(apart < 0, rising, falling)
-    weights: Array = jnp.where((apart < -1) | (apart >= 1), 0.0, share)
-    return weights
-
-
 def push(
     history: Float[Array, "length rows *batch"],
     values: Float[Array, "rows *batch"],
@@ -46,12 +31,34 @@ def push(
     return written
 
 
+def _slot(
+    history: Float[Array, "length rows *batch"], step: Int[Array, ""], back: Scalar
+) -> Float[Array, "rows *batch"]:
+    """Read the values written ``back`` whole steps ago; no further back than there are slots.
+
+    What all vehicles share is one slot; if each has its own, all slots are gone through.
+    """
+    length = history.shape[0]
+    back = jnp.clip(lax.stop_gradient(back), 0, length - 1)
+    if jnp.ndim(back) == 0:
+        index = (step - back.astype(step.dtype)) % length
+        shared: Array = lax.dynamic_index_in_dim(history, index, 0, keepdims=False)
+        return shared
+    ages = (step - jnp.arange(length)) % length
+    ages = ages.reshape((length,) + (1,) * jnp.ndim(back))
+    return jnp.sum(jnp.where(ages == back, 1.0, 0.0)[:, None] * history, axis=0)
+
+
 def look_back(
     history: Float[Array, "length rows *batch"], step: Int[Array, ""], age: Scalar
 ) -> Float[Array, "rows *batch"]:
-    """Read a delay line ``age`` steps back, fractions interpolated linearly."""
-    weights = _weights(history.shape[0], step % history.shape[0], age)
-    return jnp.sum(history * weights[:, None], axis=0)
+    """Read a delay line ``age`` steps back, fractions interpolated linearly.
+
+    At whole steps the derivative is that of greater ages.
+    """
+    whole = jnp.floor(lax.stop_gradient(age))
+    newer, older = _slot(history, step, whole), _slot(history, step, whole + 1.0)
+    return newer + (age - whole) * (older - newer)
 
 
 def switched(
@@ -62,15 +69,8 @@ def switched(
     Returns the value at the start of the step, and the one that replaces it when a fraction
     age - ⌊age⌋ of the step has passed.
     """
-    length = history.shape[0]
-    ages = (step - jnp.arange(length)) % length
-    ages = ages.reshape((length,) + (1,) * jnp.ndim(age))
     whole = jnp.floor(lax.stop_gradient(age))
-
-    def at(back: Scalar) -> Float[Array, "rows *batch"]:
-        return jnp.sum(jnp.where(ages == back, 1.0, 0.0)[:, None] * history, axis=0)
-
-    return at(whole + 1.0), at(whole)
+    return _slot(history, step, whole + 1.0), _slot(history, step, whole)
 
 
 def packed(motion: Motion) -> Float[Array, "10 *batch"]:

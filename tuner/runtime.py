@@ -69,7 +69,8 @@ def _flags() -> dict[str, str]:
     return flags
 
 
-def _set_environment() -> None:
+def set_environment() -> None:
+    """Set what jax reads from the environment when it makes its devices."""
     os.environ.setdefault("NPROC", "1")
     # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
@@ -95,7 +96,7 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
         Keep compiled code in the user's cache folder, so that the same job starts at once the next
         time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
     """
-    _set_environment()
+    set_environment()
     import jax  # noqa: PLC0415 (must come after the environment, and is slow)
 
     if "JAX_ENABLE_X64" not in os.environ:

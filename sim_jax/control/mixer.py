@@ -22,7 +22,7 @@ from sim_jax.control.desaturation import (
 )
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
-from sim_jax.numeric import Flag, Scalar, larger, magnitude, saturate, smaller
+from sim_jax.numeric import Flag, Scalar, anyone, larger, magnitude, saturate, smaller
 from sim_jax.vector import Vec3
 
 __all__ = ["PerRotor", "mix", "saturation"]
@@ -59,6 +59,11 @@ def _thrust_limits(yaw: Scalar, ahead: Scalar, across: Scalar) -> tuple[Scalar, 
     return larger(ahead - yaw, across + yaw), 1.0 - larger(ahead + yaw, across - yaw)
 
 
+def _sum(roll: Scalar, pitch: Scalar, yaw: Scalar, thrust: Scalar) -> PerRotor:
+    up, down = thrust + yaw, thrust - yaw
+    return up + (pitch - roll), up - (pitch - roll), down + (pitch + roll), down - (pitch + roll)
+
+
 def _outputs(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
     roll, pitch, yaw = torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z
     if airmode == 0:  # thrust may only be reduced; then roll, then pitch give way
@@ -79,8 +84,7 @@ def _outputs(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
     else:  # yaw gives way, then thrust
         yaw = _balanced(yaw, *_yaw_limits(thrust, ahead, across, YAW_HEADROOM))
         thrust = _reduced(thrust, *_thrust_limits(yaw, ahead, across))
-    up, down = thrust + yaw, thrust - yaw
-    return up + (pitch - roll), up - (pitch - roll), down + (pitch + roll), down - (pitch + roll)
+    return _sum(roll, pitch, yaw, thrust)
 
 
 def _quantised(command: Scalar) -> Scalar:
@@ -89,7 +93,28 @@ def _quantised(command: Scalar) -> Scalar:
     return command + jax.lax.stop_gradient((pulse - 1000.0) * 1e-3 - command)
 
 
-def mix(settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
+def _outside(outputs: PerRotor) -> Flag:
+    flags = [(out < 0.0) | (out > 1.0) for out in outputs]
+    return flags[0] | flags[1] | flags[2] | flags[3]
+
+
+def _desaturated_where_needed(
+    airmode: int, torque: Vec3, thrust: Scalar, counts: Flag | bool
+) -> PerRotor:
+    """Mix; desaturation, which is most of the work, is left out while no vehicle saturates."""
+    level = _sum(torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, jnp.zeros_like(thrust), thrust)
+    plain = _sum(torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z, thrust)
+    mixed: PerRotor = jax.lax.cond(
+        anyone((_outside(level) | _outside(plain)) & counts),
+        lambda: _outputs(airmode, torque, thrust),
+        lambda: plain,
+    )
+    return mixed
+
+
+def mix(
+    settings: MixerSettings, torque: Vec3, thrust: Scalar, *, counts: Flag | bool = True
+) -> PerRotor:
     """Return four motor commands in 0..1.
 
     Parameters
@@ -100,6 +125,8 @@ def mix(settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
         Normalised torque set-point, FRD; each axis counts up to ±1.
     thrust
         Normalised collective thrust; counts from 0 to 1.
+    counts
+        Whether anybody looks at a vehicle's commands; if not, they may lack desaturation.
     """
     within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
     thrust = saturate(thrust, 0.0, 1.0)
@@ -107,7 +134,7 @@ def mix(settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
     if settings.single_precision:
         outputs = desaturated(rounded, settings.airmode, within, thrust)
     else:
-        outputs = _outputs(settings.airmode, within, thrust)
+        outputs = _desaturated_where_needed(settings.airmode, within, thrust, counts)
     if settings.thrust_factor > 0:
         a, b, c, d = (linearised(rounded, out, settings.thrust_factor) for out in outputs)
         outputs = (a, b, c, d)

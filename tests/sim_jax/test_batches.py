@@ -1,0 +1,164 @@
+"""One vehicle, a batch, a vmapped batch: the same numbers, whatever the others do."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from sim_jax.control import mixer
+from sim_jax.control.gains import Filters, MixerSettings
+from sim_jax.control.position import ReferencePoint
+from sim_jax.crash import Limits
+from sim_jax.inlet import ActuatorInlet, ReferenceInlet
+from sim_jax.rollout import Rollout, rollout
+from sim_jax.schedule import Schedule
+from sim_jax.sensing import look_back, push
+from sim_jax.state import hover
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Setup
+from tests.golden_check.coefficients import golden_vehicle
+from tests.golden_check.controllers import golden_controller
+
+CONTROLLER = golden_controller(Filters(jnp.asarray(40.0), jnp.asarray(20.0)), MixerSettings())
+DELAYED = Schedule(longest_estimate_latency=0.03, longest_actuator_latency=0.01)
+VEHICLE = eqx.tree_at(
+    lambda v: v.setup,
+    golden_vehicle("new"),
+    Setup(jnp.asarray(0.012), jnp.asarray(0.003)),
+)
+SAMPLES = 70
+TARGETS = [0.0, 0.4, 0.9, 40.0]
+LIMITS = Limits(half_width=1.3)
+
+
+def steps_to(target: Array) -> ReferenceInlet:
+    """Return a reference that jumps along x from 0 to each target after 0.1 s."""
+    ticks = jnp.arange(SAMPLES)
+    x = jnp.where(ticks[:, None] > 10, target, 0.0) if jnp.ndim(target) else ticks * 0.0 + target
+    zero = Vec3.zeros(x)
+    return ReferenceInlet(ReferencePoint(Vec3(x, x * 0.0, x * 0.0 + 1.0), zero, zero))
+
+
+def fly(target: Array, schedule: Schedule = DELAYED, **options: object) -> Rollout:
+    start = hover(VEHICLE, Vec3(*jnp.asarray([0.0, 0.0, 1.0])))
+    inlet = steps_to(target)
+    return rollout(VEHICLE, CONTROLLER, schedule, inlet, start, samples=SAMPLES, **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def batch() -> Rollout:
+    """Vehicles that stay, go, saturate, and crash into a narrow wall."""
+    return eqx.filter_jit(fly)(jnp.asarray(TARGETS), limits=LIMITS)
+
+
+def test_the_batch_holds_a_crash_and_flights(batch: Rollout) -> None:
+    assert batch.crashed.tolist() == [False, False, False, True]
+    assert all(bool(jnp.all(jnp.isfinite(leaf))) for leaf in jax.tree.leaves(batch.log))
+
+
+def test_neighbours_change_nothing(batch: Rollout) -> None:
+    alone = eqx.filter_jit(fly)
+    for index, target in enumerate(TARGETS):
+        single = alone(jnp.asarray([target]), limits=LIMITS)
+        for got, want in zip(jax.tree.leaves(single), jax.tree.leaves(batch), strict=True):
+            np.testing.assert_allclose(got[..., 0], want[..., index], rtol=1e-9, atol=1e-9)
+
+
+def test_vmap_gives_the_same(batch: Rollout) -> None:
+    mapped = eqx.filter_jit(jax.vmap(lambda x: fly(x[None], limits=LIMITS)))
+    flown = mapped(jnp.asarray(TARGETS))
+    for got, want in zip(jax.tree.leaves(flown), jax.tree.leaves(batch), strict=True):
+        np.testing.assert_allclose(jnp.moveaxis(got, 0, -1)[..., 0, :], want, rtol=1e-9, atol=1e-9)
+
+
+def test_a_crashed_vehicle_stays_where_it_crashed(batch: Rollout) -> None:
+    crash = float(batch.crash_time[3])
+    at = round(crash * DELAYED.log_rate)
+    x = np.asarray(batch.log.motion.position.x[:, 3])
+    assert 0 < at < SAMPLES
+    assert np.ptp(x[at:]) == 0.0
+    assert np.all(np.abs(x) <= 1.3)
+    assert np.ptp(x[:at]) > 0.1
+
+
+def test_a_horizon_flies_the_beginning() -> None:
+    whole = eqx.filter_jit(fly)(jnp.asarray([0.5]))
+    part = eqx.filter_jit(fly)(jnp.asarray([0.5]), horizon=jnp.asarray(25))
+    for got, want in zip(jax.tree.leaves(part.log), jax.tree.leaves(whole.log), strict=True):
+        np.testing.assert_allclose(got[:25], want[:25], rtol=1e-12, atol=1e-12)
+        assert not np.any(got[25:])
+
+
+@pytest.mark.parametrize("log_rate", [50, 400])
+def test_logging_more_or_less_often_changes_nothing(log_rate: int) -> None:
+    usual = eqx.filter_jit(fly)(jnp.asarray([0.5])).log
+    schedule = Schedule(
+        log_rate=log_rate, longest_estimate_latency=0.03, longest_actuator_latency=0.01
+    )
+    other = eqx.filter_jit(fly)(jnp.asarray([0.5]), schedule).log
+    ours, theirs = max(1, 100 // log_rate), max(1, log_rate // 100)
+    for got, want in zip(jax.tree.leaves(other), jax.tree.leaves(usual), strict=True):
+        rows = min(len(got[::theirs]), len(want[::ours]))
+        np.testing.assert_allclose(got[::theirs][:rows], want[::ours][:rows], atol=1e-12)
+
+
+def test_control_rates_that_do_not_divide_still_fly() -> None:
+    schedule = Schedule(physics_rate=400, rate_control_rate=250, position_control_rate=30)
+    zero = jnp.zeros(1)
+    assert schedule.steps_per_block == 1
+    hovering = eqx.filter_jit(fly)(zero, schedule)
+    assert not bool(hovering.crashed[0])
+    np.testing.assert_allclose(hovering.log.motion.position.z, 1.0, atol=0.2)
+
+
+def test_commands_from_the_inlet_are_logged_when_they_act() -> None:
+    wanted = jnp.linspace(0.4, 0.6, SAMPLES * 4)
+    start = hover(VEHICLE, Vec3(*jnp.asarray([0.0, 0.0, 10.0])))
+    inlet = ActuatorInlet((wanted, wanted, wanted, wanted))
+    flown = rollout(VEHICLE, CONTROLLER, Schedule(), inlet, start, samples=SAMPLES)
+    np.testing.assert_allclose(flown.log.command[2], wanted[::4], rtol=1e-12)
+
+
+@pytest.mark.parametrize("airmode", [0, 1, 2])
+def test_leaving_desaturation_out_changes_nothing(airmode: int) -> None:
+    settings = MixerSettings(airmode=airmode)  # type: ignore[arg-type]
+    keys = jax.random.split(jax.random.key(airmode), 2)
+    torque = jax.random.uniform(keys[0], (3, 500), minval=-0.3, maxval=0.3)
+    thrust = jax.random.uniform(keys[1], (500,))
+
+    def mix(torque: Array, thrust: Array) -> Array:
+        return jnp.stack(mixer.mix(settings, Vec3.of(torque), thrust))
+
+    @jax.jit
+    def both(torque: Array, thrust: Array) -> tuple[Array, Array]:
+        pushed: tuple[Array, Array] = jax.jvp(mix, (torque, thrust), (torque, thrust))
+        return pushed
+
+    together, tangent = both(torque, thrust)
+    inside = 0
+    for i in range(0, 500, 10):
+        alone, own = both(torque[:, i], thrust[i])
+        np.testing.assert_allclose(alone, together[:, i], atol=1e-15)
+        np.testing.assert_allclose(own, tangent[:, i], atol=1e-15)
+        inside += bool(jnp.all((alone > 0) & (alone < 1)))
+    assert 2 < inside < 48
+    mapped = jax.jit(jax.vmap(mix, in_axes=(1, 0), out_axes=1))(torque, thrust)
+    np.testing.assert_allclose(mapped, together, atol=1e-15)
+
+
+def test_an_age_of_all_and_one_of_each_read_the_same() -> None:
+    history = jnp.zeros((7, 2, 3))
+    for step in range(20):
+        history = push(history, jnp.full((2, 3), step**2 * 1.0), jnp.asarray(step))
+    ages = jnp.asarray([0.0, 1.25, 4.0])
+    now = jnp.asarray(19)
+    each, slope = jax.jvp(lambda age: look_back(history, now, age), (ages,), (jnp.ones(3),))
+    for i, age in enumerate(ages):
+        value, rise = jax.jvp(lambda a: look_back(history, now, a), (age,), (jnp.ones(()),))
+        np.testing.assert_allclose(value[:, i], each[:, i], rtol=1e-14)
+        np.testing.assert_allclose(rise[:, i], slope[:, i], rtol=1e-14)
+    np.testing.assert_allclose(each[0], [361.0, 0.75 * 324 + 0.25 * 289, 225.0])
