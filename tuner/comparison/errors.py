@@ -154,16 +154,20 @@ class Comparison:
         between = np.column_stack(
             [np.interp(turn_time - offset, clock, column) for column in attitude.T]
         )
-        angles = roll_pitch_yaw(between) - roll_pitch_yaw(turn)
         return FlightErrors(
             name=flight.name,
             position_time=place_time,
             position=np.column_stack(simulated) - place,
             attitude_time=turn_time,
-            attitude=(angles + 180.0) % 360.0 - 180.0,
+            attitude=short_way(roll_pitch_yaw(between) - roll_pitch_yaw(turn)),
             laps=laps_of(flight),
             crash_time=crash_time if crash_time <= flight.duration else None,
         )
+
+
+def short_way(degrees: Array) -> Array:
+    """Return angles in degrees within ±180."""
+    return (degrees + 180.0) % 360.0 - 180.0
 
 
 def _recorded(flight: Flight, signal: str) -> tuple[Array, Array]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_jax.crash import AIRBORNE, Limits
-from tuner.comparison.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of
+from tuner.comparison.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of, short_way
 from tuner.config import ControllerFile, TrajectorySettings, with_values
 from tuner.flights.flight import Series
 from tuner.simulation.trajectory import with_named_reference
@@ -59,6 +59,12 @@ def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
         assert getattr(own.rmse, axis) < 0.02, axis
     other = comparison.fly(with_values(updated, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
     assert other.rmse.x > 100 * own.rmse.x
+
+
+def test_angles_are_compared_the_short_way_round():
+    just_left, just_right = np.array([[0, 0, 179.0]]), np.array([[0, 0, -179.0]])
+    np.testing.assert_allclose(short_way(just_left - just_right), [[0, 0, -2]])
+    np.testing.assert_allclose(short_way(np.array([[-190.0, 180.0, 10.0]])), [[170, -180, 10]])
 
 
 def test_a_late_clock_is_taken_back(flight, updated):

@@ -8,6 +8,7 @@ from tuner.config import read_vehicle
 from tuner.config.job import ExportSettings
 from tuner.errors import ExportError, InputError
 from tuner.export.after_run import export_as_asked
+from tuner.export.draft import Draft, write
 from tuner.export.export import export
 from tuner.export.gates import check
 
@@ -148,6 +149,12 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     make_run(**BAD[0][0])
     lines = list(export_as_asked(run.folder, asked, refly=as_the_run_says, today=TODAY))
     assert all(line.startswith("not exported as ") and "held position" in line for line in lines)
+
+
+def test_a_file_that_does_not_read_back_is_not_reported_as_written(tmp_path, make_run):
+    draft = Draft("text", make_run().vehicle, (), lambda path: [f"{path.name} is wrong"])
+    with pytest.raises(ExportError, match=r"does not read back: a\.txt is wrong"):
+        write(draft, tmp_path / "a.txt")
 
 
 def test_gates_fly_what_the_format_holds(make_run, tmp_path):

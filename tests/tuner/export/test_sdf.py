@@ -77,6 +77,16 @@ def test_a_template_keeps_its_expressions_and_sets_its_variables(vehicle):
     assert [e.text for e in final.iter("input_scaling")] == ["950"] * 4
 
 
+def test_a_variable_that_several_rotors_use_is_set_once(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8").replace(
+        "<motorConstant>8.55e-06</motorConstant>", "<motorConstant>{{ kf }}</motorConstant>"
+    )
+    text = text.replace("<sdf ", "{% set kf = 8.55e-06 %}\n<sdf ")
+    out = patched(tmp_path, vehicle, text, "model.sdf.jinja").text
+    assert "{% set kf = 1.45e-05 %}" in out
+    assert out.count("{{ kf }}") == 4
+
+
 @ALL
 def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
     draft = sdf_draft(path, vehicle, "by a test")
