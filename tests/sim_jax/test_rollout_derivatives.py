@@ -1,0 +1,149 @@
+"""Derivatives through whole flights: right over seconds, finite whatever the coefficients are."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import Array
+
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.rollout import rollout
+from sim_jax.schedule import Schedule
+from sim_jax.vehicle import Vehicle
+from tests.sim_jax.support import at_first_point, controller, reference, vehicle
+
+NAMES = (
+    "mass",
+    "inertia_xx",
+    "inertia_yy",
+    "inertia_zz",
+    "input_scaling",
+    "zero_position_armed",
+    "time_constant_up",
+    "time_constant_down",
+    "motor_constant",
+    "moment_constant",
+    "rotor_drag_coefficient",
+    "rolling_moment_coefficient",
+    "estimate_latency",
+    "actuator_latency",
+)
+LATENCIES = (0.0123, 0.0021)
+SCHEDULE = Schedule(longest_estimate_latency=0.05, longest_actuator_latency=0.02)
+
+
+def places(craft: Vehicle) -> list[Array]:
+    parts = (craft.body, craft.motor, craft.aerodynamics, craft.setup)
+    return [getattr(part, name) for name in NAMES for part in parts if hasattr(part, name)]
+
+
+def nominal() -> Array:
+    values = jnp.stack([jnp.asarray(value) for value in places(vehicle())])
+    return values.at[-2:].set(jnp.asarray(LATENCIES))
+
+
+def jump(samples: int) -> Array:
+    """Return a step in m that makes the vehicle move in its first second."""
+    return jnp.where(jnp.arange(samples) > 10, 0.3, 0.0)
+
+
+@partial(jax.jit, static_argnames=("samples", "shape"))
+def flown(values: Array, *, samples: int, shape: str) -> Array:
+    """Return position, attitude, rates and rotor speeds, (channels, samples, *batch)."""
+    craft = eqx.tree_at(places, vehicle(), list(values))
+    points = reference(shape, ticks=samples)  # type: ignore[arg-type]
+    points = eqx.tree_at(lambda p: p.position.y, points, points.position.y + jump(samples))
+    start = at_first_point(vehicle(), points)
+    # exactly at their reference speed rotors are between rising and falling
+    speeds = tuple(0.98 * speed for speed in start.rotor_speed)
+    start = eqx.tree_at(lambda s: s.rotor_speed, start, speeds)
+    inlet = ReferenceInlet(points)
+    log = rollout(craft, controller(), SCHEDULE, inlet, start, samples=samples).log
+    leaves = jax.tree.leaves((log.motion, log.rotor_speed))
+    return jnp.stack(jnp.broadcast_arrays(*leaves))
+
+
+@partial(jax.jit, static_argnames=("samples", "shape"))
+def slope(values: Array, along: Array, *, samples: int, shape: str) -> tuple[Array, Array]:
+    return jax.jvp(partial(flown, samples=samples, shape=shape), (values,), (along,))
+
+
+@pytest.fixture(scope="module")
+def jacobian() -> Array:
+    unit = jnp.eye(len(NAMES))
+    values = nominal()
+    columns = [slope(values, values * axis, samples=100, shape="circle")[1] for axis in unit]
+    return jnp.stack(columns, axis=-1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_forward_derivatives_are_the_finite_differences(name: str, jacobian: Array) -> None:
+    """From rest: identity attitude, no velocity, every error zero at the first tick."""
+    values, column = nominal(), NAMES.index(name)
+    step = 1e-2 if name == "rolling_moment_coefficient" else 1e-6  # its effect is tiny
+    move = jnp.eye(len(NAMES))[column] * values * step
+    above = flown(values + move, samples=100, shape="circle")
+    below = flown(values - move, samples=100, shape="circle")
+    wanted = np.asarray((above - below) / (2 * step))
+    got = np.asarray(jacobian[..., column])
+    size = np.abs(wanted).max(axis=1, keepdims=True)
+    rounding = 1e-13 / step * np.abs(np.asarray(above)).max(axis=1, keepdims=True)
+    assert np.all(np.abs(got - wanted) < 1e-4 * size + rounding)
+    assert np.any(size > 10 * rounding)
+
+
+@pytest.mark.slow
+def test_reverse_mode_gives_the_same(jacobian: Array) -> None:
+    weights = jnp.sin(jnp.arange(jacobian[..., 0].size)).reshape(jacobian.shape[:-1])
+
+    def weighed(values: Array) -> Array:
+        return jnp.sum(weights * flown(values, samples=100, shape="circle"))
+
+    reverse = jax.grad(weighed)(nominal()) * nominal()
+    forward = jnp.einsum("csk,cs->k", jacobian, weights)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-8)
+
+
+def test_scaling_every_mass_is_a_null_direction(jacobian: Array) -> None:
+    massive = [
+        "mass",
+        "inertia_xx",
+        "inertia_yy",
+        "inertia_zz",
+        "motor_constant",
+        "rotor_drag_coefficient",
+        "rolling_moment_coefficient",
+    ]
+    along = jnp.asarray([1.0 if name in massive else 0.0 for name in NAMES])
+    sizes = jnp.abs(jacobian).max(axis=(0, 1))
+    assert float(jnp.abs(jacobian @ along).max()) < 1e-9 * float(sizes.max())
+    assert float(sizes[NAMES.index("mass")]) > 1e-3
+
+
+@pytest.mark.slow
+def test_forty_seconds_with_bad_coefficients_stay_finite() -> None:
+    """Sixteen vehicles drawn from a factor five: most crash, none gives not-a-number."""
+    rng = np.random.default_rng(3)
+    factors = np.exp(rng.uniform(-np.log(5.0), np.log(5.0), (len(NAMES), 16)))
+    factors[:, 0] = 1.0
+    values = nominal()[:, None] * jnp.asarray(factors)
+    values = values.at[-2:].set(jnp.minimum(values[-2:], jnp.asarray([[0.05], [0.02]])))
+    along = values * jnp.asarray(rng.normal(size=values.shape))
+    motion, change = slope(values, along, samples=4000, shape="circle")
+    assert bool(jnp.all(jnp.isfinite(motion)))
+    assert bool(jnp.all(jnp.isfinite(change)))
+
+
+@pytest.mark.slow
+def test_reverse_mode_through_forty_seconds_with_bad_coefficients_is_finite() -> None:
+    values = nominal() * jnp.asarray([1.2, 0.4, 1.7, 3.0, 0.9, 1.2, 3.0, 2.0, 0.8, 2, 4, 5, 2, 3])
+
+    def last(values: Array) -> Array:
+        return jnp.sum(flown(values, samples=4000, shape="circle")[:3, -1])
+
+    assert bool(jnp.all(jnp.isfinite(jax.grad(last)(values))))
