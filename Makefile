@@ -26,8 +26,8 @@ lint: $(READY)  ## style, types, and who may import whom
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-bench: $(READY)  ## ratios on this machine, written to benchmarks/RESULTS.md; needs a quiet machine
-	$(BIN)/python -m benchmarks
+bench: $(READY)  ## reading speed beside plain rosbags; needs a quiet machine
+	$(BIN)/python -m benchmarks.reading
 
 clean:
 	rm -rf $(VENV) runs
