@@ -140,15 +140,18 @@ class Objective(eqx.Module):
         clocks = jnp.zeros((len(CLOCKS), self.lanes.count))
         return Point(jnp.asarray(vector), clocks)
 
+    @property
+    def flier(self) -> Flier:
+        """The static half, by which compiled functions are kept."""
+        return Flier(self.space, self.schedule, self.samples, self.limits)
+
     def simulate(self, coefficients: Float[Array, " K"], horizon: Int[Array, ""]) -> Trace:
         """Fly every lane with a search vector."""
-        flier = _Flier(self.space, self.schedule, self.samples, self.limits)
-        return flier.fly(self.model, self.lanes, coefficients, horizon)
+        return self.flier.fly(self.model, self.lanes, coefficients, horizon)
 
     def sums(self, point: Point, stage: Stage, *, derivatives: bool) -> LaneSums:
         """Return every lane's contribution, computed on all devices."""
-        flier = _Flier(self.space, self.schedule, self.samples, self.limits)
-        return _shared_sums(flier, derivatives)(
+        return _shared_sums(self.flier, derivatives)(
             (self.lanes, point.offsets, stage.scale, stage.held),
             self.model,
             point.coefficients,
@@ -158,19 +161,18 @@ class Objective(eqx.Module):
 
     def jacobian(self, point: Point, stage: Stage) -> Jacobian:
         """Return every residual's derivatives, computed on all devices."""
-        flier = _Flier(self.space, self.schedule, self.samples, self.limits)
-        return _shared_jacobian(flier)(
+        return _shared_jacobian(self.flier)(
             (self.lanes, point.offsets, stage.held), self.model, point.coefficients, stage.horizon
         )
 
 
 @lru_cache(maxsize=16)
-def _shared_jacobian(flier: _Flier) -> Callable[..., Jacobian]:
+def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
     return jax.jit(over_devices(flier.jacobian))
 
 
 @lru_cache(maxsize=16)
-def _shared_sums(flier: _Flier, derivatives: bool) -> Callable[..., LaneSums]:
+def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
     """Return the sums over all devices, traced once however often they are used."""
 
     def lanewise(data: Any, *rest: Any) -> LaneSums:
@@ -180,7 +182,7 @@ def _shared_sums(flier: _Flier, derivatives: bool) -> Callable[..., LaneSums]:
 
 
 @dataclass(frozen=True)
-class _Flier:
+class Flier:
     """The static half of an objective: its methods are functions of arrays alone."""
 
     space: Space
@@ -189,6 +191,7 @@ class _Flier:
     limits: Limits
 
     def fly(self, model: Model, lanes: Lanes, coefficients: Array, horizon: Array) -> Trace:
+        """Simulate some lanes with a search vector (K,) up to a horizon in samples."""
         return fly(
             with_coefficients(model, self.space.values(coefficients)),
             lanes,
@@ -197,6 +200,16 @@ class _Flier:
             horizon=horizon,
             limits=self.limits,
         )
+
+    def compared(
+        self, data: tuple[Lanes, Array, Array], model: Model, coefficients: Array, horizon: Array
+    ) -> tuple[Trace, dict[str, Array]]:
+        """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
+        lanes, offsets, held = data
+        trace = self.fly(model, lanes, coefficients, horizon)
+        rate = float(self.schedule.log_rate)
+        late = offsets * OFFSET_UNIT
+        return trace, residuals(trace, lanes, late, held, rate=rate, horizon=horizon)
 
     def sums(
         self,
@@ -208,6 +221,7 @@ class _Flier:
         *,
         derivatives: bool,
     ) -> LaneSums:
+        """Return what some lanes contribute; see `Objective.sums`."""
         lanes, offsets, scale, held = data
         rate = float(self.schedule.log_rate)
 
@@ -225,7 +239,7 @@ class _Flier:
         squares = {name: jnp.sum(e * e, axis=(0, 1)) for name, e in errors.items()}
         counts = {name: _count(lanes, name, rate, horizon) for name in errors}
         scaled = {name: e / scale[name] for name, e in errors.items()}
-        loss = sum((jnp.sum(_huber(e, huber), axis=(0, 1)) for e in scaled.values()), jnp.zeros(()))
+        loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled.values()), jnp.zeros(()))
         lanes_here = offsets.shape[-1]
         size = len(coefficients) + len(offsets)
         gradient, hessian = jnp.zeros((size, lanes_here)), jnp.zeros((size, size, lanes_here))
@@ -237,6 +251,7 @@ class _Flier:
     def jacobian(
         self, data: tuple[Lanes, Array, Array], model: Model, coefficients: Array, horizon: Array
     ) -> Jacobian:
+        """Return every residual of some lanes and its derivatives."""
         lanes, offsets, held = data
         rate = float(self.schedule.log_rate)
 
@@ -296,7 +311,8 @@ def _normal(
     return gradient, hessian
 
 
-def _huber(error: Array, limit: Array) -> Array:
+def robust(error: Array, limit: Array) -> Array:
+    """Return Huber's loss of an error: its square, growing linearly beyond a limit."""
     size = jnp.abs(error)
     return jnp.where(size > limit, 2.0 * limit * size - limit * limit, error * error)
 

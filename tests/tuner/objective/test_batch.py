@@ -1,0 +1,31 @@
+"""Many vectors at once against one after the other."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.identifiability.making import problem, stage_of
+from tuner.objective.batch import CHUNK, evaluate
+from tuner.objective.normal import Point
+
+FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return problem(FREE)
+
+
+def test_each_vector_gives_what_it_gives_alone(fit):
+    stage = eqx.tree_at(lambda s: s.huber, stage_of(fit), jnp.asarray(2.0))
+    steps = np.random.default_rng(1).normal(0.0, 0.2, (CHUNK + 1, len(FREE)))
+    vectors = np.asarray(fit.space.initial) + steps
+    late = jnp.full((2, 2), 0.1)
+    batch = evaluate(fit, vectors, Point(jnp.asarray(vectors[0]), late), stage)
+    assert batch.loss.shape == (CHUNK + 1, 2)
+    for number in (0, 3, CHUNK):
+        alone = fit.sums(Point(jnp.asarray(vectors[number]), late), stage, derivatives=False)
+        np.testing.assert_allclose(batch.loss[number], alone.loss, rtol=1e-9)
+        for name, squares in alone.squares.items():
+            np.testing.assert_allclose(batch.squares[name][number].sum(axis=0), squares, rtol=1e-9)

@@ -1,0 +1,92 @@
+"""Many coefficient vectors at once: how closely each meets the recordings, axis by axis."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from tuner.objective.normal import Flier, Objective, Point, Stage, robust
+from tuner.parallel import over_devices
+
+CHUNK = 16
+"""Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
+
+
+class Batch(eqx.Module):
+    """What S vectors give.
+
+    Attributes
+    ----------
+    loss
+        (S, F) half the robust sum of squares.
+    squares
+        Channel -> (S, k, F) plain sum of squares in unscaled standard deviations.
+    crash_time
+        (S, F) s, infinite for a lane that flew.
+    """
+
+    loss: Float[Array, "S F"]
+    squares: dict[str, Float[Array, "S k F"]]
+    crash_time: Float[Array, "S F"]
+
+
+def evaluate(
+    objective: Objective, vectors: NDArray[np.float64], point: Point, stage: Stage
+) -> Batch:
+    """Fly all lanes with every vector, in chunks of one compiled shape.
+
+    Parameters
+    ----------
+    objective, stage
+        The problem.
+    vectors
+        (S, K) search vectors.
+    point
+        Its clock offsets hold for all.
+    """
+    flown = _shared(objective.flier)
+    parts = []
+    for first in range(0, len(vectors), CHUNK):
+        chunk = vectors[first : first + CHUNK]
+        padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
+        found = flown(
+            (objective.lanes, point.offsets, stage.scale, stage.held),
+            objective.model,
+            jnp.asarray(padded),
+            stage.horizon,
+            stage.huber,
+        )
+        parts.append(_first(found, len(chunk)))
+    joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return joined
+
+
+def _first(batch: Batch, count: int) -> Batch:
+    kept: Batch = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], batch)
+    return kept
+
+
+@lru_cache(maxsize=16)
+def _shared(flier: Flier) -> Callable[..., Batch]:
+    def lanewise(data: Any, model: Any, vectors: Array, horizon: Array, huber: Array) -> Batch:
+        lanes, offsets, scale, held = data
+
+        def one(vector: Array) -> Batch:
+            trace, errors = flier.compared((lanes, offsets, held), model, vector, horizon)
+            scaled = [error / scale[name] for name, error in errors.items()]
+            loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled), jnp.zeros(()))
+            squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
+            return Batch(0.5 * loss, squares, trace.crash_time)
+
+        return jax.vmap(one)(vectors)
+
+    return jax.jit(over_devices(lanewise))
