@@ -85,7 +85,7 @@ def clean(
     time, values = time[~apart], values[~apart]
     time, values, doubles = _merge_equal_times(time, values)
     note(doubles, "with a stamp seen before dropped")
-    note(_missing(time), "seem to be missing between those recorded")
+    note(0 if signal == "lap" else _missing(time), "seem to be missing between those recorded")
 
     if signal == "attitude":
         time, values, odd = _unit_quaternions(time, values)

@@ -21,7 +21,7 @@ class Grid:
     origin
         s, the time of one tick.
     rate
-        Hz.
+        Hz; the wanted clock's, or a multiple of it that the publisher keeps.
     drift
         Seconds per second by which the publisher's clock runs slower than its stamps.
     spread
@@ -53,7 +53,7 @@ class Grid:
 
 
 def fit_grid(time: Array, rate: float) -> Grid | None:
-    """Fit ticks of a known rate to (n,) increasing stamps that are late by a varying delay.
+    """Fit ticks of a known rate, or a multiple, to (n,) increasing stamps that come a little late.
 
     A publisher's timer fires on the tick and the stamp is written a little later, never earlier,
     so that the ticks are the lower envelope of the stamps: the first percentile of how late they
@@ -62,6 +62,8 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
     if len(time) < 20:
         return None
     period = np.median(np.diff(time))
+    if period * rate < 1 - ON_TICK:  # published more often than the wanted clock ticks
+        rate *= max(1, round(1 / (period * rate)))
     stride = round(period * rate)
     if stride < 1 or abs(period * rate - stride) > ON_TICK:
         return None

@@ -54,7 +54,7 @@ def make_flight(
     around = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
     own = {name: _until(data, mission.end - start) for name, data in around.items()}
     own = {name: data for name, data in own.items() if len(data.time)}
-    ticks = Grid(grid.origin - start, rate, grid.drift, grid.spread) if grid else None
+    ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
     if grid is not None and grid.drift:
         text = f"the publisher's clock drifts by {1e6 * grid.drift:+.0f} ppm against its stamps"

@@ -49,6 +49,12 @@ def test_reference_sample_k_sits_on_tick_k() -> None:
     assert np.abs(position[:, :2] - np.array(expected)[:, :2]).max() < 1e-5
 
 
+def test_a_slower_clock_reads_the_reference_on_its_ticks_too() -> None:
+    full = load_flight(FLIGHTS / "circle_3mps.bag").signals["reference_position"]
+    half = load_flight(FLIGHTS / "circle_3mps.bag", rate=50.0).signals["reference_position"]
+    assert np.array_equal(half, full[::2])
+
+
 def test_initial_state_is_the_hover_before_the_mission() -> None:
     start = load_flight(FLIGHTS / "circle_3mps.bag").initial
     assert start.position == pytest.approx([2.0, 0.0, 1.1177], abs=5e-4)
