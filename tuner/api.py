@@ -108,7 +108,13 @@ def fit(
         topics=None if topics is None else str(topics),
         namespace=namespace,
     )
-    folder, _ = run(options, out=None if out is None else Path(out), resume=resume, force=force)
+    folder, _ = run(
+        options,
+        out=None if out is None else Path(out),
+        resume=resume,
+        force=force,
+        command=f"tuner.fit from Python: {options.flights}",
+    )
     return read_run(folder)
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from typing import Annotated
 
 from cyclopts import Parameter
+
+#: What the user typed, for the record of a run.
+TYPED: ContextVar[str] = ContextVar("TYPED", default="")
 
 #: An option that takes all words up to the next option.
 Many = Parameter(consume_multiple=True, negative=())

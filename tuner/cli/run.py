@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from collections.abc import Sequence
 from cyclopts import CycloptsError
 
 from tuner.cli.app import app, commands
+from tuner.cli.options import TYPED
 from tuner.errors import InputError, did_you_mean
 
 DONE = 0
@@ -27,6 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Without the program's name; None takes those of the process.
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
+    TYPED.set(shlex.join(["tune", *given]))
     logging.basicConfig(level=logging.WARNING, format="tune: %(message)s", stream=sys.stderr)
     logging.captureWarnings(True)
     try:

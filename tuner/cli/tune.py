@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from tuner.cli.options import (
+    TYPED,
     ControllerChoice,
     Flights,
     JobChoice,
@@ -83,6 +84,8 @@ def tune(
         seed=seed,
     )
     with listening(quiet=quiet) as listener:
-        folder, result = run(options, out=out, resume=resume, force=force, listener=listener)
+        folder, result = run(
+            options, out=out, resume=resume, force=force, listener=listener, command=TYPED.get()
+        )
     if not quiet:
         print_run(folder, result)

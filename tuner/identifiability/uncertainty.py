@@ -115,9 +115,7 @@ def uncertainty(
 def judged(space: Space, vector: Array, evidence: Evidence, flights: Sequence[str]) -> Uncertainty:
     """Return what the evidence at a search vector (K,) says."""
     scaled = np.asarray(space.scaled(jnp.asarray(vector)))
-    reference = np.array(
-        [_reference(p, value) for p, value in zip(space.parameters, scaled, strict=True)]
-    )
+    reference = references(space, vector)
     found = covariance(evidence)
     shares, prior_share = _shares(evidence, len(flights))
     directions = weakest(found.alone, reference, space.names)
@@ -168,6 +166,12 @@ def judged(space: Space, vector: Array, evidence: Evidence, flights: Sequence[st
         prior_share=prior_share,
         directions=directions,
     )
+
+
+def references(space: Space, vector: Array) -> Array:
+    """Return the change (K,) of each scaled coordinate that counts as one hundred percent."""
+    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    return np.array([_reference(p, x) for p, x in zip(space.parameters, scaled, strict=True)])
 
 
 def _reference(parameter: Parameter, scaled: float) -> float:

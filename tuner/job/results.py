@@ -106,6 +106,7 @@ def result_of(
     errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
     *,
     status: str,
+    command: str = "",
 ) -> RunResult:
     """Assemble ``result.json``."""
     initial, best = errors
@@ -116,6 +117,7 @@ def result_of(
         seed=settings.job.search.seed,
         versions=versions(),
         settings={
+            "command": command,
             "vehicle": settings.vehicle.model_dump(mode="json"),
             "controller": controller_flown(job, fitted).model_dump(mode="json"),
             "job": settings.job.model_dump(mode="json"),

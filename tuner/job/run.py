@@ -45,6 +45,7 @@ def run(
     resume: bool = False,
     force: bool = False,
     listener: Listener = SILENT,
+    command: str = "",
 ) -> tuple[Path, RunResult]:
     """Fit, validate and report.
 
@@ -60,6 +61,8 @@ def run(
         Search although the check before it failed.
     listener
         Is told how it goes.
+    command
+        What the user typed, for the record.
 
     Returns
     -------
@@ -76,7 +79,9 @@ def run(
     configure()
     from tuner.export.after_run import export_as_asked  # noqa: PLC0415
     from tuner.export.refly import refly  # noqa: PLC0415
-    from tuner.identifiability import uncertainty as uncertainty_of  # noqa: PLC0415
+    from tuner.identifiability.examine import examine  # noqa: PLC0415
+    from tuner.identifiability.files import write_files  # noqa: PLC0415
+    from tuner.identifiability.telling import tell as told_of  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.prepare import Job, prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
@@ -86,7 +91,7 @@ def run(
         write_folder,
     )
     from tuner.job.search import parameters_of, search  # noqa: PLC0415
-    from tuner.report import render, write_traces  # noqa: PLC0415
+    from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
     from tuner.search.growing import Progress  # noqa: PLC0415
 
     settings = settle(options)
@@ -111,14 +116,18 @@ def run(
 
     fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
     listener.message("telling how far each coefficient can be trusted")
-    uncertainty = uncertainty_of(fitted)
+    examination = examine(fitted)
+    uncertainty = examination.uncertainty
     vehicle = vehicle_fitted(job, fitted, uncertainty)
     listener.message("flying every flight with the initial and the fitted coefficients")
     errors = validate(job, fitted, vehicle)
     status = "converged" if fitted.converged else "stopped"
-    result = result_of(job, fitted, uncertainty, errors, status=status)
+    result = result_of(job, fitted, uncertainty, errors, status=status, command=command)
     write_folder(folder, result, vehicle, job)
     write_traces(folder, job.flights, *errors)
+    write_laps(folder, *errors)
+    write_search(folder, fitted)
+    write_files(told_of(examination, job.space, fitted.point), folder)
     render(folder)
     for line in export_as_asked(
         folder, settings.job.export, refly=refly, today=datetime.date.today()

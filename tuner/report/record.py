@@ -1,0 +1,117 @@
+"""How a search went and how laps are met, as files of the result folder that the page reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from tuner.config.yaml_file import write_text
+from tuner.identifiability.knowledge import Part, read_part
+from tuner.result import AxesRmse
+
+if TYPE_CHECKING:
+    from tuner.comparison.errors import FlightErrors
+    from tuner.search.fitted import Fitted
+
+SEARCH_FILE = "search.json"
+LAPS_FILE = "laps.json"
+
+
+class Move(Part):
+    """One iteration of the search, see `tuner.search.fitted.Iteration`."""
+
+    stage: str
+    number: int
+    loss: float
+    position_rmse: float | None
+    accepted: bool
+    horizon: float
+
+
+class Start(Part):
+    """Where one start came from and ended; coefficients in their units."""
+
+    origin: str
+    loss: float | None
+    start: dict[str, float]
+    end: dict[str, float]
+
+
+class SearchRecord(Part):
+    """The content of ``search.json``."""
+
+    schema_version: int = 1
+    iterations: list[Move]
+    starts: list[Start]
+
+
+class LapRow(Part):
+    """How closely one vehicle meets a flight, or one lap of it."""
+
+    flight: str
+    lap: int | None
+    vehicle: Literal["initial", "best"]
+    rmse: AxesRmse
+    crash_time: float | None
+
+
+class LapTable(Part):
+    """The content of ``laps.json``, a comparison of the initial and the best vehicle."""
+
+    schema_version: int = 1
+    rows: list[LapRow]
+
+
+def write_search(folder: Path, fitted: Fitted) -> None:
+    """Write ``search.json`` of a finished search."""
+    record = SearchRecord(
+        iterations=[
+            Move(
+                stage=one.stage,
+                number=one.number,
+                loss=one.loss,
+                position_rmse=one.position_rmse if one.position_rmse >= 0 else None,
+                accepted=one.accepted,
+                horizon=one.horizon,
+            )
+            for one in fitted.iterations
+        ],
+        starts=[
+            Start(
+                origin=one.origin,
+                loss=one.loss if abs(one.loss) < float("inf") else None,
+                start=_values(fitted, one.start),
+                end=_values(fitted, one.vector),
+            )
+            for one in fitted.outcomes
+        ],
+    )
+    write_text(folder / SEARCH_FILE, record.model_dump_json(indent=1) + "\n")
+
+
+def _values(fitted: Fitted, vector: object) -> dict[str, float]:
+    import jax.numpy as jnp  # noqa: PLC0415 (a page is rendered without it)
+
+    values = fitted.objective.space.values(jnp.asarray(vector))
+    return {name: float(value) for name, value in values.items()}
+
+
+def write_laps(
+    folder: Path, initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
+) -> None:
+    """Write ``laps.json``: the RMSE of both vehicles per flight, per lap and overall."""
+    from tuner.comparison.table import table_of  # noqa: PLC0415
+    from tuner.comparison.write import write_table  # noqa: PLC0415
+
+    write_table(table_of({"initial": initial, "best": best}), folder / LAPS_FILE)
+
+
+def read_search(folder: Path) -> SearchRecord | None:
+    """Read ``search.json``; None where there is none."""
+    return read_part(SearchRecord, folder / SEARCH_FILE)
+
+
+def read_laps(folder: Path) -> LapTable | None:
+    """Read ``laps.json``; None where there is none."""
+    return read_part(LapTable, folder / LAPS_FILE)
