@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import lru_cache, wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
+from numpy.typing import NDArray
 
 _AXIS = "batch"
 
@@ -27,8 +29,9 @@ def _size(tree: PyTree[Array]) -> int:
 
 
 def _padded(tree: PyTree[Array], missing: int) -> PyTree[Array]:
-    def pad(leaf: Array) -> Array:
-        return jnp.concatenate([leaf, jnp.repeat(leaf[..., -1:], missing, axis=-1)], axis=-1)
+    def pad(leaf: Array) -> NDArray[Any]:
+        rows = np.asarray(leaf)
+        return np.concatenate([rows, np.repeat(rows[..., -1:], missing, axis=-1)], axis=-1)
 
     return jax.tree.map(pad, tree)
 
@@ -36,41 +39,53 @@ def _padded(tree: PyTree[Array], missing: int) -> PyTree[Array]:
 def over_devices(
     function: Callable[..., PyTree[Array]], *, devices: int | None = None
 ) -> Callable[..., PyTree[Array]]:
-    """Return the same function of a batch, computed by all devices at once.
+    """Return a function of a batch compiled for all devices, each of which takes its share.
 
-    The devices do not wait for each other inside the function: each runs its own loops. With one
-    device the function is called as it is. May be used under `jax.jit`, `jax.jvp` and `jax.vmap`,
-    and ``function`` may itself be a Jacobian.
+    The devices never wait for each other: nothing is exchanged between them, padding and joining
+    happen on the host. (Reductions over a shared axis inside the compiled program would have them
+    meet, and with a single thread for all devices a meeting can wait for ever.)
 
     Parameters
     ----------
     function
         Takes a batch, a pytree whose leaves all have the batch as their last axis, then any number
         of pytrees that every device needs whole; returns a pytree whose leaves have the batch last.
-        Members of the batch must not depend on each other.
+        Members of the batch must not depend on each other. It may itself be a Jacobian.
     devices
         How many devices to use; all of the default backend by default.
+
+    Returns
+    -------
+    callable
+        The same function, not to be used under jax's transformations; its leaves are numpy arrays.
     """
+    compiled = lru_cache(maxsize=8)(lambda count: jax.jit(_shared(function, count)))
 
     @wraps(function)
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
-        chosen = jax.devices()[:devices]
         size = _size(batch)
-        chosen = chosen[:size]
-        if len(chosen) == 1:
-            return function(batch, *whole)
-        missing = -size % len(chosen)
-        padded = _padded(batch, missing) if missing else batch
-        shapes = jax.eval_shape(function, padded, *whole)
-        result = jax.shard_map(
+        count = min(len(jax.devices()[:devices]), size)
+        missing = -size % count
+        result = compiled(count)(_padded(batch, missing) if missing else batch, *whole)
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :size], result)
+
+    return shared_out
+
+
+def _shared(function: Callable[..., PyTree[Array]], count: int) -> Callable[..., PyTree[Array]]:
+    if count == 1:
+        return function
+
+    def over_all(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
+        shapes = jax.eval_shape(function, batch, *whole)
+        return jax.shard_map(
             function,
-            mesh=Mesh(np.array(chosen), (_AXIS,)),
-            in_specs=(_last_axis(padded), *[PartitionSpec()] * len(whole)),
+            mesh=Mesh(np.array(jax.devices()[:count]), (_AXIS,)),
+            in_specs=(_last_axis(batch), *[PartitionSpec()] * len(whole)),
             out_specs=_last_axis(shapes),
             # loops start from constants, which are the same on every device, and end in values
             # that are not: the check of what varies over devices would refuse them
             check_vma=False,
-        )(padded, *whole)
-        return jax.tree.map(lambda leaf: leaf[..., :size], result) if missing else result
+        )(batch, *whole)
 
-    return shared_out
+    return over_all

@@ -12,7 +12,7 @@ from tuner.parallel import over_devices
 CHECK = """
 from tuner import runtime
 runtime.configure(keep_compiled=False)
-import jax, jax.numpy as jnp, numpy as np
+import jax, jax.numpy as jnp, numpy as np, tuner.parallel
 from tuner.parallel import over_devices
 
 assert len(jax.devices()) == 3
@@ -36,13 +36,15 @@ for size in (1, 2, 3, 7):
              "push": jnp.asarray(rows.normal(size=(6, size)))}
     for function in (flight, jacobian):
         want = function(batch, coefficients, horizon)
-        got = jax.jit(over_devices(function))(batch, coefficients, horizon)
+        got = over_devices(function)(batch, coefficients, horizon)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), got, want)
-    outer = jax.jacfwd(lambda c: over_devices(flight)(batch, c, horizon)["log"])(coefficients)
-    inner = jax.jacfwd(lambda c: flight(batch, c, horizon)["log"])(coefficients)
-    np.testing.assert_allclose(outer, inner, rtol=1e-14)
-shared = over_devices(flight)({"start": jnp.ones(6), "push": jnp.ones((6, 6))}, coefficients, 5)
-assert len(shared["log"].sharding.device_set) == 3, shared["log"].sharding
+        assert isinstance(got, (dict, np.ndarray))
+text = jax.jit(tuner.parallel._shared(flight, 3)).lower(
+    {"start": jnp.ones(6), "push": jnp.ones((6, 6))}, coefficients, horizon
+).compile().as_text()
+meeting = [word for word in ("all-reduce", "all-gather", "permute", "all-to-all") if word in text]
+assert not meeting, meeting
+assert "f64[2]" in text, "each device should have its share of two"
 """
 
 

@@ -1,7 +1,7 @@
 """What the data say, cut into flights, channels and stretches of time.
 
-Everything here is in the scaled coordinates of the `Space` (logarithm or number). Each lane's clock
-offsets are nuisances: they are eliminated lane by lane, so that what is left speaks of the
+Everything here is in the scaled coordinates of the `Space` (logarithm or number). Each lane's start
+and each flight's offsets are nuisances: they are eliminated, so that what is left speaks of the
 coefficients alone and can be added up and split at will.
 """
 
@@ -32,13 +32,13 @@ class Evidence:
     flight
         (F,) number of the flight that each lane belongs to.
     information
-        (C, F, B, K, K): JᵀWJ in the scaled coordinates, clock offsets eliminated.
+        (C, F, B, K, K): JᵀWJ in the scaled coordinates, nuisances eliminated.
     score
         (C, F, B, K): JᵀWr, likewise.
     spread
         (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
     clock_prior
-        (K, K): what the prior of the clock offsets contributes.
+        (K, K): what the priors of offsets and starts contribute.
     prior
         (K, K): what the priors of the coefficients contribute.
     crashed
@@ -80,7 +80,7 @@ def gather(
     objective, point, stage
         A fit and where it stands.
     clocks
-        (clocks, F) which clock offsets were fitted; by default those that are not exactly zero.
+        (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     block
         s of one flight that are summed up together.
     """
@@ -101,7 +101,8 @@ def summed(
     count, lanes = len(objective.space), objective.lanes.count
     channels = tuple(jacobian.residuals)
     blocks = _block_count(objective, stage, block)
-    size = count + point.offsets.shape[0]
+    states = 0 if stage.states is None else len(stage.states)
+    size = count + point.offsets.shape[0] + states
     information = np.zeros((len(channels), lanes, blocks, size, size))
     score = np.zeros((len(channels), lanes, blocks, size))
     spread = np.ones((len(channels), lanes))
@@ -110,7 +111,7 @@ def summed(
         residuals = np.asarray(jacobian.residuals[channel])
         weight = np.asarray(objective.lanes.measured[channel].weight)
         time = np.asarray(objective.lanes.measured[channel].time)
-        scale = np.asarray(stage.scale[channel])
+        scale = np.asarray(stage.scale[channel])[np.asarray(objective.lanes.flight)]
         for lane in range(lanes):
             rows = columns[..., lane] / scale[lane]
             error = residuals[..., lane] / scale[lane]
@@ -140,7 +141,7 @@ def summed(
 
 @dataclass(frozen=True)
 class _Raw:
-    """Sums with the clock offsets still in them, in the search's coordinates."""
+    """Sums with the nuisances still in them, in the search's coordinates."""
 
     channels: tuple[str, ...]
     information: Array
@@ -162,36 +163,59 @@ def _without_clocks(
     clocks: NDArray[np.bool_],
     crashed: NDArray[np.bool_],
 ) -> Evidence:
-    """Change to scaled coordinates and eliminate every lane's clock offsets."""
+    """Change to scaled coordinates; eliminate every lane's start, then every flight's offsets."""
     space, lanes = objective.space, objective.lanes.count
-    count = len(space)
-    stretch = np.concatenate(
-        [1.0 / space.slope(np.asarray(point.coefficients)), np.ones(len(clocks))]
-    )
+    count, kinds = len(space), len(clocks)
+    slope = space.slope(np.asarray(point.coefficients))
+    stretch = np.concatenate([1.0 / slope, np.ones(raw.score.shape[-1] - count)])
     information = raw.information * stretch[:, None] * stretch
     score = raw.score * stretch
-    eliminate = np.zeros((lanes, count, count + len(clocks)))
-    clock_prior = np.zeros((count, count))
-    for lane in range(lanes):
-        whole = information[:, lane].sum(axis=(0, 1))
-        projection = _projection(whole, clocks[:, lane], count)
-        eliminate[lane] = np.hstack([np.eye(count), projection])
-        clock_prior += projection @ projection.T / OFFSET_SD**2
+    flight = np.asarray(objective.lanes.flight)
+    eliminate = np.zeros((lanes, count, len(stretch)))
+    nuisance_prior = np.zeros((count, count))
+    for number in range(int(flight.max()) + 1):
+        own = np.flatnonzero(flight == number)
+        first, whole = {}, np.zeros((count + kinds, count + kinds))
+        for lane in own:
+            first[lane] = _without_start(information[:, lane].sum(axis=(0, 1)), count + kinds)
+            whole += _kept(information[:, lane].sum(axis=(0, 1)), first[lane])
+        projection = _projection(whole, clocks[:, number], count)
+        second = np.hstack([np.eye(count), projection])
+        nuisance_prior += projection @ projection.T / OFFSET_SD**2
+        for lane in own:
+            eliminate[lane] = second @ first[lane]
+            follow = second @ first[lane][:, count + kinds :]
+            nuisance_prior += follow @ follow.T
     reduced = np.einsum("lap,clbpq,ldq->clbad", eliminate, information, eliminate, optimize=True)
     return Evidence(
         channels=raw.channels,
-        flight=np.asarray(objective.lanes.flight),
+        flight=flight,
         information=reduced,
         score=np.einsum("lap,clbp->clba", eliminate, score),
         spread=raw.spread,
-        clock_prior=clock_prior,
+        clock_prior=nuisance_prior,
         prior=np.diag(float(stage.prior) ** 2 / space.prior_sd**2),
         crashed=crashed,
     )
 
 
+def _without_start(whole: Array, kept: int) -> Array:
+    """Return (kept, Q): the change of all parameters when a lane's best start follows the others.
+
+    In its standard deviations the prior of a start is one.
+    """
+    own = whole[kept:, kept:] + np.eye(len(whole) - kept)
+    return np.hstack([np.eye(kept), -np.linalg.solve(own, whole[kept:, :kept]).T])
+
+
+def _kept(whole: Array, along: Array) -> Array:
+    """Return the information along some directions, the prior of a start included."""
+    kept = len(along)
+    return np.asarray(along @ whole @ along.T + along[:, kept:] @ along[:, kept:].T)
+
+
 def _projection(whole: Array, movable: NDArray[np.bool_], count: int) -> Array:
-    """Return (K, clocks): how a lane's best clock offsets follow the coefficients."""
+    """Return (K, offsets): how a flight's best offsets follow the coefficients."""
     projection = np.zeros((count, len(movable)))
     free = np.flatnonzero(movable)
     own = whole[np.ix_(count + free, count + free)] + np.eye(len(free)) / OFFSET_SD**2

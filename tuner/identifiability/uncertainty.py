@@ -105,7 +105,7 @@ def uncertainty(
     flights
         Names of the fitted flights in the order of the objective; ``fitted.scales``' by default.
     clocks
-        (clocks, F) which clock offsets were fitted; by default those that are not exactly zero.
+        (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
     evidence = gather(fitted.objective, fitted.point, fitted.stage, clocks=clocks)
     names = tuple(fitted.scales) if flights is None else tuple(flights)

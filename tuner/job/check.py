@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.search.fitted import Finding
-from tuner.search.growing import Leg, on_host, stage_of
-from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.growing import Leg, beginning, point_of, stage_of
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""
@@ -156,15 +154,11 @@ def information(job: Job) -> NDArray[np.float64]:
     rate = float(objective.schedule.log_rate)
     horizon = min(round(HORIZON * rate), objective.samples)
     leg = Leg("check", horizon, 1.0, False, False, 1, 1.0, False)
-    lanes = objective.lanes.count
-    scales = {name: np.ones(lanes) for name in objective.lanes.measured}
-    start = objective.start(job.space.initial)
-    stage = on_host(stage_of(leg, scales, np.asarray(start.offsets)))
-    alone = on_host(jax.tree.map(lambda leaf: leaf[None], start))
-    free = np.zeros(len(job.space) + start.offsets.size)
-    step = advance(objective, on_host(begin(objective, alone, stage, free)), stage, free)
+    start = beginning(objective, job.space.initial[None])
+    stage = stage_of(leg, start.scales, np.asarray(start.points.offsets[0]), start.states)
+    sums = objective.sums(point_of(start.points, 0), stage)
     count = len(job.space)
-    hessian = np.asarray(step.sums.hessian[0]).sum(axis=-1)[:count, :count]
+    hessian = np.asarray(sums.hessian).sum(axis=-1)[:count, :count]
     slope = job.space.slope(job.space.initial)
     return np.asarray(hessian / np.outer(slope, slope))
 

@@ -9,27 +9,25 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.errors import InputError
 from tuner.job.prepare import Job, given_offset
-from tuner.objective.normal import Objective, Point
+from tuner.objective.normal import Objective, Point, Stage
 from tuner.search.fitted import Finding, Fitted, Iteration, Outcome
 from tuner.search.growing import (
     Leg,
     Progress,
     beginning,
     grow,
-    on_host,
     point_of,
     schedule_of,
     stage_of,
     with_feedback,
 )
-from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.levenberg_marquardt import total
 
 CHECKPOINT = "checkpoint.npz"
 SPREAD = np.log(1.7)
@@ -155,12 +153,10 @@ def _origin(number: int) -> str:
     return "vehicle file" if number == 0 else "random"
 
 
-def _loss_at(objective: Objective, point: Point, stage: object) -> float:
-    """Return the loss at a point; one step of a solver evaluates it with what is compiled."""
-    alone = on_host(jax.tree.map(lambda leaf: leaf[None], point))
-    free = np.zeros(len(objective.space) + point.offsets.size)
-    step = on_host(begin(objective, alone, on_host(stage), free))
-    return float(advance(objective, step, on_host(stage), free).loss[0])
+def _loss_at(objective: Objective, point: Point, stage: Stage) -> float:
+    """Return the loss at a point, as the search counts it."""
+    flight = np.asarray(objective.lanes.flight)
+    return float(total(objective.space, flight, point, stage, objective.sums(point, stage))[0])
 
 
 def _findings(job: Job, progress: Progress) -> tuple[Finding, ...]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,7 +13,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from tuner.objective.normal import Flier, Objective, Point, Stage, robust
+from tuner.model import Model
+from tuner.objective.normal import Flier, LaneData, Objective, Point, Stage, robust
 from tuner.parallel import over_devices
 
 CHUNK = 16
@@ -59,11 +59,11 @@ def evaluate(
         chunk = vectors[first : first + CHUNK]
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
         found = flown(
-            (objective.lanes, point.offsets, stage.scale, stage.held),
+            objective.data(point.offsets, stage),
             objective.model,
-            jnp.asarray(padded),
-            stage.horizon,
-            stage.huber,
+            padded,
+            np.asarray(stage.horizon),
+            np.asarray(stage.huber),
         )
         parts.append(_first(found, len(chunk)))
     joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
@@ -77,16 +77,17 @@ def _first(batch: Batch, count: int) -> Batch:
 
 @lru_cache(maxsize=16)
 def _shared(flier: Flier) -> Callable[..., Batch]:
-    def lanewise(data: Any, model: Any, vectors: Array, horizon: Array, huber: Array) -> Batch:
-        lanes, offsets, scale, held = data
-
+    def lanewise(
+        data: LaneData, model: Model, vectors: Array, horizon: Array, huber: Array
+    ) -> Batch:
         def one(vector: Array) -> Batch:
-            trace, errors = flier.compared((lanes, offsets, held), model, vector, horizon)
-            scaled = [error / scale[name] for name, error in errors.items()]
+            trace, errors = flier.compared(data, model, vector, horizon)
+            scaled = [error / data.scale[name] for name, error in errors.items()]
             loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled), jnp.zeros(()))
             squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
             return Batch(0.5 * loss, squares, trace.crash_time)
 
-        return jax.vmap(one)(vectors)
+        found: Batch = jax.vmap(one)(vectors)
+        return found
 
-    return jax.jit(over_devices(lanewise))
+    return over_devices(lanewise)

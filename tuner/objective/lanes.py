@@ -31,6 +31,9 @@ CLOCK_OF = {
     "command": 1,
 }
 
+#: What a recording may get wrong by a constant: its clocks, in s, and its gyro, in rad/s.
+OFFSETS = (*CLOCKS, "gyro_x", "gyro_y", "gyro_z")
+
 #: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
 
@@ -65,6 +68,10 @@ class Lanes(eqx.Module):
     measured: dict[str, Measured]
     flight: Int[Array, " F"]
     """Number of the flight that a lane belongs to."""
+    turning: Float[Array, "4 F"] | None = None
+    """Recent commands 0..1 of rotors whose speed at the start was not measured, else NaN."""
+    freedom: Float[Array, "L F"] | None = None
+    """Standard deviations of the start, see `tuner.objective.freedom`; None where it is known."""
 
     @property
     def count(self) -> int:

@@ -18,27 +18,28 @@ from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
 from tuner.coefficients import Space
 from tuner.model import Model, with_coefficients
-from tuner.objective.lanes import CLOCKS, Lanes
+from tuner.objective.freedom import eliminated
+from tuner.objective.lanes import OFFSETS, Lanes
 from tuner.objective.residuals import Trace, fly, residuals
 from tuner.parallel import over_devices
 
 OFFSET_UNIT = 0.01
-"""s of clock offset per unit of the search's coordinate."""
+"""s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
 
 
 class Point(eqx.Module):
-    """Where the search is: what all lanes share, and each lane's own.
+    """Where the search is: what all flights share, and each flight's own.
 
     Attributes
     ----------
     coefficients
         (K,) search vector of the `Space`.
     offsets
-        (clocks, F) clock offsets in units of `OFFSET_UNIT`.
+        (offsets, N) of `OFFSETS`, a column for each flight, in units of `OFFSET_UNIT`.
     """
 
     coefficients: Float[Array, " K"]
-    offsets: Float[Array, "clocks F"]
+    offsets: Float[Array, "offsets N"]
 
 
 class Stage(eqx.Module):
@@ -49,26 +50,30 @@ class Stage(eqx.Module):
     horizon
         Samples of the simulation that are compared.
     scale
-        Channel -> (F,) factor on the standard deviations: loosened at first, more for a lane that
+        Channel -> (N,) factor on the standard deviations: loosened at first, more for a flight that
         the model cannot match.
     held
-        (clocks, F) s of clock offset for the signals that jump between samples.
+        (clocks, N) s of clock offset for the signals that jump between samples.
     huber
         Residuals beyond so many (scaled) standard deviations count linearly; infinite for plain
         squares.
     prior
         Factor on the prior's residuals.
+    states
+        (L, F) start of every lane around which is linearised, in the lanes' standard deviations;
+        None where starts are known.
     """
 
     horizon: Int[Array, ""]
-    scale: dict[str, Float[Array, " F"]]
-    held: Float[Array, "clocks F"]
+    scale: dict[str, Float[Array, " N"]]
+    held: Float[Array, "clocks N"]
     huber: Float[Array, ""]
     prior: Float[Array, ""]
+    states: Float[Array, "L F"] | None = None
 
 
 class LaneSums(eqx.Module):
-    """What one lane contributes; P = K + clocks.
+    """What one lane contributes; P = K + offsets. Where starts are free, at the best of them.
 
     Attributes
     ----------
@@ -82,6 +87,8 @@ class LaneSums(eqx.Module):
         Channel -> (F,) how many values were compared.
     crash_time
         (F,) s.
+    states
+        (L, F) best start, in the lanes' standard deviations; None where starts are known.
     """
 
     loss: Float[Array, " F"]
@@ -90,10 +97,11 @@ class LaneSums(eqx.Module):
     squares: dict[str, Float[Array, " F"]]
     counts: dict[str, Float[Array, " F"]]
     crash_time: Float[Array, " F"]
+    states: Float[Array, "L F"] | None
 
 
 class Jacobian(eqx.Module):
-    """Every residual and its derivatives at a point; P = K + clocks.
+    """Every residual and its derivatives at a point; Q = K + offsets + L.
 
     It holds P numbers for every recorded one: some 10 MB for a flight of 40 s.
 
@@ -102,14 +110,14 @@ class Jacobian(eqx.Module):
     residuals
         Channel -> (n, k, F), in unscaled standard deviations.
     columns
-        Channel -> (P, n, k, F): derivatives by the search vector, then by each clock's offset in
-        units of `OFFSET_UNIT`.
+        Channel -> (Q, n, k, F): derivatives by the search vector, then by each offset in units of
+        `OFFSET_UNIT`, then by the start in the lanes' standard deviations.
     crash_time
         (F,) s.
     """
 
     residuals: dict[str, Float[Array, "n k F"]]
-    columns: dict[str, Float[Array, "P n k F"]]
+    columns: dict[str, Float[Array, "Q n k F"]]
     crash_time: Float[Array, " F"]
 
 
@@ -135,10 +143,14 @@ class Objective(eqx.Module):
     samples: int = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
 
+    @property
+    def flights(self) -> int:
+        """How many flights the lanes belong to."""
+        return int(np.max(np.asarray(self.lanes.flight))) + 1
+
     def start(self, vector: np.ndarray[Any, Any]) -> Point:
-        """Return a point with a search vector and no clock offset."""
-        clocks = jnp.zeros((len(CLOCKS), self.lanes.count))
-        return Point(jnp.asarray(vector), clocks)
+        """Return a point with a search vector and no offset."""
+        return Point(jnp.asarray(vector), jnp.zeros((len(OFFSETS), self.flights)))
 
     @property
     def flier(self) -> Flier:
@@ -149,36 +161,79 @@ class Objective(eqx.Module):
         """Fly every lane with a search vector."""
         return self.flier.fly(self.model, self.lanes, coefficients, horizon)
 
-    def sums(self, point: Point, stage: Stage, *, derivatives: bool) -> LaneSums:
-        """Return every lane's contribution, computed on all devices."""
-        return _shared_sums(self.flier, derivatives)(
-            (self.lanes, point.offsets, stage.scale, stage.held),
-            self.model,
-            point.coefficients,
-            stage.horizon,
-            stage.huber,
+    def sums(self, point: Point, stage: Stage, *, derivatives: bool = True) -> LaneSums:
+        """Return every lane's contribution at a point, computed on all devices."""
+        alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], point)
+        found: LaneSums = jax.tree.map(
+            lambda leaf: leaf[0], self.sums_of(alone, stage, derivatives=derivatives)
         )
+        return found
+
+    def sums_of(self, points: Point, stage: Stage, *, derivatives: bool = True) -> LaneSums:
+        """Return every lane's contribution at S points; all leaves have S first."""
+        found: LaneSums = _shared_sums(self.flier, derivatives)(
+            self.data(points.offsets, stage),
+            self.model,
+            np.asarray(points.coefficients),
+            np.asarray(stage.horizon),
+            np.asarray(stage.huber),
+        )
+        return found
 
     def jacobian(self, point: Point, stage: Stage) -> Jacobian:
         """Return every residual's derivatives, computed on all devices."""
-        return _shared_jacobian(self.flier)(
-            (self.lanes, point.offsets, stage.held), self.model, point.coefficients, stage.horizon
+        found: Jacobian = _shared_jacobian(self.flier)(
+            self.data(point.offsets, stage),
+            self.model,
+            np.asarray(point.coefficients),
+            np.asarray(stage.horizon),
         )
+        return found
+
+    def data(self, offsets: Array, stage: Stage) -> LaneData:
+        """Return what each device needs of its own lanes; offsets are (\\*starts, offsets, N)."""
+        flight = np.asarray(self.lanes.flight)
+        own: LaneData = jax.tree.map(
+            np.asarray,
+            LaneData(
+                lanes=self.lanes,
+                offsets=offsets[..., flight],
+                scale={name: scale[flight] for name, scale in stage.scale.items()},
+                held=stage.held[:, flight],
+                states=stage.states,
+            ),
+        )
+        return own
+
+
+class LaneData(eqx.Module):
+    """Recordings and the part of a point and a stage that concerns them, lane by lane."""
+
+    lanes: Lanes
+    offsets: Float[Array, "*starts offsets F"]
+    scale: dict[str, Float[Array, " F"]]
+    held: Float[Array, "clocks F"]
+    states: Float[Array, "L F"] | None
 
 
 @lru_cache(maxsize=16)
 def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
-    return jax.jit(over_devices(flier.jacobian))
+    return over_devices(flier.jacobian)
 
 
 @lru_cache(maxsize=16)
 def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
-    """Return the sums over all devices, traced once however often they are used."""
+    """Return the sums over all devices for S points, compiled once however often used."""
 
-    def lanewise(data: Any, *rest: Any) -> LaneSums:
-        return flier.sums(data, *rest, derivatives=derivatives)
+    def lanewise(data: LaneData, model: Model, coefficients: Array, *rest: Any) -> LaneSums:
+        def at(vector: Array, offsets: Array) -> LaneSums:
+            own = eqx.tree_at(lambda d: d.offsets, data, offsets)
+            return flier.sums(own, model, vector, *rest, derivatives=derivatives)
 
-    return jax.jit(over_devices(lanewise))
+        found: LaneSums = jax.vmap(at)(coefficients, data.offsets)
+        return found
+
+    return over_devices(lanewise)
 
 
 @dataclass(frozen=True)
@@ -190,7 +245,14 @@ class Flier:
     samples: int
     limits: Limits
 
-    def fly(self, model: Model, lanes: Lanes, coefficients: Array, horizon: Array) -> Trace:
+    def fly(
+        self,
+        model: Model,
+        lanes: Lanes,
+        coefficients: Array,
+        horizon: Array,
+        states: Array | None = None,
+    ) -> Trace:
         """Simulate some lanes with a search vector (K,) up to a horizon in samples."""
         return fly(
             with_coefficients(model, self.space.values(coefficients)),
@@ -199,21 +261,31 @@ class Flier:
             samples=self.samples,
             horizon=horizon,
             limits=self.limits,
+            states=states,
         )
 
     def compared(
-        self, data: tuple[Lanes, Array, Array], model: Model, coefficients: Array, horizon: Array
+        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
     ) -> tuple[Trace, dict[str, Array]]:
         """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
-        lanes, offsets, held = data
-        trace = self.fly(model, lanes, coefficients, horizon)
-        rate = float(self.schedule.log_rate)
-        late = offsets * OFFSET_UNIT
-        return trace, residuals(trace, lanes, late, held, rate=rate, horizon=horizon)
+        trace = self.fly(model, data.lanes, coefficients, horizon, data.states)
+        return trace, self._compare(data, horizon, trace, data.offsets)
+
+    def _compare(
+        self, data: LaneData, horizon: Array, trace: Trace, offsets: Array
+    ) -> dict[str, Array]:
+        return residuals(
+            trace,
+            data.lanes,
+            offsets * OFFSET_UNIT,
+            data.held,
+            rate=float(self.schedule.log_rate),
+            horizon=horizon,
+        )
 
     def sums(
         self,
-        data: tuple[Lanes, Array, dict[str, Array], Array],
+        data: LaneData,
         model: Model,
         coefficients: Array,
         horizon: Array,
@@ -222,78 +294,84 @@ class Flier:
         derivatives: bool,
     ) -> LaneSums:
         """Return what some lanes contribute; see `Objective.sums`."""
-        lanes, offsets, scale, held = data
-        rate = float(self.schedule.log_rate)
-
-        def simulate(vector: Array) -> Trace:
-            return self.fly(model, lanes, vector, horizon)
-
-        def compare(trace: Trace, clocks: Array) -> dict[str, Array]:
-            return residuals(trace, lanes, clocks * OFFSET_UNIT, held, rate=rate, horizon=horizon)
-
-        if derivatives:
-            trace, moved = _jacobian_forward(simulate, coefficients)
+        if derivatives or data.states is not None:
+            trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
         else:
-            trace, moved = simulate(coefficients), None
-        errors = compare(trace, offsets)
+            trace, errors = self.compared(data, model, coefficients, horizon)
+            columns = None
         squares = {name: jnp.sum(e * e, axis=(0, 1)) for name, e in errors.items()}
-        counts = {name: _count(lanes, name, rate, horizon) for name in errors}
-        scaled = {name: e / scale[name] for name, e in errors.items()}
+        rate = float(self.schedule.log_rate)
+        counts = {name: _count(data.lanes, name, rate, horizon) for name in errors}
+        scaled = {name: e / data.scale[name] for name, e in errors.items()}
         loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled.values()), jnp.zeros(()))
-        lanes_here = offsets.shape[-1]
-        size = len(coefficients) + len(offsets)
-        gradient, hessian = jnp.zeros((size, lanes_here)), jnp.zeros((size, size, lanes_here))
-        if moved is not None:
-            columns = _columns(compare, trace, moved, offsets)
-            gradient, hessian = _normal(columns, scaled, scale, huber)
-        return LaneSums(0.5 * loss, gradient, hessian, squares, counts, trace.crash_time)
+        loss = 0.5 * loss
+        lanes = jnp.shape(data.offsets)[-1]
+        size = len(coefficients) + len(OFFSETS)
+        gradient, hessian, states = jnp.zeros((size, lanes)), jnp.zeros((size, size, lanes)), None
+        if columns is not None:
+            gradient, hessian = _normal(columns, scaled, data.scale, huber)
+        if data.states is not None:
+            loss, gradient, hessian, states = eliminated(loss, gradient, hessian, data.states)
+        return LaneSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
 
     def jacobian(
-        self, data: tuple[Lanes, Array, Array], model: Model, coefficients: Array, horizon: Array
+        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
     ) -> Jacobian:
         """Return every residual of some lanes and its derivatives."""
-        lanes, offsets, held = data
-        rate = float(self.schedule.log_rate)
+        trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
+        return Jacobian(errors, columns, trace.crash_time)
 
-        def compare(trace: Trace, clocks: Array) -> dict[str, Array]:
-            return residuals(trace, lanes, clocks * OFFSET_UNIT, held, rate=rate, horizon=horizon)
+    def _with_columns(
+        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
+    ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
+        """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 
+        An offset does not enter the simulation, so that its column costs an interpolation.
+        """
+        offsets = data.offsets
         trace, moved = _jacobian_forward(
-            lambda vector: self.fly(model, lanes, vector, horizon), coefficients
+            lambda vector, starts: self.fly(model, data.lanes, vector, horizon, starts),
+            coefficients,
+            data.states,
         )
-        columns = _columns(compare, trace, moved, offsets)
-        return Jacobian(compare(trace, offsets), columns, trace.crash_time)
+
+        def compare(flown: Trace, late: Array) -> dict[str, Array]:
+            return self._compare(data, horizon, flown, late)
+
+        by_flight = jax.vmap(
+            lambda change: jax.jvp(lambda flown: compare(flown, offsets), (trace,), (change,))[1]
+        )(moved)
+        each = jnp.eye(len(offsets), dtype=offsets.dtype)[:, :, None] * jnp.ones_like(offsets)
+        by_offset = jax.vmap(
+            lambda change: jax.jvp(lambda late: compare(trace, late), (offsets,), (change,))[1]
+        )(each)
+        count = len(coefficients)
+        columns = {
+            name: jnp.concatenate([flown[:count], by_offset[name], flown[count:]])
+            for name, flown in by_flight.items()
+        }
+        return trace, compare(trace, offsets), columns
 
 
-def _jacobian_forward(simulate: Any, vector: Array) -> tuple[Trace, Trace]:
-    """Return a simulation and its derivative to every element of a vector, (K, ...) first."""
+def _jacobian_forward(
+    simulate: Callable[[Array, Array | None], Trace], vector: Array, states: Array | None
+) -> tuple[Trace, Trace]:
+    """Return a simulation and its derivatives, first by a vector (K,), then by starts (L, F).
+
+    All lanes' starts move at once: a lane depends on its own alone.
+    """
+    basis = jnp.eye(len(vector) + (0 if states is None else len(states)), dtype=vector.dtype)
 
     def push(direction: Array) -> tuple[Trace, Trace]:
-        flown, moved = jax.jvp(simulate, (vector,), (direction,))
+        if states is None:
+            flown, moved = jax.jvp(lambda v: simulate(v, None), (vector,), (direction,))
+            return flown, moved
+        turned = direction[len(vector) :, None] * jnp.ones_like(states)
+        flown, moved = jax.jvp(simulate, (vector, states), (direction[: len(vector)], turned))
         return flown, moved
 
-    pushed: tuple[Trace, Trace] = jax.vmap(push, out_axes=(None, 0))(
-        jnp.eye(len(vector), dtype=vector.dtype)
-    )
+    pushed: tuple[Trace, Trace] = jax.vmap(push, out_axes=(None, 0))(basis)
     return pushed
-
-
-def _columns(compare: Any, trace: Trace, moved: Trace, offsets: Array) -> dict[str, Array]:
-    """Return channel -> (P, n, k, F): derivatives by coefficients, then by each clock's offset.
-
-    A clock's offset does not enter the simulation, so that its column costs an interpolation.
-    """
-    by_coefficient = jax.vmap(
-        lambda change: jax.jvp(lambda flown: compare(flown, offsets), (trace,), (change,))[1]
-    )(moved)
-    clocks = offsets.shape[0]
-    each = jnp.eye(clocks, dtype=offsets.dtype)[:, :, None] * jnp.ones_like(offsets)
-    by_clock = jax.vmap(
-        lambda change: jax.jvp(lambda late: compare(trace, late), (offsets,), (change,))[1]
-    )(each)
-    return {
-        name: jnp.concatenate([by_coefficient[name], by_clock[name]]) for name in by_coefficient
-    }
 
 
 def _normal(

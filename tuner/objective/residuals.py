@@ -14,7 +14,8 @@ from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
-from tuner.objective.lanes import CLOCK_OF, Lanes, Measured
+from tuner.objective.freedom import moved, spun_up
+from tuner.objective.lanes import CLOCK_OF, CLOCKS, Lanes, Measured
 
 
 class Trace(eqx.Module):
@@ -40,14 +41,28 @@ def fly(
     samples: int,
     horizon: Int[Array, ""],
     limits: Limits,
+    states: Float[Array, "L F"] | None = None,
 ) -> Trace:
-    """Simulate every lane up to a horizon in samples."""
+    """Simulate every lane up to a horizon in samples.
+
+    Parameters
+    ----------
+    model, lanes, schedule, samples, horizon, limits
+        As of `sim_jax.rollout.rollout`.
+    states
+        How far the starts lie from the recorded ones, in the lanes' standard deviations.
+    """
+    start = lanes.start
+    if lanes.turning is not None:
+        start = spun_up(start, model.vehicle, lanes.turning)
+    if states is not None and lanes.freedom is not None:
+        start = moved(start, states * lanes.freedom)
     flown = rollout(
         model.vehicle,
         model.controller,
         schedule,
         lanes.inlet,
-        lanes.start,
+        start,
         samples=samples,
         horizon=horizon,
         limits=limits,
@@ -68,7 +83,7 @@ def fly(
 def residuals(
     trace: Trace,
     lanes: Lanes,
-    offsets: Float[Array, "clocks F"],
+    offsets: Float[Array, "offsets F"],
     held: Float[Array, "clocks F"],
     *,
     rate: float,
@@ -83,7 +98,8 @@ def residuals(
     lanes
         The recording.
     offsets
-        s by which each clock's stamps are late: a sample stamped t was taken at t - offset.
+        s by which each clock's stamps are late: a sample stamped t was taken at t - offset; then
+        rad/s by which the gyro reads too much about each axis.
     held
         Offsets at which signals that jump between samples are read exactly; from there to
         ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
@@ -101,6 +117,8 @@ def residuals(
             simulated = _held_then_moved(trace.channels[name], before, place)
         else:
             simulated = _between(trace.channels[name], place)
+        if name == "body_rate":
+            simulated = simulated + offsets[len(CLOCKS) :]
         if name == "attitude":
             error = _attitude_error(measured, simulated)
         else:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -17,14 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.lanes import CLOCKS
 from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
 from tuner.search.fitted import Iteration
-from tuner.search.levenberg_marquardt import Step, advance, begin
+from tuner.search.levenberg_marquardt import Step, advance, begin, on_host
 
-HORIZONS = (1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
-"""s; the whole flights follow."""
-LOOSENING = (20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
+HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
+"""s; the whole flights follow. The first are so short that even a vehicle with a third of the
+thrust is still near where it began, so that a bad start has a slope to go down."""
+LOOSENING = (20.0, 20.0, 20.0, 20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
 """Factor on every standard deviation, stage by stage; 1 on whole flights."""
+GENTLE = 1.0
+"""s of horizon below which a Jacobian costs so little that a leg may take its time."""
 OFFSETS_FROM = 5.0
 """s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
 STRAY = 3.0
@@ -34,9 +38,12 @@ FEEDBACK_AT = 3.0
 """s of horizon at which the mixer's saturation feedback is tried both ways."""
 FEEDBACK_GAIN = 1.2
 """The set-up's own choice is given up only for one that lowers the loss by this factor."""
-NO_OFFSET = 0.0005
+NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
-differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia."""
+differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
+gyro that reads so little when at rest is taken to have no bias."""
+FAR = 5.0
+"""Standard deviations beyond which no start is believed to lie."""
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
 
@@ -88,8 +95,8 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     loosening=loosening,
                     robust=False,
                     offsets=seconds >= OFFSETS_FROM,
-                    steps=min(8, steps),
-                    tolerance=0.02,
+                    steps=min(16 if seconds < GENTLE else 8, steps),
+                    tolerance=0.005 if seconds < GENTLE else 0.02,
                     rescale=False,
                 )
             )
@@ -111,7 +118,9 @@ class Progress:
     points
         S points.
     scales
-        Channel -> (F,) how much larger than the noise the residuals are taken to be.
+        Channel -> (N,) how much larger than the noise the residuals are taken to be.
+    states
+        (L, F) starts of the lanes, in their standard deviations; None where they are known.
     losses
         (S,) at the end of the last leg.
     iterations
@@ -129,6 +138,7 @@ class Progress:
     leg: int
     points: Point
     scales: dict[str, NDArray[np.float64]]
+    states: NDArray[np.float64] | None
     losses: NDArray[np.float64]
     iterations: tuple[Iteration, ...]
     evaluations: int
@@ -140,12 +150,13 @@ class Progress:
 
 def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
     """Return the state before the first leg for S start vectors (S, K)."""
-    offsets = jnp.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
-    lanes = objective.lanes.count
+    offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
+    freedom = objective.lanes.freedom
     return Progress(
         leg=0,
-        points=Point(jnp.asarray(vectors), offsets),
-        scales={name: np.ones(lanes) for name in objective.lanes.measured},
+        points=Point(jnp.asarray(vectors), jnp.asarray(offsets)),
+        scales={name: np.ones(objective.flights) for name in objective.lanes.measured},
+        states=None if freedom is None else np.zeros(freedom.shape),
         losses=np.full(len(vectors), np.inf),
         iterations=(),
         evaluations=0,
@@ -172,7 +183,7 @@ def grow(
     progress
         Where to begin: `beginning`, or what an earlier call yielded.
     free_offsets
-        (F,) whether a flight's clock offsets may be fitted at all.
+        (N,) or (offsets, N): which flights' offsets may be fitted at all.
     clipped
         Whether rotors were clipped low in a recording: whether the rate integrator then stops is
         tried both ways, for set-ups differ in it and a saturated yaw step shows it.
@@ -218,15 +229,15 @@ def run_leg(
     objective = with_feedback(objective, progress.feedback)
     points, kept = _offsets_that_matter(leg, progress)
     best = int(np.argmin(progress.losses))
-    stage = on_host(stage_of(leg, progress.scales, np.asarray(points.offsets[best])))
+    stage = stage_of(leg, progress.scales, np.asarray(points.offsets[best]), progress.states)
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (kept * free_offsets).ravel() * float(leg.offsets)])
     step = progress.step
     if step is None:
-        step = on_host(begin(objective, on_host(points), stage, free))
+        step = begin(on_host(points), free)
     converged = False
     while len(progress.trail) < leg.steps and not converged:
-        step = on_host(advance(objective, step, stage, free))
+        step = advance(objective, step, stage, free)
         iteration = _iteration(objective, leg, step, len(progress.iterations))
         progress = replace(
             progress,
@@ -237,14 +248,14 @@ def run_leg(
         )
         tell(progress)
         converged = _settled(progress.trail, np.asarray(step.accepted), leg.tolerance)
-    scales = strays(step, leg.loosening)
-    if leg.rescale or leg.name == WHOLE:
-        scales = misfit(step)
+    found = root_mean_squares(objective, step)
+    scales = misfit(found) if leg.rescale or leg.name == WHOLE else strays(found, leg.loosening)
     return replace(
         progress,
         leg=progress.leg + 1,
         points=step.point,
         scales=scales,
+        states=_starts(step, progress.states),
         losses=progress.trail[-1],
         converged=converged,
         step=None,
@@ -258,29 +269,36 @@ def _offsets_that_matter(leg: Leg, progress: Progress) -> tuple[Point, NDArray[n
     if not leg.rescale:
         return points, np.ones(points.offsets.shape[1:])
     best = int(np.argmin(progress.losses))
-    kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET).astype(float)
+    kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET[:, None]).astype(float)
     return Point(points.coefficients, points.offsets * kept), kept
 
 
 def stage_of(
-    leg: Leg, scales: dict[str, NDArray[np.float64]], offsets: NDArray[np.float64]
+    leg: Leg,
+    scales: dict[str, NDArray[np.float64]],
+    offsets: NDArray[np.float64],
+    states: NDArray[np.float64] | None = None,
 ) -> Stage:
-    """Return what the solver needs to know of a leg; offsets (clocks, F) in units of 10 ms."""
-    return Stage(
+    """Return what the solver needs to know of a leg.
+
+    Parameters
+    ----------
+    leg, scales
+        Horizon and weights.
+    offsets
+        (offsets, N) at which commands are read exactly, as in a `Point`.
+    states
+        (L, F) starts around which is linearised.
+    """
+    stage = Stage(
         horizon=jnp.asarray(leg.horizon),
         scale={name: jnp.asarray(leg.loosening * scale) for name, scale in scales.items()},
-        held=jnp.asarray(offsets * OFFSET_UNIT),
+        held=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
         huber=jnp.asarray(HUBER if leg.robust else np.inf),
         prior=jnp.asarray(1.0),
+        states=None if states is None else jnp.asarray(states),
     )
-
-
-def on_host(tree: Any) -> Any:
-    """Return a pytree with numpy leaves: the same compiled step then serves every iteration.
-
-    What comes back from several devices would otherwise count as another kind of argument.
-    """
-    return jax.tree.map(np.asarray, tree)
+    return cast(Stage, on_host(stage))
 
 
 def _settled(
@@ -298,19 +316,30 @@ def _settled(
     return bool(np.all((accepted & still(trail[-2])) | stuck))
 
 
-def root_mean_squares(step: Step, start: int) -> dict[str, NDArray[np.float64]]:
-    """Return channel -> (F,) root mean square residual in σ at the point tried, NaN if none."""
-    found = {}
+def _starts(step: Step, before: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    """Return the lanes' starts that the best of the points asks for."""
+    if before is None or step.sums is None or step.sums.states is None:
+        return before
+    asked = np.asarray(step.sums.states[int(np.argmin(step.loss))])
+    return np.clip(np.where(np.isfinite(asked), asked, before), -FAR, FAR)
+
+
+def root_mean_squares(objective: Objective, step: Step) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (N,) root mean square residual in σ at the best start's point, or NaN."""
+    assert step.sums is not None
+    best, found = int(np.argmin(step.loss)), {}
+    flight, flights = np.asarray(objective.lanes.flight), objective.flights
     for name, squares in step.sums.squares.items():
-        counts = np.asarray(step.sums.counts[name][start])
-        mean = np.asarray(squares[start]) / np.maximum(counts, 1.0)
+        counts = np.bincount(flight, np.asarray(step.sums.counts[name][best]), flights)
+        mean = np.bincount(flight, np.asarray(squares[best]), flights) / np.maximum(counts, 1.0)
         found[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
     return found
 
 
-def strays(step: Step, loosening: float) -> dict[str, NDArray[np.float64]]:
+def strays(
+    found: dict[str, NDArray[np.float64]], loosening: float
+) -> dict[str, NDArray[np.float64]]:
     """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
-    found = root_mean_squares(step, int(np.argmin(np.asarray(step.loss))))
     table = np.stack(list(found.values())) / loosening
     with np.errstate(all="ignore"):
         per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
@@ -322,9 +351,8 @@ def strays(step: Step, loosening: float) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def misfit(step: Step) -> dict[str, NDArray[np.float64]]:
+def misfit(found: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
-    found = root_mean_squares(step, int(np.argmin(np.asarray(step.loss))))
     return {name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in found.items()}
 
 
@@ -342,7 +370,7 @@ def _iteration(objective: Objective, leg: Leg, step: Step, number: int) -> Itera
 
 
 def _position_rmse(objective: Objective, step: Step, start: int) -> float:
-    if "position" not in objective.lanes.measured:
+    if step.sums is None or "position" not in objective.lanes.measured:
         return float("nan")
     weight = np.asarray(objective.lanes.measured["position"].weight)
     sigma = 1.0 / weight.max(initial=1e-30)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
+from tuner.coefficients import Space
 from tuner.objective.normal import LaneSums, Objective, Point, Stage
 
+_Before: TypeAlias = tuple[Point, Any, LaneSums]
+"""Best points, solver states and the sums at the points that these wanted to try."""
 RIDGE = 1e-13
 """Relative to the largest diagonal element: keeps a singular Hessian factorisable."""
 
@@ -28,7 +32,7 @@ class Step(eqx.Module):
     solver
         optimistix's own state.
     sums
-        The lanes' sums at the point that was tried, gradient and Hessian included.
+        The lanes' sums at the point that was tried, gradient and Hessian included; None before.
     loss
         Scalar: the loss at the best point, per compared value.
     accepted
@@ -37,21 +41,30 @@ class Step(eqx.Module):
 
     point: Point
     solver: Any
-    sums: LaneSums
+    sums: LaneSums | None
     loss: Float[Array, ""]
     accepted: Array
 
 
 def total(
-    objective: Objective, point: Point, stage: Stage, sums: LaneSums
+    space: Space, flight: ArrayLike, point: Point, stage: Stage, sums: LaneSums
 ) -> tuple[Array, Array, Array]:
-    """Return loss, gradient (P,) and Hessian (P, P) over all lanes, priors and offsets included.
+    """Return loss, gradient (P,) and Hessian (P, P) over all lanes, priors included.
 
-    The parameters are the coefficients, then the offsets clock by clock; everything is divided by
-    the number of compared values, so that damping means the same at every horizon.
+    The parameters are the coefficients, then the flights' offsets, one kind after the other;
+    everything is divided by the number of compared values, so that damping means the same at every
+    horizon.
+
+    Parameters
+    ----------
+    space
+        Free coefficients and their priors.
+    flight
+        (F,) number of the flight that each lane belongs to.
+    point, stage, sums
+        Where, in which terms, and what the lanes contribute there.
     """
-    space, count = objective.space, len(objective.space)
-    clocks, lanes = point.offsets.shape
+    count, (kinds, flights) = len(space), point.offsets.shape
     compared = jnp.maximum(sum(jnp.sum(n) for n in sums.counts.values()), 1.0)
     mean, sd = jnp.asarray(space.prior_mean), jnp.asarray(space.prior_sd)
 
@@ -59,77 +72,61 @@ def total(
         return (space.scaled(vector) - mean) / sd * stage.prior
 
     pull, slope = jax.jvp(prior, (point.coefficients,), (jnp.ones(count),))
-    clock_pull = point.offsets / OFFSET_SD
-    loss = jnp.sum(sums.loss) + 0.5 * (jnp.sum(pull**2) + jnp.sum(clock_pull**2))
-    size = count + clocks * lanes
-    gradient, hessian = jnp.zeros(size), jnp.zeros((size, size))
-    gradient = gradient.at[:count].set(jnp.sum(sums.gradient[:count], axis=-1) + slope * pull)
+    offset_pull = point.offsets / OFFSET_SD
+    loss = jnp.sum(sums.loss) + 0.5 * (jnp.sum(pull**2) + jnp.sum(offset_pull**2))
+    owner = (jnp.arange(flights)[:, None] == jnp.asarray(flight)).astype(sums.gradient.dtype)
+    own_gradient = sums.gradient[count:] @ owner.T + offset_pull / OFFSET_SD
+    gradient = jnp.concatenate(
+        [jnp.sum(sums.gradient[:count], axis=-1) + slope * pull, own_gradient.ravel()]
+    )
     shared = jnp.sum(sums.hessian[:count, :count], axis=-1) + jnp.diag(slope**2)
-    hessian = hessian.at[:count, :count].set(shared)
-    for clock in range(clocks):
-        own = count + clock * lanes + jnp.arange(lanes)
-        gradient = gradient.at[own].set(
-            sums.gradient[count + clock] + clock_pull[clock] / OFFSET_SD
-        )
-        across = sums.hessian[:count, count + clock]
-        hessian = hessian.at[:count, own].set(across).at[own, :count].set(across.T)
-        for other in range(clocks):
-            theirs = count + other * lanes + jnp.arange(lanes)
-            hessian = hessian.at[own, theirs].set(sums.hessian[count + clock, count + other])
-        hessian = hessian.at[own, own].add(1.0 / OFFSET_SD**2)
+    across = (sums.hessian[:count, count:] @ owner.T).reshape(count, -1)
+    own = sums.hessian[count:, count:] @ owner.T  # (kinds, kinds, N): a flight's own alone
+    spread = own[:, :, :, None] * jnp.eye(flights)
+    block = jnp.moveaxis(spread, 2, 1).reshape(kinds * flights, kinds * flights)
+    block = block + jnp.eye(len(block)) / OFFSET_SD**2
+    hessian = jnp.block([[shared, across], [across.T, block]])
     return loss / compared, gradient / compared, hessian / compared
 
 
 OFFSET_SD = 2.0
-"""Prior of a clock's offset, in its unit of 10 ms: an offset is likelier small than large."""
+"""Prior of an offset, in its unit of 10 ms or 0.01 rad/s: likelier small than large."""
 
 
 def _pack(point: Point) -> Array:
     return jnp.concatenate([point.coefficients, point.offsets.reshape(-1)])
 
 
-def _unpack(objective: Objective, packed: Array) -> Point:
-    count = len(objective.space)
-    return Point(packed[:count], packed[count:].reshape(-1, objective.lanes.count))
+def _unpack(packed: Array, like: Point) -> Point:
+    count = len(like.coefficients)
+    return Point(packed[:count], packed[count:].reshape(like.offsets.shape))
 
 
-def _square_problem(objective: Objective, stage: Stage, free: ArrayLike) -> Any:
+def _square_problem(loss: Array, gradient: Array, hessian: Array, free: ArrayLike) -> Any:
     """Return a least-squares function with as many residuals as parameters, plus one.
 
-    Its derivative rule gives residuals r and Jacobian J with ½|r|² the loss, Jᵀr its gradient and
-    JᵀJ the Gauss-Newton Hessian: a solver takes the very steps that it would take on all the
-    residuals, without seeing them. Evaluated alone, it costs one simulation.
+    It knows one point alone, where its value and its derivative rule give residuals r and Jacobian
+    J with ½|r|² the loss, Jᵀr its gradient and JᵀJ the Gauss-Newton Hessian: a solver takes the
+    very step that it would take on all the residuals, without seeing them.
     """
     free = jnp.asarray(free)
-
-    def evaluate(packed: Array, *, derivatives: bool) -> tuple[Array, Array, Array, LaneSums]:
-        point = _unpack(objective, packed)
-        sums = objective.sums(point, stage, derivatives=derivatives)
-        return (*total(objective, point, stage, sums), sums)
+    gradient = gradient * free
+    hessian = hessian * free[:, None] * free[None] + jnp.diag(1.0 - free)
+    ridge = RIDGE * jnp.max(jnp.diag(hessian))
+    factor = jnp.linalg.cholesky(hessian + ridge * jnp.eye(len(free)))
+    residual = jax.scipy.linalg.solve_triangular(factor, gradient, lower=True)
+    rest = jnp.sqrt(jnp.maximum(2.0 * loss - residual @ residual, 0.0))
+    value = jnp.concatenate([residual, rest[None]])
 
     @jax.custom_jvp
-    def square(packed: Array) -> tuple[Array, LaneSums]:
-        loss, _, _, sums = evaluate(packed, derivatives=False)
-        last = jnp.sqrt(2.0 * loss)
-        return jnp.concatenate([jnp.zeros_like(packed), last[None]]), sums
+    def square(packed: Array) -> Array:
+        return value + 0.0 * packed[0]
 
     @square.defjvp
-    def derivative(
-        primals: tuple[Array], tangents: tuple[Array]
-    ) -> tuple[tuple[Array, LaneSums], tuple[Array, LaneSums]]:
-        (packed,), (change,) = primals, tangents
-        loss, gradient, hessian, sums = evaluate(packed, derivatives=True)
-        gradient = gradient * free
-        hessian = hessian * free[:, None] * free[None] + jnp.diag(1.0 - free)
-        ridge = RIDGE * jnp.max(jnp.diag(hessian))
-        factor = jnp.linalg.cholesky(hessian + ridge * jnp.eye(len(packed)))
-        residual = jax.scipy.linalg.solve_triangular(factor, gradient, lower=True)
-        rest = jnp.sqrt(jnp.maximum(2.0 * loss - residual @ residual, 0.0))
-        pushed = jnp.concatenate([factor.T @ change, jnp.zeros(1, packed.dtype)])
-        quiet = jax.tree.map(jnp.zeros_like, sums)
-        return (jnp.concatenate([residual, rest[None]]), sums), (pushed, quiet)
+    def derivative(_: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+        return value, jnp.concatenate([factor.T @ tangents[0], jnp.zeros(1, value.dtype)])
 
-    return lambda packed, _: square(packed)
+    return lambda packed, _: (square(packed), None)
 
 
 class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]
@@ -148,43 +145,58 @@ class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[mi
 _SOLVER = _Solver()
 
 
-def _fresh(
-    objective: Objective, point: Point, stage: Stage, free: ArrayLike
-) -> tuple[Any, Any, Any]:
-    """Return the function, the solver's first state, and the shape of what it reports."""
-    fn = _square_problem(objective, stage, free)
-    packed = _pack(point)
-    shape, report = jax.eval_shape(lambda p: fn(p, None), packed)
-    return fn, _SOLVER.init(fn, packed, None, {}, shape, report, frozenset()), report
-
-
-def _begin(objective: Objective, point: Point, stage: Stage, free: ArrayLike) -> Step:
-    _, state, report = _fresh(objective, point, stage, free)
-    sums = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), report)
-    arrays = eqx.filter(state, eqx.is_array)
-    return Step(point, arrays, sums, jnp.asarray(jnp.inf), jnp.asarray(True))
-
-
-def _advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -> Step:
-    fn, template, _ = _fresh(objective, before.point, stage, free)
-    state = eqx.combine(before.solver, eqx.filter(template, eqx.is_array, inverse=True))
-    packed = _pack(before.point)
-    new, state, sums = _SOLVER.step(fn, packed, None, {}, state, frozenset())
-    arrays = eqx.filter(state, eqx.is_array)
-    accepted = state.num_steps_since_acceptance == 0
-    return Step(_unpack(objective, new), arrays, sums, state.f_info.as_min(), accepted)
+def _fresh(packed: Array, fn: Any) -> Any:
+    """Return the solver's first state."""
+    shape, _ = jax.eval_shape(lambda p: fn(p, None), packed)
+    return _SOLVER.init(fn, packed, None, {}, shape, None, frozenset())
 
 
 @eqx.filter_jit
-def begin(objective: Objective, points: Point, stage: Stage, free: ArrayLike) -> Step:
-    """Set a stage up at S points; their leaves have S first, and so has every leaf returned."""
-    step: Step = eqx.filter_vmap(lambda point: _begin(objective, point, stage, free))(points)
-    return step
+def _begin(packed: Array, free: ArrayLike) -> Any:
+    def one(packed: Array) -> Any:
+        still = jnp.zeros_like(packed)
+        fn = _square_problem(jnp.zeros(()), still, jnp.diag(still), free)
+        return eqx.filter(_fresh(packed, fn), eqx.is_array)
+
+    return eqx.filter_vmap(one)(packed)
 
 
 @eqx.filter_jit
+def _step(space: Space, flight: ArrayLike, before: _Before, stage: Stage, free: ArrayLike) -> Step:
+    def one(point: Point, solver: Any, sums: LaneSums) -> Step:
+        tried = _unpack(solver.y_eval, point)
+        fn = _square_problem(*total(space, flight, tried, stage, sums), free)
+        packed = _pack(point)
+        static = eqx.filter(_fresh(packed, fn), eqx.is_array, inverse=True)
+        new, state, _ = _SOLVER.step(fn, packed, None, {}, eqx.combine(solver, static), frozenset())
+        accepted = state.num_steps_since_acceptance == 0
+        arrays = eqx.filter(state, eqx.is_array)
+        return Step(_unpack(new, point), arrays, sums, state.f_info.as_min(), accepted)
+
+    after: Step = eqx.filter_vmap(one)(*before)
+    return after
+
+
+def begin(points: Point, free: ArrayLike) -> Step:
+    """Set a stage up at S points; their leaves have S first, and so has every leaf returned.
+
+    Parameters
+    ----------
+    points
+        Where the starts stand.
+    free
+        (K + offsets·N,) one for what may move, zero for what stays.
+    """
+    starts = len(points.coefficients)
+    solver = _begin(jax.vmap(_pack)(points), np.asarray(free))
+    fresh = Step(points, solver, None, jnp.full(starts, jnp.inf), jnp.ones(starts, bool))
+    return cast(Step, on_host(fresh))
+
+
 def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
+
+    The points are flown on all devices; the step itself, a small affair, is taken on one.
 
     Parameters
     ----------
@@ -195,7 +207,22 @@ def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -
     stage
         Horizon, scales, robust limit: may change without compiling again, but only at `begin`.
     free
-        (K + clocks·F,) one for what may move, zero for what stays.
+        As given to `begin`.
     """
-    after: Step = eqx.filter_vmap(lambda step: _advance(objective, step, stage, free))(before)
-    return after
+    tried = jax.vmap(_unpack)(jnp.asarray(before.solver.y_eval), before.point)
+    after = _step(
+        objective.space,
+        np.asarray(objective.lanes.flight),
+        (before.point, before.solver, objective.sums_of(on_host(tried), stage)),
+        stage,
+        np.asarray(free),
+    )
+    return cast(Step, on_host(after))
+
+
+def on_host(tree: Any) -> Any:
+    """Return a pytree with numpy leaves: the same compiled step then serves every iteration.
+
+    What comes back from several devices would otherwise count as another kind of argument.
+    """
+    return jax.tree.map(np.asarray, tree)

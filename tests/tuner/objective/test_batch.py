@@ -21,7 +21,7 @@ def test_each_vector_gives_what_it_gives_alone(fit):
     stage = eqx.tree_at(lambda s: s.huber, stage_of(fit), jnp.asarray(2.0))
     steps = np.random.default_rng(1).normal(0.0, 0.2, (CHUNK + 1, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
-    late = jnp.full((2, 2), 0.1)
+    late = jnp.full((5, 2), 0.1)
     batch = evaluate(fit, vectors, Point(jnp.asarray(vectors[0]), late), stage)
     assert batch.loss.shape == (CHUNK + 1, 2)
     for number in (0, 3, CHUNK):

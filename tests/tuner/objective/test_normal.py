@@ -20,13 +20,13 @@ def fit():
 def loss_at(fit, coefficients, offsets, stage):
     point = Point(jnp.asarray(coefficients), jnp.asarray(offsets))
     sums = fit.sums(point, stage, derivatives=True)
-    return total(fit, point, stage, sums)
+    return total(fit.space, fit.lanes.flight, point, stage, sums)
 
 
 def test_gradient_equals_finite_differences(fit):
     stage = stage_of(fit)
     at = np.asarray(fit.space.initial) + 0.1
-    late = np.full((2, 2), 0.05)
+    late = np.full((5, 2), 0.05)
     _, gradient, _ = loss_at(fit, at, late, stage)
     for index in range(len(at)):
         step = np.zeros_like(at)
@@ -39,10 +39,10 @@ def test_gradient_equals_finite_differences(fit):
 def test_offset_gradient_equals_finite_differences(fit):
     stage = stage_of(fit)
     at = np.asarray(fit.space.initial)
-    late = np.full((2, 2), 0.03)
+    late = np.full((5, 2), 0.03)
     _, gradient, _ = loss_at(fit, at, late, stage)
-    own = gradient[len(at) :].reshape(2, 2)
-    step = np.zeros((2, 2))
+    own = gradient[len(at) :].reshape(5, 2)
+    step = np.zeros((5, 2))
     step[0, 0] = 1e-4
     up, _, _ = loss_at(fit, at, late + step, stage)
     down, _, _ = loss_at(fit, at, late - step, stage)
@@ -59,7 +59,7 @@ def test_the_truth_has_no_residual_and_no_gradient(fit):
 
 def test_hessian_is_symmetric_and_positive(fit):
     stage = stage_of(fit)
-    _, _, hessian = loss_at(fit, np.asarray(fit.space.initial), np.zeros((2, 2)), stage)
+    _, _, hessian = loss_at(fit, np.asarray(fit.space.initial), np.zeros((5, 2)), stage)
     np.testing.assert_allclose(hessian, hessian.T, rtol=1e-12)
     assert np.linalg.eigvalsh(np.asarray(hessian)).min() > 0
 
@@ -67,7 +67,7 @@ def test_hessian_is_symmetric_and_positive(fit):
 def test_a_horizon_cuts_what_is_compared(fit):
     stage = stage_of(fit)
     short = eqx.tree_at(lambda s: s.horizon, stage, jnp.asarray(400))
-    point = Point(jnp.asarray(fit.space.initial + 0.2), jnp.zeros((2, 2)))
+    point = Point(jnp.asarray(fit.space.initial + 0.2), jnp.zeros((5, 2)))
     whole = fit.sums(point, stage, derivatives=True)
     part = fit.sums(point, short, derivatives=True)
     assert float(part.counts["position"][0]) == pytest.approx(
@@ -79,7 +79,7 @@ def test_a_horizon_cuts_what_is_compared(fit):
 def test_huber_counts_large_residuals_linearly(fit):
     stage = stage_of(fit)
     robust = eqx.tree_at(lambda s: s.huber, stage, jnp.asarray(2.0))
-    point = Point(jnp.asarray(fit.space.initial + 0.5), jnp.zeros((2, 2)))
+    point = Point(jnp.asarray(fit.space.initial + 0.5), jnp.zeros((5, 2)))
     plain = fit.sums(point, stage, derivatives=True)
     bounded = fit.sums(point, robust, derivatives=True)
     assert float(jnp.sum(bounded.loss)) < float(jnp.sum(plain.loss))
@@ -89,7 +89,7 @@ def test_huber_counts_large_residuals_linearly(fit):
 
 
 def test_a_late_clock_is_found_in_its_own_column(fit):
-    late = Point(truth(fit).coefficients, jnp.full((2, 2), 0.02 / OFFSET_UNIT))
+    late = Point(truth(fit).coefficients, jnp.zeros((5, 2)).at[:2].set(0.02 / OFFSET_UNIT))
     shifted = with_data(fit, truth(fit))
     moved = eqx.tree_at(
         lambda o: [m.time for m in o.lanes.measured.values()],
