@@ -92,7 +92,9 @@ def is_common_scale(moves: Mapping[str, float]) -> bool:
 
 
 def _words(moves: Mapping[str, float], taking_part: Mapping[str, float], error: float) -> str:
-    size = "cannot be told at all" if error > FREE_FOR_ALL else f"is known to ±{196 * error:.2g} %"
+    size = (
+        "cannot be told at all" if error > FREE_FOR_ALL else f"is known to ±{percent(1.96 * error)}"
+    )
     if is_common_scale(moves):
         group = _listed([name for name in moves if name in SCALE_GROUP])
         return (
@@ -114,3 +116,8 @@ def _words(moves: Mapping[str, float], taking_part: Mapping[str, float], error: 
 
 def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def percent(share: float) -> str:
+    """Return a share as a percentage of two digits."""
+    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from tuner.coefficients import HABITS, Parameter, Space
 from tuner.config import COEFFICIENTS
 from tuner.identifiability.covariance import Covariance, covariance
-from tuner.identifiability.directions import Direction, weakest
+from tuner.identifiability.directions import Direction, percent, weakest
 from tuner.identifiability.evidence import Evidence, gather
-from tuner.identifiability.verdict import Standing, Verdict, judge, percent
+from tuner.identifiability.verdict import Standing, Verdict, judge
 from tuner.search.fitted import Fitted
 
 Array = NDArray[np.float64]

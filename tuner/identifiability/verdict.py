@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-from tuner.identifiability.directions import Direction
+from tuner.identifiability.directions import Direction, percent
 
 WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
@@ -109,8 +109,3 @@ def _why_not(standing: Standing, directions: Sequence[Direction]) -> str:
 
 def _at_bound(standing: Standing) -> str:
     return f"; the fit ended at its {standing.bound} bound" if standing.bound else ""
-
-
-def percent(share: float) -> str:
-    """Return a share as a percentage of two digits."""
-    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from pydantic import JsonValue
+
 from tuner.config.yaml_file import write_text
 from tuner.identifiability.knowledge import Part, read_part
 from tuner.result import AxesRmse
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 
 SEARCH_FILE = "search.json"
 LAPS_FILE = "laps.json"
+ABOUT_FILE = "about.json"
 
 
 class Move(Part):
@@ -45,6 +48,10 @@ class SearchRecord(Part):
     iterations: list[Move]
     starts: list[Start]
 
+    def write(self, folder: Path) -> None:
+        """Write ``search.json``."""
+        write_text(folder / SEARCH_FILE, self.model_dump_json(indent=1) + "\n")
+
 
 class LapRow(Part):
     """How closely one vehicle meets a flight, or one lap of it."""
@@ -61,6 +68,36 @@ class LapTable(Part):
 
     schema_version: int = 1
     rows: list[LapRow]
+
+
+class Recording(Part):
+    """A flight that something was told from."""
+
+    name: str
+    path: str
+    sha256: str
+    duration: float
+
+
+class About(Part):
+    """The content of ``about.json``: what an examination without a fit was made of."""
+
+    schema_version: int = 1
+    command: str
+    vehicle: str
+    versions: dict[str, str]
+    settings: dict[str, JsonValue]
+    flights: list[Recording]
+
+
+def write_about(folder: Path, about: About) -> None:
+    """Write ``about.json``."""
+    write_text(folder / ABOUT_FILE, about.model_dump_json(indent=1) + "\n")
+
+
+def read_about(folder: Path) -> About | None:
+    """Read ``about.json``; None where there is none."""
+    return read_part(About, folder / ABOUT_FILE)
 
 
 def write_search(folder: Path, fitted: Fitted) -> None:
@@ -87,7 +124,7 @@ def write_search(folder: Path, fitted: Fitted) -> None:
             for one in fitted.outcomes
         ],
     )
-    write_text(folder / SEARCH_FILE, record.model_dump_json(indent=1) + "\n")
+    record.write(folder)
 
 
 def _values(fitted: Fitted, vector: object) -> dict[str, float]:

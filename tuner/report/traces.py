@@ -27,12 +27,12 @@ def write_traces(
     best: Mapping[str, FlightErrors],
 ) -> None:
     """Write ``traces.npz``: per flight times in s, positions in m, roll, pitch, yaw in degrees."""
-    arrays: dict[str, Array] = {}
+    found: dict[str, dict[str, Array]] = {}
     for flight in flights:
         before, after = initial[flight.name], best[flight.name]
         place = _at(flight, "position", after.position_time)
         turn = roll_pitch_yaw(_at(flight, "attitude", after.attitude_time))
-        parts = {
+        found[flight.name] = {
             "position_time": after.position_time,
             "position": place,
             "position_initial": place + before.position,
@@ -42,8 +42,16 @@ def write_traces(
             "attitude_initial": turn + before.attitude,
             "attitude_best": turn + after.attitude,
         }
-        for name, values in parts.items():
-            arrays[f"{flight.name}/{name}"] = _thinned(values)
+    save_traces(folder, found)
+
+
+def save_traces(folder: Path, flights: Mapping[str, Mapping[str, Array]]) -> None:
+    """Write ``traces.npz`` of flight -> name -> array, thinned to what a screen can show."""
+    arrays = {
+        f"{flight}/{name}": _thinned(values)
+        for flight, parts in flights.items()
+        for name, values in parts.items()
+    }
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
     temporary = folder / f"{TRACES_FILE}.tmp"

@@ -1,0 +1,128 @@
+"""What a figure shows, apart from how it is drawn: by plotly for the page, else by matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Told apart with every common kind of colour blindness (Okabe and Ito, "Color universal design").
+#: The first stands out against light and dark alike.
+PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+GREY = "#8a8a8a"
+
+Scale = Literal["linear", "log"]
+
+
+@dataclass(frozen=True)
+class Look:
+    """How a line looks; colour alone never tells two apart."""
+
+    colour: str
+    dash: Literal["solid", "dot", "dash"] = "solid"
+    width: float = 1.5
+    marks: bool = False
+
+
+RECORDED = Look(GREY, width=4.0)
+INITIAL = Look(PALETTE[1], dash="dot")
+FITTED = Look(PALETTE[0])
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve, or points alone where ``joined`` is false."""
+
+    name: str
+    x: Sequence[float | None]
+    y: Sequence[float | None]
+    look: Look
+    joined: bool = True
+    text: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Horizontal bars, one a label; several of these in a panel are stacked."""
+
+    name: str
+    labels: Sequence[str]
+    values: Sequence[float | None]
+    colour: str
+    text: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Heat:
+    """A table of colours.
+
+    Attributes
+    ----------
+    columns, rows
+        Labels, or for columns the middles of intervals.
+    values
+        (rows, columns).
+    text
+        What each cell says when pointed at.
+    digits
+        With how many decimals each value is written into its cell; None writes nothing.
+    diverging
+        Whether zero lies in the middle: then the colours go from −``limit`` to +``limit``.
+    bar
+        Title of the colour bar.
+    ticks
+        Colour-bar position -> label, for logarithms.
+    """
+
+    columns: Sequence[str] | Sequence[float]
+    rows: Sequence[str]
+    values: Sequence[Sequence[float | None]]
+    bar: str
+    text: Sequence[Sequence[str]] = ()
+    digits: int | None = None
+    diverging: bool = False
+    limit: float = 1.0
+    ticks: dict[float, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes."""
+
+    marks: Sequence[Line | Bars | Heat]
+    y_title: str = ""
+    y_scale: Scale = "linear"
+    x_scale: Scale = "linear"
+    equal: bool = False
+    levels: Sequence[tuple[float, str]] = ()
+    """Horizontal lines and what they mean."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A figure: panels above each other with one x axis.
+
+    Attributes
+    ----------
+    key
+        Name of its file under ``plots/``.
+    title, caption
+        What it is, and how to read it.
+    height
+        Pixels on the page.
+    """
+
+    key: str
+    title: str
+    panels: Sequence[Panel]
+    x_title: str = ""
+    caption: str = ""
+    height: int = 420
+
+
+def rounded(values: NDArray[np.float64], digits: int) -> list[float | None]:
+    """Return a curve for the page, None where it is not finite."""
+    return [round(float(v), digits) if np.isfinite(v) else None for v in np.asarray(values)]

@@ -1,0 +1,91 @@
+"""Everything that a result folder holds for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from tuner.errors import InputError
+from tuner.flights.flight import Array
+from tuner.identifiability.knowledge import Knowledge, read_knowledge
+from tuner.report.record import (
+    About,
+    LapTable,
+    Recording,
+    SearchRecord,
+    read_about,
+    read_laps,
+    read_search,
+)
+from tuner.report.traces import read_traces
+from tuner.result import RESULT_FILE, Run, read_run
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A result folder, read; None for what it does not hold.
+
+    Attributes
+    ----------
+    folder
+        Where everything lies.
+    about
+        What it was made of: of a run, too.
+    run
+        The fit.
+    knowledge
+        What is known about each coefficient.
+    search, laps
+        How the fit went, and how closely laps are met.
+    traces
+        Flight -> name -> array, see `tuner.report.traces`.
+    """
+
+    folder: Path
+    about: About
+    run: Run | None
+    knowledge: Knowledge | None
+    search: SearchRecord | None
+    laps: LapTable | None
+    traces: Mapping[str, Mapping[str, Array]]
+
+
+def read_contents(folder: str | Path) -> Contents:
+    """Read the folder of a run, or of an examination without one.
+
+    Raises
+    ------
+    InputError
+        It is neither, or one of its files cannot be used.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "is no folder", "give the result folder of a run")
+    run, about = None, read_about(folder)
+    if about is None or (folder / RESULT_FILE).exists():
+        run = read_run(folder)
+        about = _about_run(run)
+    return Contents(
+        folder=folder,
+        about=about,
+        run=run,
+        knowledge=read_knowledge(folder),
+        search=read_search(folder),
+        laps=read_laps(folder),
+        traces=read_traces(folder),
+    )
+
+
+def _about_run(run: Run) -> About:
+    result = run.result
+    return About(
+        command=str(result.settings.get("command", "")),
+        vehicle=run.vehicle.name,
+        versions=result.versions,
+        settings=result.settings,
+        flights=[
+            Recording(name=f.name, path=f.path, sha256=f.sha256, duration=f.duration)
+            for f in result.flights
+        ],
+    )

@@ -1,0 +1,147 @@
+"""Charts as SVG files for papers."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tuner.config.yaml_file import write_text
+from tuner.report.chart import Bars, Chart, Heat, Line, Panel
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PLOTS = "plots"
+WIDTH = 6.3
+"""Inches: the text width of a page with usual margins."""
+PIXELS = 96.0
+"""An inch of the page on a screen."""
+DASHES = {"solid": "-", "dot": ":", "dash": "--"}
+SETTINGS: dict[Any, Any] = {
+    "font.size": 8,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "tune",
+}
+
+
+def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
+    """Write each chart as ``plots/KEY.svg`` of a folder; the same charts give the same bytes."""
+    import matplotlib as mpl  # noqa: PLC0415 (a second to import)
+
+    mpl.use("Agg", force=False)
+    (folder / PLOTS).mkdir(exist_ok=True)
+    written = []
+    with mpl.rc_context(SETTINGS):
+        for chart in charts:
+            path = folder / PLOTS / f"{chart.key}.svg"
+            write_text(path, _svg(chart))
+            written.append(path)
+    return tuple(written)
+
+
+def _svg(chart: Chart) -> str:
+    from matplotlib import pyplot as plt  # noqa: PLC0415
+
+    count = len(chart.panels)
+    figure, axes = plt.subplots(
+        count,
+        1,
+        sharex=count > 1,
+        squeeze=False,
+        figsize=(WIDTH, max(chart.height / PIXELS * 0.75, 2.0)),
+        layout="constrained",
+    )
+    for panel, place in zip(chart.panels, axes[:, 0], strict=True):
+        _draw(panel, place)
+    axes[-1, 0].set_xlabel(chart.x_title)
+    names, handles = _legend(list(axes[:, 0]))
+    if len(names) > 1:
+        figure.legend(handles, names, loc="outside upper left", ncols=min(len(names), 5))
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Title": chart.title})
+    plt.close(figure)
+    return buffer.getvalue()
+
+
+def _legend(axes: Sequence[Any]) -> tuple[list[str], list[Any]]:
+    found: dict[str, Any] = {}
+    for place in axes:
+        for handle, name in zip(*place.get_legend_handles_labels(), strict=True):
+            found.setdefault(name, handle)
+    return list(found), list(found.values())
+
+
+def _draw(panel: Panel, place: Axes) -> None:
+    base: dict[str, Any] = {}
+    for mark in panel.marks:
+        if isinstance(mark, Line):
+            _line(mark, place)
+        elif isinstance(mark, Bars):
+            _bars(mark, place, base)
+        else:
+            _heat(mark, place)
+    place.set_ylabel(panel.y_title)
+    if not any(isinstance(mark, Heat | Bars) for mark in panel.marks):
+        place.set_yscale(panel.y_scale)
+    place.set_xscale(panel.x_scale)
+    if panel.equal:
+        place.set_aspect("equal", adjustable="datalim")
+    for value, text in panel.levels:
+        place.axhline(value, linestyle="--", linewidth=0.8, color="0.4")
+        place.annotate(
+            text, (1, value), xycoords=("axes fraction", "data"), ha="right", va="bottom"
+        )
+
+
+def _line(line: Line, place: Axes) -> None:
+    look = line.look
+    place.plot(
+        np.array(line.x, dtype=float),
+        np.array([np.nan if y is None else y for y in line.y]),
+        label=line.name,
+        color=look.colour,
+        linestyle=DASHES[look.dash] if line.joined else "none",
+        linewidth=0.7 * look.width,
+        marker="o" if look.marks or not line.joined else "",
+        markersize=3,
+    )
+
+
+def _bars(bars: Bars, place: Axes, base: dict[str, Any]) -> None:
+    values = np.array([0.0 if value is None else value for value in bars.values])
+    left = base.get("left", np.zeros(len(values)))
+    place.barh(list(bars.labels), values, left=left, color=bars.colour, label=bars.name)
+    base["left"] = left + values
+    if not place.yaxis_inverted():
+        place.invert_yaxis()
+
+
+def _heat(heat: Heat, place: Axes) -> None:
+    values = np.array([[np.nan if v is None else v for v in row] for row in heat.values])
+    limits: dict[str, Any] = {}
+    if heat.diverging:
+        limits = {"vmin": -heat.limit, "vmax": heat.limit}
+    image = place.imshow(
+        values, aspect="auto", cmap="RdBu_r" if heat.diverging else "cividis", **limits
+    )
+    place.grid(visible=False)
+    place.set_yticks(range(len(heat.rows)), heat.rows)
+    if heat.columns and isinstance(heat.columns[0], str):
+        place.set_xticks(range(len(heat.columns)), [str(c) for c in heat.columns], rotation=60)
+        place.tick_params(axis="x", labelsize=6)
+    else:
+        shown = range(0, len(heat.columns), max(len(heat.columns) // 8, 1))
+        place.set_xticks(list(shown), [f"{float(heat.columns[i]):.0f}" for i in shown])
+    for (row, column), value in np.ndenumerate(values):
+        if heat.digits is not None:
+            text = f"{value:.{heat.digits}f}"
+            place.text(column, row, text, ha="center", va="center", fontsize=5)
+    bar = place.figure.colorbar(image, ax=place, label=heat.bar)
+    if heat.ticks:
+        bar.set_ticks(list(heat.ticks), labels=list(heat.ticks.values()))

@@ -1,0 +1,39 @@
+"""The page's sections, in the order in which a reader needs them.
+
+Each takes what the result folder holds and returns a `Section`, or None if there is nothing to
+show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tuner.report.contents import Contents
+from tuner.report.section import Section
+from tuner.report.sections.coefficients import coefficients
+from tuner.report.sections.effects import effects
+from tuner.report.sections.errors import errors
+from tuner.report.sections.findings import findings
+from tuner.report.sections.flights import flights
+from tuner.report.sections.information import information
+from tuner.report.sections.made import made
+from tuner.report.sections.residuals import residuals
+from tuner.report.sections.search import search
+
+SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
+    findings,
+    coefficients,
+    errors,
+    flights,
+    effects,
+    information,
+    residuals,
+    search,
+    made,
+)
+
+
+def sections_of(contents: Contents) -> tuple[Section, ...]:
+    """Return the sections that apply."""
+    found = (section(contents) for section in SECTIONS)
+    return tuple(one for one in found if one is not None)

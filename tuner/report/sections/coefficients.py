@@ -1,0 +1,105 @@
+"""Each coefficient: its value, how well it is known, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tuner.config import COEFFICIENTS
+from tuner.identifiability.knowledge import Known
+from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
+from tuner.report.contents import Contents
+from tuner.report.section import Section
+from tuner.result import CoefficientResult
+
+#: Verdict -> class of its badge, sign before it and colour of its bar.
+VERDICTS = {
+    "well known": ("well", "●", PALETTE[2]),
+    "weakly known": ("weak", "◐", PALETTE[4]),
+    "not identifiable": ("not", "○", PALETTE[1]),
+    "kept as given": ("kept", "–", GREY),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table; numbers in ``unit``."""
+
+    name: str
+    meaning: str
+    unit: str
+    initial: float | None
+    best: float
+    error: float | None
+    interval: tuple[float | None, float | None] | None
+    verdict: str
+    badge: str
+    sign: str
+    reason: str
+
+
+def coefficients(contents: Contents) -> Section | None:
+    """Return the table and how wide the intervals are."""
+    if contents.run is not None:
+        rows = [_fitted(name, one) for name, one in contents.run.result.coefficients.items()]
+    elif contents.knowledge is not None:
+        rows = [_known(name, one) for name, one in contents.knowledge.coefficients.items()]
+    else:
+        return None
+    charts = [] if contents.knowledge is None else _intervals(contents.knowledge.coefficients)
+    values = {"rows": rows, "fit": contents.run is not None}
+    return Section("coefficients", "Coefficients", values, charts)
+
+
+def _fitted(name: str, one: CoefficientResult) -> Row:
+    verdict, colon, reason = one.note.partition(": ")
+    if verdict not in VERDICTS:
+        verdict, reason = "kept as given", one.note
+    elif not colon:
+        reason = ""
+    return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (verdict, reason))
+
+
+def _known(name: str, one: Known) -> Row:
+    reason = one.reason if one.fitted else f"were it fitted with the others: {one.reason}"
+    return _row(name, (None, one.value), (one.std_error, one.ci95), (one.verdict, reason))
+
+
+def _row(
+    name: str,
+    values: tuple[float | None, float],
+    spread: tuple[float | None, tuple[float | None, float | None] | None],
+    judged: tuple[str, str],
+) -> Row:
+    badge, sign, _ = VERDICTS[judged[0]]
+    about = COEFFICIENTS[name]
+    return Row(name, about.meaning, about.unit, *values, *spread, judged[0], badge, sign, judged[1])
+
+
+def _intervals(known: dict[str, Known]) -> list[Chart]:
+    """Return half the 95 % interval of every coefficient, relative to its value."""
+    wide = {
+        name: min(196.0 * one.std_error / one.step, 1000.0)
+        for name, one in known.items()
+        if one.std_error and one.step
+    }
+    if not wide:
+        return []
+    order = sorted(wide, key=wide.__getitem__)
+    bars = []
+    for verdict, (_, sign, colour) in VERDICTS.items():
+        own = [wide[name] if known[name].verdict == verdict else None for name in order]
+        if any(value is not None for value in own):
+            texts = [f"{name}: ±{wide[name]:.2g} %, {known[name].verdict}" for name in order]
+            labels = [name if known[name].fitted else f"{name} (fixed)" for name in order]
+            bars.append(Bars(f"{sign} {verdict}", labels, own, colour, texts))
+    return [
+        Chart(
+            key="intervals",
+            title="How closely each coefficient is known",
+            caption="Half the 95 % interval. For one that is fixed: what it would be, were it "
+            "fitted with the others.",
+            panels=(Panel(bars, x_scale="log"),),
+            x_title="± % of the value (of its usual uncertainty where the value is smaller)",
+            height=120 + 24 * len(order),
+        )
+    ]

@@ -1,0 +1,138 @@
+"""What each coefficient does to each recorded signal, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuner.identifiability.knowledge import Knowledge, OutputChange
+from tuner.report.chart import Chart, Heat, Panel
+from tuner.report.contents import Contents
+from tuner.report.section import Section
+
+FAINTEST = 1e-4
+"""Changes smaller than this share of the present RMSE are drawn as this."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """RMSE of one channel over all flights, for −10 % and +10 %; None where one crashed."""
+
+    down: float | None
+    up: float | None
+
+
+def effects(contents: Contents) -> Section | None:
+    """Return heat maps of the change for +1 %, and the RMSE for ±10 %."""
+    knowledge = contents.knowledge
+    if knowledge is None or not knowledge.outputs:
+        return None
+    names = [name for name in knowledge.coefficients if name in knowledge.outputs[0].change]
+    channels = [c for c in knowledge.channels if _of(knowledge, c)]
+    now = {channel: _together([o.rmse for o in _of(knowledge, channel)]) for channel in channels}
+    table = {
+        name: {
+            channel: Cell(
+                _together([o.rmse_down[name] for o in _of(knowledge, channel)]),
+                _together([o.rmse_up[name] for o in _of(knowledge, channel)]),
+            )
+            for channel in channels
+        }
+        for name in names
+    }
+    values = {
+        "units": {channel: _of(knowledge, channel)[0].unit for channel in channels},
+        "now": now,
+        "table": table,
+    }
+    charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
+    return Section("effects", "What each coefficient does", values, charts)
+
+
+def _of(knowledge: Knowledge, channel: str) -> list[OutputChange]:
+    return [output for output in knowledge.outputs if output.channel == channel]
+
+
+def _together(rmse: Sequence[float | None]) -> float | None:
+    """Return the root mean square over outputs of one unit, None if one of them failed."""
+    known = [value for value in rmse if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known) == len(rmse) else None
+
+
+def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
+    """Return coefficients against channels and axes, all flights together."""
+    signals = list(dict.fromkeys((o.channel, o.axis, o.unit) for o in knowledge.outputs))
+    rows, texts = [], []
+    for name in names:
+        shares, says = [], []
+        for channel, axis, unit in signals:
+            own = [o for o in knowledge.outputs if (o.channel, o.axis) == (channel, axis)]
+            change = float(np.sqrt(np.mean([o.change[name] ** 2 for o in own])))
+            rmse = float(np.sqrt(np.mean([o.rmse**2 for o in own])))
+            shares.append(float(np.log10(max(change / max(rmse, 1e-300), FAINTEST))))
+            each = "".join(f"<br>{o.flight}: {o.change[name]:.3g} {unit}" for o in own)
+            says.append(f"{name} +1 % changes {_name(channel, axis)} by {change:.3g} {unit}{each}")
+        rows.append(shares)
+        texts.append(says)
+    heat = Heat(
+        columns=[_name(channel, axis) for channel, axis, _ in signals],
+        rows=_labels(knowledge, names),
+        values=rows,
+        text=texts,
+        bar="change / RMSE",
+        ticks={-4.0: "≤ 0.0001", -3.0: "0.001", -2.0: "0.01", -1.0: "0.1", 0.0: "1", 1.0: "10"},
+    )
+    return Chart(
+        key="sensitivity",
+        title="Change of each signal for +1 %",
+        caption="RMS change over all flights, as a multiple of what is left between simulation and "
+        "recording: above 1 the change stands out in a single sample, and thousands of samples "
+        "show far less. Point at a cell for units and flights.",
+        panels=(Panel((heat,)),),
+        height=170 + 24 * len(names),
+    )
+
+
+def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
+    charts = []
+    for acting in knowledge.acting:
+        rows, texts = [], []
+        for name in names:
+            change = np.array(acting.change[name])
+            largest = max(float(change.max()), 1e-300)
+            start, end = acting.span[name]
+            rows.append((change / largest).round(3).tolist())
+            texts.append(
+                [
+                    f"{name}: {c:.3g} σ at {t:.1f} s<br>half of its effect from {start:.1f} "
+                    f"to {end:.1f} s"
+                    for t, c in zip(acting.time, change, strict=True)
+                ]
+            )
+        heat = Heat(
+            columns=acting.time,
+            rows=_labels(knowledge, names),
+            values=rows,
+            text=texts,
+            bar="share of its largest",
+        )
+        charts.append(
+            Chart(
+                key=f"{acting.flight}_acts",
+                title=f"{acting.flight}: when each coefficient acts",
+                panels=(Panel((heat,)),),
+                x_title="time since the mission's start [s]",
+                height=130 + 20 * len(names),
+            )
+        )
+    return charts
+
+
+def _labels(knowledge: Knowledge, names: Sequence[str]) -> list[str]:
+    return [n if knowledge.coefficients[n].fitted else f"{n} (fixed)" for n in names]
+
+
+def _name(channel: str, axis: str) -> str:
+    return f"{channel.replace('_', ' ')} {axis}"

@@ -1,0 +1,93 @@
+"""How the search went: where each start ended, and the way there."""
+
+from __future__ import annotations
+
+from tuner.report.chart import FITTED, INITIAL, PALETTE, Chart, Line, Look, Panel
+from tuner.report.contents import Contents
+from tuner.report.record import SearchRecord
+from tuner.report.section import Section
+
+
+def search(contents: Contents) -> Section | None:
+    """Return the waterfall of starts and the search's trace."""
+    if contents.run is None:
+        return None
+    charts = []
+    if contents.search is not None:
+        charts = [*_waterfall(contents.search), *_trace(contents.search)]
+    values = {"search": contents.run.result.search}
+    return Section("search", "How it was found", values, charts)
+
+
+def _waterfall(record: SearchRecord) -> list[Chart]:
+    ends = sorted((s for s in record.starts if s.loss is not None), key=lambda s: s.loss or 0.0)
+    if not ends:
+        return []
+    marks = []
+    for number, origin in enumerate(dict.fromkeys(start.origin for start in ends)):
+        own = [(rank, one) for rank, one in enumerate(ends, start=1) if one.origin == origin]
+        marks.append(
+            Line(
+                f"start: {origin}",
+                [rank for rank, _ in own],
+                [one.loss for _, one in own],
+                Look(PALETTE[number % len(PALETTE)], marks=True),
+                joined=False,
+                text=[f"{origin}: loss {one.loss:.6g}" for _, one in own],
+            )
+        )
+    failed = len(record.starts) - len(ends)
+    several = (
+        "Starts that end equally low have found the same minimum; a step is another minimum."
+        if len(ends) > 1
+        else "One start was searched from; more (search.starts in the job file) would tell "
+        "whether another minimum lies lower."
+    )
+    return [
+        Chart(
+            key="waterfall",
+            title="Where each start ended",
+            caption=several + (f" {failed} starts failed." if failed else ""),
+            panels=(Panel(marks, y_title="loss", y_scale="log"),),
+            x_title="starts, best first",
+            height=300,
+        )
+    ]
+
+
+def _trace(record: SearchRecord) -> list[Chart]:
+    moves = record.iterations
+    if not moves:
+        return []
+    steps = [float(number) for number in range(1, len(moves) + 1)]
+    texts = [f"{m.stage}, {'better' if m.accepted else 'tried, not kept'}" for m in moves]
+    rows = (
+        ("loss", [m.loss for m in moves], Look(FITTED.colour, marks=True), "log"),
+        (
+            "position RMSE [m]",
+            [m.position_rmse for m in moves],
+            Look(INITIAL.colour, marks=True),
+            "log",
+        ),
+        ("horizon [s]", [m.horizon for m in moves], Look(PALETTE[2], marks=True), "linear"),
+    )
+    panels = [
+        Panel(
+            [Line(name.partition(" [")[0], steps, values, look, text=texts)],
+            y_title=name,
+            y_scale="log" if scale == "log" else "linear",
+        )
+        for name, values, look, scale in rows
+        if any(value is not None for value in values)
+    ]
+    return [
+        Chart(
+            key="trace",
+            title="The way there",
+            caption="Each stage weighs and compares more of the flights than the one before, so "
+            "that losses of different stages do not compare.",
+            panels=panels,
+            x_title="iteration",
+            height=480,
+        )
+    ]
