@@ -1,4 +1,4 @@
-"""A batch over all devices: each takes its share of the last axis."""
+"""A batch over all devices, each its share of the last axis, and there in pieces."""
 
 from __future__ import annotations
 
@@ -9,12 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 from numpy.typing import NDArray
 
 _AXIS = "batch"
+_ROW = 768
+"""bytes that one variable of a piece may take: some fifty then lie in a first-level cache of 32 kB.
+Measured for rollouts in both precisions and for Jacobians of a dozen columns: with twice as much
+both are slower, with half as much rollouts are."""
+_FEWEST = 8
+"""Members that fill a vector register."""
 
 
 def _last_axis(tree: PyTree[Array]) -> PyTree[PartitionSpec]:
@@ -89,3 +95,61 @@ def _shared(function: Callable[..., PyTree[Array]], count: int) -> Callable[...,
         )(batch, *whole)
 
     return over_all
+
+
+def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..., PyTree[Array]]:
+    """Return the same function of a batch, computed for at most so many members at a time.
+
+    What it needs beside arguments and result does not grow with the batch then. Where the batch is
+    no multiple of the pieces, the last two overlap. May be used under jax's transformations.
+
+    Parameters
+    ----------
+    function
+        As for `over_devices`.
+    piece
+        Members at a time; see `piece_that_fits`.
+    """
+
+    @wraps(function)
+    def piecewise(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
+        size = _size(batch)
+        if size <= piece:
+            return function(batch, *whole)
+
+        def begin(number: int | Array) -> Array:
+            return jnp.minimum(number * piece, size - piece)
+
+        def part(first: Array) -> PyTree[Array]:
+            taken = jax.tree.map(
+                lambda leaf: lax.dynamic_slice_in_dim(leaf, first, piece, axis=-1), batch
+            )
+            return function(taken, *whole)
+
+        def one(number: Array, joined: PyTree[Array]) -> PyTree[Array]:
+            first = begin(number)
+            return jax.tree.map(
+                lambda into, leaf: lax.dynamic_update_slice_in_dim(into, leaf, first, axis=-1),
+                joined,
+                part(first),
+            )
+
+        shapes = jax.eval_shape(part, begin(0))
+        empty = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape[:-1], size), leaf.dtype), shapes)
+        return lax.fori_loop(0, -(-size // piece), one, empty)
+
+    return piecewise
+
+
+def piece_that_fits(itemsize: int, columns: int = 1) -> int:
+    """Return how many members to compute at a time so that a step's variables stay in the cache.
+
+    Parameters
+    ----------
+    itemsize
+        Bytes of a number: 4 or 8.
+    columns
+        Numbers that each variable holds for one member: those of a Jacobian's columns.
+    """
+    lanes = max(_FEWEST, _ROW // (itemsize * columns))
+    return 1 << (lanes.bit_length() - 1)

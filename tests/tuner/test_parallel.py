@@ -3,11 +3,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import tuner
-from tuner.parallel import over_devices
+from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 CHECK = """
 from tuner import runtime
@@ -70,3 +72,52 @@ def test_a_batch_of_unequal_sizes_is_refused() -> None:
         over_devices(lambda batch: batch)((jnp.zeros(3), jnp.zeros(4)))
     with pytest.raises(ValueError, match="last axes"):
         over_devices(lambda batch: batch)(jnp.zeros(()))
+
+
+def _flown(batch: dict[str, jax.Array], gain: jax.Array) -> dict[str, jax.Array]:
+    end, log = jax.lax.scan(
+        lambda state, push: (state * gain + push, state), batch["start"], batch["push"]
+    )
+    return {"end": end, "log": log}
+
+
+@pytest.mark.parametrize("piece", [1, 3, 4, 7, 9])
+def test_pieces_of_a_batch_give_what_the_batch_gives(piece: int) -> None:
+    random = np.random.default_rng(piece)
+    batch = {
+        "start": jnp.asarray(random.normal(size=7)),
+        "push": jnp.asarray(random.normal(size=(5, 7))),
+    }
+    gain = jnp.asarray(0.9)
+    pieces = in_pieces(_flown, piece)
+    for derive in (lambda f: f, lambda f: jax.jacfwd(f, argnums=1)):
+        want, got = derive(_flown)(batch, gain), jax.jit(derive(pieces))(batch, gain)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), got, want)
+
+    def energy(function: object) -> object:
+        return jax.grad(
+            lambda start: sum(
+                jnp.sum(leaf**2) for leaf in function({**batch, "start": start}, gain).values()
+            )
+        )(batch["start"])
+
+    np.testing.assert_allclose(energy(pieces), energy(_flown), rtol=1e-13)
+
+
+def test_pieces_bound_the_memory_between() -> None:
+    def squared_path(batch: jax.Array) -> jax.Array:
+        path = jnp.cumsum(jnp.ones((4096, 1)) * batch, axis=0)
+        return jnp.sum(jnp.sin(jax.lax.optimization_barrier(path)) ** 2, axis=0)
+
+    def needed(function: object) -> int:
+        analysis = jax.jit(function).lower(jnp.ones(256)).compile().memory_analysis()
+        return analysis.temp_size_in_bytes
+
+    assert needed(in_pieces(squared_path, 16)) < needed(squared_path) / 8
+
+
+def test_a_piece_holds_as_many_as_fit() -> None:
+    assert piece_that_fits(4) == 128
+    assert piece_that_fits(8) == 64
+    assert piece_that_fits(8, columns=12) == 8
+    assert piece_that_fits(8, columns=1000) == 8
