@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from tuner.comparison.table import Table
     from tuner.export.export import Exported, Format
     from tuner.export.sdf.snippet import Simulator
+    from tuner.job.examination import Examined
     from tuner.simulation.simulate import Simulation
 
 Named = str | Path
@@ -31,6 +32,7 @@ __all__ = [
     "export",
     "fit",
     "load_flight",
+    "sensitivity",
     "simulate",
 ]
 
@@ -166,6 +168,71 @@ def compare(
     named = {label: str(v) if isinstance(v, Path) else v for label, v in vehicles.items()}
     table, _ = compare_vehicles(options, named, [Path(path) for path in out])
     return table
+
+
+def sensitivity(
+    flights: Sequence[Named],
+    *,
+    vehicle: Named | VehicleFile | None = None,
+    controller: Named | ControllerFile | None = None,
+    mass: float | None = None,
+    config: Named | None = None,
+    free: Sequence[str] | None = None,
+    fixed: Sequence[str] | None = None,
+    topics: Named | None = None,
+    namespace: str | None = None,
+    arena: Sequence[float] | None = None,
+    out: Named | None = None,
+) -> Examined:
+    """Tell what recordings say of each coefficient of a vehicle; what ``tune sensitivity`` does.
+
+    Parameters
+    ----------
+    flights
+        Recordings, or globs.
+    vehicle, controller, mass, config, topics, namespace
+        As of `fit`; nothing is fitted, held-out flights are examined like the others.
+    free, fixed
+        Coefficients that are taken to be fitted together, as of `fit`.
+    arena
+        m from wall to wall along x and y, about the origin, and up: where the next flight must
+        fit. None takes what the recorded flights took, and some more.
+    out
+        Folder for the tables and the report; None makes one under ``runs/``.
+
+    Returns
+    -------
+    Examined
+        ``knowledge.coefficients`` has each coefficient's verdict, interval and origin,
+        ``knowledge.outputs`` what it does to each signal, ``proposals`` what to fly next, and
+        ``folder`` the tables and the report.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used; one line says what to do.
+    """
+    configure()
+    from tuner.job.examination import Request, examine_vehicle  # noqa: PLC0415 (jax)
+    from tuner.job.run import folder_for  # noqa: PLC0415
+
+    options = Options(
+        flights=[str(path) for path in flights],
+        vehicle=str(vehicle) if isinstance(vehicle, Path) else vehicle,
+        controller=str(controller) if isinstance(controller, Path) else controller,
+        mass=mass,
+        config=None if config is None else str(config),
+        fit=free,
+        fix=fixed,
+        topics=None if topics is None else str(topics),
+        namespace=namespace,
+    )
+    return examine_vehicle(
+        options,
+        Request(arena=arena),
+        out=folder_for(None if out is None else Path(out)),
+        command=f"tuner.sensitivity from Python: {options.flights}",
+    )
 
 
 def simulate(

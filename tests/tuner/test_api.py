@@ -9,6 +9,7 @@ import tuner
 from tuner import api
 from tuner.cli.compare import compare as compare_command
 from tuner.cli.export import export as export_command
+from tuner.cli.sensitivity import sensitivity as sensitivity_command
 from tuner.cli.simulate import simulate as simulate_command
 from tuner.cli.tune import tune as tune_command
 from tuner.config import ControllerFile, with_values
@@ -19,6 +20,7 @@ PEERS = {
     api.fit: (tune_command, {"free": "fit", "fixed": "fix"}, {"quiet"}),
     api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps"}),
     api.simulate: (simulate_command, {"grid": "sweep"}, {"quiet", "out"}),
+    api.sensitivity: (sensitivity_command, {"free": "fit", "fixed": "fix"}, {"quiet"}),
     api.export: (export_command, {}, {"quiet"}),
 }
 

@@ -52,6 +52,10 @@ COMMANDS = {
         "tune export runs/x --format sdf --into models/quad.sdf",
         "tune export runs/x --format px4 --out quad.params",
     ),
+    "sensitivity": (
+        "Tell what each coefficient does, how well it is known, and what to fly next.",
+        "tune sensitivity --flights lab/*.bag --vehicle runs/x/best_fit.yaml --arena 8,6,3",
+    ),
     "report": (
         "Render the page of a run again.",
         "tune report runs/demo",

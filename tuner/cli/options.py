@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextvars import ContextVar
 from typing import Annotated
 
@@ -41,3 +42,22 @@ Namespace = Annotated[
     str | None, Parameter(help="Prefix of the recorded topics that the topic map does not have.")
 ]
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.", negative=())]
+
+
+def lengths(option: str, word: str) -> tuple[float, ...]:
+    """Return the numbers of a word such as ``8,6,3``.
+
+    Raises
+    ------
+    InputError
+        One is no number above zero.
+    """
+    from tuner.errors import InputError
+
+    try:
+        numbers = tuple(float(part) for part in word.split(","))
+    except ValueError:
+        numbers = ()
+    if not numbers or not all(math.isfinite(n) and n > 0 for n in numbers):
+        raise InputError(option, f"'{word}' is no list of lengths in m", "write it as 8,6,3")
+    return numbers

@@ -14,6 +14,7 @@ from tuner.cli.tables import console
 
 if TYPE_CHECKING:
     from tuner.config import Settings
+    from tuner.job.examination import Examined
     from tuner.job.run import Listener
     from tuner.result import RunResult
 
@@ -65,6 +66,43 @@ def print_run(folder: Path, result: RunResult) -> None:
         f"{search.evaluations} Jacobians in {search.wall_time:.0f} s, {search.message}; "
         f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv)"
     )
+
+
+def print_examined(found: Examined) -> None:
+    """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    screen = console()
+    table = Table(box=None, title="Coefficients", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("value", "±", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    table.add_column("+1 % moves position by")
+    table.add_column("how well it is known")
+    for name, one in found.knowledge.coefficients.items():
+        error = "" if one.std_error is None else f"{one.std_error:.2g}"
+        label = name if one.fitted else f"{name} (fixed)"
+        told = f"{one.verdict}: {one.reason}"
+        table.add_row(label, f"{one.value:.5g}", error, one.unit, _moves(found, name), told)
+    screen.print(table)
+    for finding in found.findings:
+        screen.print(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
+    for direction in found.knowledge.directions[:1]:
+        screen.print(f"Worst determined: {direction.text}")
+    for sentence in found.proposals.sentences if found.proposals else ():
+        screen.print(sentence)
+    screen.print(f"written to {found.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")
+
+
+def _moves(found: Examined, name: str) -> str:
+    """Return the largest RMS change of a position axis, and where."""
+    changes = [
+        (output.change[name], output.axis, output.flight)
+        for output in found.knowledge.outputs
+        if output.channel == "position" and name in output.change
+    ]
+    if not changes:
+        return ""
+    change, axis, flight = max(changes)
+    return f"{1000 * change:.3g} mm ({axis}, {flight})"
 
 
 def _coefficients(result: RunResult) -> Table:

@@ -36,8 +36,8 @@ class Examination:
         Of the flights to all, the fitted first.
     residuals
         Of every flight and channel.
-    evidence
-        Information in all coefficients.
+    every, evidence
+        The problem in all coefficients, the fitted first, and the information about them.
     """
 
     uncertainty: Uncertainty
@@ -45,6 +45,7 @@ class Examination:
     bias: Array
     sensitivity: Sensitivity
     residuals: tuple[Residual, ...]
+    every: Every
     evidence: Evidence
 
 
@@ -81,6 +82,7 @@ def examine(
             objective, point, stage, jacobian, reference=reference, flights=names
         ),
         residuals=whiteness(objective, jacobian, stage, names),
+        every=every,
         evidence=evidence,
     )
 

@@ -45,13 +45,13 @@ def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
     """
     write_knowledge(knowledge, folder)
     texts = {
-        SENSITIVITY_FILE: _table(COLUMNS, _sensitivity(knowledge)),
-        SHARES_FILE: _table(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
+        SENSITIVITY_FILE: table(COLUMNS, _sensitivity(knowledge)),
+        SHARES_FILE: table(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
     }
     for name in MATRICES:
         rows = zip(knowledge.names, getattr(knowledge, name), strict=True)
         header = ("coefficient", *knowledge.names)
-        texts[f"{name}.csv"] = _table(header, ([one, *row] for one, row in rows))
+        texts[f"{name}.csv"] = table(header, ([one, *row] for one, row in rows))
     for name, text in texts.items():
         write_text(folder / name, text)
     return tuple(folder / name for name in texts)
@@ -87,7 +87,8 @@ def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
         yield [name, "", "prior", known.prior_share]
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return CSV text, numbers in full precision and nothing for None."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)

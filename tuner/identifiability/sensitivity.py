@@ -247,7 +247,9 @@ def _when(
                 time = np.asarray(measured.time)[:, lane]
                 weight = np.asarray(measured.weight)[..., lane]
                 which = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
-                rows = np.asarray(jacobian.columns[channel])[: len(moved), ..., lane] / scale[lane]
+                rows = (
+                    np.asarray(jacobian.columns[channel])[: len(moved), ..., lane] / scale[flight]
+                )
                 power = (rows**2).sum(axis=2)
                 for index in range(len(moved)):
                     squares[index, flight] += np.bincount(which, power[index], minlength=BINS)

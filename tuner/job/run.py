@@ -80,9 +80,8 @@ def run(
     from tuner.export.after_run import export_as_asked  # noqa: PLC0415
     from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.identifiability.examine import examine  # noqa: PLC0415
-    from tuner.identifiability.files import write_files  # noqa: PLC0415
-    from tuner.identifiability.telling import tell as told_of  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
+    from tuner.job.examination import write_examination  # noqa: PLC0415
     from tuner.job.prepare import Job, prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
         result_of,
@@ -96,7 +95,7 @@ def run(
 
     settings = settle(options)
     listener.settled(settings)
-    folder = _folder(out, resume)
+    folder = folder_for(out, resume=resume)
     job = prepare(settings)
     findings = check(job)
     for finding in findings:
@@ -127,7 +126,8 @@ def run(
     write_traces(folder, job.flights, *errors)
     write_laps(folder, *errors)
     write_search(folder, fitted)
-    write_files(told_of(examination, job.space, fitted.point), folder)
+    listener.message("simulating what could be flown next")
+    write_examination(folder, job, examination, fitted)
     render(folder)
     for line in export_as_asked(
         folder, settings.job.export, refly=refly, today=datetime.date.today()
@@ -136,7 +136,14 @@ def run(
     return folder, result
 
 
-def _folder(out: Path | None, resume: bool) -> Path:
+def folder_for(out: Path | None, *, resume: bool = False) -> Path:
+    """Return the folder to write into: the one named, or a new one under ``runs/``.
+
+    Raises
+    ------
+    InputError
+        A file is in the way, or nothing is named to go on in.
+    """
     if out is None:
         if resume:
             raise InputError("--resume", "needs the folder to go on in", "name it with --out")

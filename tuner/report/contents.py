@@ -9,6 +9,7 @@ from pathlib import Path
 from tuner.errors import InputError
 from tuner.flights.flight import Array
 from tuner.identifiability.knowledge import Knowledge, read_knowledge
+from tuner.identifiability.proposals import Proposals, read_proposals
 from tuner.report.record import (
     About,
     LapTable,
@@ -36,6 +37,8 @@ class Contents:
         The fit.
     knowledge
         What is known about each coefficient.
+    proposals
+        What to fly next.
     search, laps
         How the fit went, and how closely laps are met.
     traces
@@ -46,6 +49,7 @@ class Contents:
     about: About
     run: Run | None
     knowledge: Knowledge | None
+    proposals: Proposals | None
     search: SearchRecord | None
     laps: LapTable | None
     traces: Mapping[str, Mapping[str, Array]]
@@ -71,6 +75,7 @@ def read_contents(folder: str | Path) -> Contents:
         about=about,
         run=run,
         knowledge=read_knowledge(folder),
+        proposals=read_proposals(folder),
         search=read_search(folder),
         laps=read_laps(folder),
         traces=read_traces(folder),

@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 
+from tuner.identifiability.proposals import listed
 from tuner.report.contents import Contents
 from tuner.result import RunResult
 
@@ -21,7 +22,7 @@ def summary(contents: Contents) -> list[str]:
         parts = [f"{count} {'is' if count == 1 else 'are'} {v}" for v, count in counts.items()]
         if len(parts) == 1 and len(known) > 1:
             parts = [f"all {len(known)} are {known[0].verdict}"]
-        verdicts = _listed(parts)
+        verdicts = listed(parts)
         if contents.run is None:
             flights = len(contents.knowledge.flights)
             said.append(
@@ -30,6 +31,8 @@ def summary(contents: Contents) -> list[str]:
             )
         elif verdicts:
             said.append(f"Of the coefficients, {verdicts}.")
+    if contents.proposals is not None:
+        said += contents.proposals.sentences[:2]
     return said
 
 
@@ -61,7 +64,3 @@ def _length(rmse: object) -> float | None:
 
 def _metres(value: float) -> str:
     return f"{100 * value:.1f} cm" if value >= 0.01 else f"{1000 * value:.2f} mm"
-
-
-def _listed(parts: list[str]) -> str:
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -45,6 +45,27 @@ def write_traces(
     save_traces(folder, found)
 
 
+def write_simulated(
+    folder: Path, flights: Sequence[Flight], flown: Mapping[str, FlightErrors]
+) -> None:
+    """Write ``traces.npz`` of flights simulated with one vehicle."""
+    found: dict[str, dict[str, Array]] = {}
+    for flight in flights:
+        if flight.name in flown:
+            errors = flown[flight.name]
+            place = _at(flight, "position", errors.position_time)
+            turn = roll_pitch_yaw(_at(flight, "attitude", errors.attitude_time))
+            found[flight.name] = {
+                "position_time": errors.position_time,
+                "position": place,
+                "position_simulated": place + errors.position,
+                "attitude_time": errors.attitude_time,
+                "attitude": turn,
+                "attitude_simulated": turn + errors.attitude,
+            }
+    save_traces(folder, found)
+
+
 def save_traces(folder: Path, flights: Mapping[str, Mapping[str, Array]]) -> None:
     """Write ``traces.npz`` of flight -> name -> array, thinned to what a screen can show."""
     arrays = {

@@ -17,6 +17,7 @@ from tuner.report.sections.findings import findings
 from tuner.report.sections.flights import flights
 from tuner.report.sections.information import information
 from tuner.report.sections.made import made
+from tuner.report.sections.next_flight import next_flight
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 
@@ -27,6 +28,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     flights,
     effects,
     information,
+    next_flight,
     residuals,
     search,
     made,

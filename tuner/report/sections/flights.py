@@ -12,7 +12,12 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
-CURVES = {"recorded": ("", RECORDED), "initial": ("_initial", INITIAL), "fitted": ("_best", FITTED)}
+CURVES = {
+    "recorded": ("", RECORDED),
+    "initial": ("_initial", INITIAL),
+    "fitted": ("_best", FITTED),
+    "simulated": ("_simulated", FITTED),
+}
 QUANTITIES = {
     "position": (("x", "y", "z"), "m"),
     "attitude": (("roll", "pitch", "yaw"), "°"),
@@ -40,7 +45,9 @@ def flights(contents: Contents) -> Section | None:
             _errors(name, title, arrays),
             _from_above(name, title, arrays),
         ]
-    return Section("flights", "Simulated against recorded", {}, charts)
+    return Section(
+        "flights", "Simulated against recorded", {"fit": contents.run is not None}, charts
+    )
 
 
 def _over_time(name: str, title: str, quantity: str, arrays: Mapping[str, Array]) -> Chart:

@@ -1,0 +1,95 @@
+"""The command `tune sensitivity` on a recording, from the command line and from Python."""
+
+import json
+
+import pytest
+
+import tuner
+from tuner.cli import main
+from tuner.config import ControllerFile, configs_folder
+from tuner.errors import InputError
+from tuner.job.examination import arena_of
+
+
+@pytest.fixture(scope="module")
+def examined(bag, updated, tmp_path_factory):
+    out = tmp_path_factory.mktemp("examined") / "out"
+    return tuner.sensitivity(
+        [bag], vehicle=updated, controller=ControllerFile(), arena=(4.0, 4.0, 2.0), out=out
+    )
+
+
+def test_the_folder_holds_tables_matrices_and_the_report(examined):
+    names = {path.name for path in examined.folder.iterdir()}
+    assert {
+        "sensitivity.csv",
+        "sensitivity.json",
+        "information_shares.csv",
+        "correlation.csv",
+        "covariance.csv",
+        "information.csv",
+        "next_flight.csv",
+        "about.json",
+        "report.html",
+        "plots",
+    } <= names
+    about = json.loads((examined.folder / "about.json").read_text())
+    assert about["flights"][0]["name"] == "small_circle"
+    assert len(about["flights"][0]["sha256"]) == 64
+
+
+def test_the_report_says_that_nothing_was_fitted(examined):
+    text = (examined.folder / "report.html").read_text()
+    assert "nothing fitted" in text
+    assert "What to fly next" in text
+    assert "best</th>" not in text
+
+
+def test_what_matters_is_known_and_what_does_not_is_not(examined):
+    known = examined.knowledge.coefficients
+    assert known["motor_constant"].fitted
+    assert known["motor_constant"].verdict == "well known"
+    assert not known["rolling_moment_coefficient"].fitted
+    changes = {
+        name: max(o.change[name] for o in examined.knowledge.outputs if o.channel == "position")
+        for name in known
+    }
+    assert changes["motor_constant"] > 100 * changes["rolling_moment_coefficient"]
+    assert examined.proposals.arena == (4.0, 4.0, 2.0)
+
+
+def test_an_arena_is_taken_from_the_flights(flight):
+    arena = arena_of([flight])
+    assert arena.x >= 2.0
+    assert arena.z >= 1.5
+
+
+@pytest.mark.parametrize(
+    ("arena", "expected"),
+    [("8,x,3", "no list of lengths"), ("8,6", "three lengths"), ("1,1,1", "too small")],
+)
+def test_a_wrong_arena_is_one_line_and_writes_nothing(bag, tmp_path, capsys, arena, expected):
+    out = tmp_path / "out"
+    words = ["sensitivity", "--flights", str(bag), "--arena", arena, "--out", str(out)]
+    assert main(words) == 2
+    err = capsys.readouterr().err
+    assert expected in err
+    assert err.count("\n") == 1
+    assert not out.exists()
+
+
+def test_the_other_way_round_is_refused_too(bag):
+    with pytest.raises(InputError, match="--arena"):
+        tuner.sensitivity([bag], arena=(8.0, 6.0))
+
+
+@pytest.mark.slow
+def test_the_command_prints_a_line_for_each_coefficient(bag, tmp_path, capsys):
+    vehicle = configs_folder() / "vehicles" / "hovergames_updated.yaml"
+    out = tmp_path / "out"
+    words = ["sensitivity", "--flights", str(bag), "--vehicle", str(vehicle), "--out", str(out)]
+    assert main(words) == 0
+    shown = capsys.readouterr().out
+    assert "rolling_moment_coefficient (fixed)" in shown
+    assert "Worst determined:" in shown
+    assert f"written to {out}/" in shown

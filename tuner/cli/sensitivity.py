@@ -1,0 +1,78 @@
+"""``tune sensitivity``: what recordings tell of each coefficient."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tuner.cli.options import (
+    TYPED,
+    ControllerChoice,
+    Flights,
+    JobChoice,
+    Many,
+    Namespace,
+    Quiet,
+    Topics,
+    VehicleChoice,
+)
+
+
+def sensitivity(
+    *,
+    flights: Flights,
+    vehicle: VehicleChoice = None,
+    controller: ControllerChoice = None,
+    mass: float | None = None,
+    config: JobChoice = None,
+    topics: Topics = None,
+    namespace: Namespace = None,
+    fit: Annotated[list[str] | None, Many] = None,
+    fix: Annotated[list[str] | None, Many] = None,
+    arena: str | None = None,
+    out: Path | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Tell what each coefficient does, how well it is known and from what, nothing fitted.
+
+    Parameters
+    ----------
+    mass
+        The weighed take-off mass in kg, instead of the vehicle file's.
+    fit
+        Exactly these coefficients are taken to be fitted together.
+    fix
+        The usual coefficients are, without these.
+    arena
+        X,Y,Z in m from wall to wall and up, about the origin: where the next flight must fit.
+        Default: what the recorded flights took, and some more.
+    out
+        Folder for the tables and the report; default runs/ and the time.
+    """
+    from tuner.cli.options import lengths
+    from tuner.cli.progress import listening, print_examined
+    from tuner.runtime import configure
+
+    configure()
+    from tuner.config import Options
+    from tuner.job.examination import Request, examine_vehicle
+    from tuner.job.run import folder_for
+
+    options = Options(
+        flights,
+        vehicle=vehicle,
+        controller=controller,
+        mass=mass,
+        config=config,
+        topics=topics,
+        namespace=namespace,
+        fit=fit,
+        fix=fix,
+    )
+    request = Request(arena=None if arena is None else lengths("--arena", arena))
+    with listening(quiet=quiet) as listener:
+        found = examine_vehicle(
+            options, request, out=folder_for(out), command=TYPED.get(), say=listener.message
+        )
+    if not quiet:
+        print_examined(found)

@@ -1,0 +1,277 @@
+"""The command `tune sensitivity` as a function: what recordings tell of the coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.inlet import ReferenceInlet
+from tuner.comparison.compare import flights_of, offset_of
+from tuner.comparison.errors import Comparison, FlightErrors
+from tuner.config import Options, Settings, settle, values_of
+from tuner.flights.flight import Flight
+from tuner.identifiability.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
+from tuner.identifiability.examine import Examination, examine
+from tuner.identifiability.files import write_files
+from tuner.identifiability.knowledge import Knowledge
+from tuner.identifiability.next_flight import Habits, next_flights
+from tuner.identifiability.proposals import Proposals, write_proposals
+from tuner.identifiability.telling import tell as told_of
+from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
+from tuner.job.results import controller_flown, versions
+from tuner.objective.normal import Objective, Point, Stage
+from tuner.report import render
+from tuner.report.record import About, Recording, write_about
+from tuner.report.traces import write_simulated
+from tuner.search.fitted import Finding, Fitted
+from tuner.search.growing import WHOLE, beginning, schedule_of, stage_of, with_feedback
+
+FEEDBACK_GAIN = 1.2
+"""Factor on the squares by which the other saturation feedback must meet the flights better."""
+ROOM = 1.0
+"""m added to what the recorded flights took, to make an arena of it."""
+SHORTEST = 20.0
+"""s: the publisher takes ten to wind up."""
+UNTRUSTED = 10.0
+"""Residuals this many times the noise are no place from which to judge a coefficient."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """An examination's folder and what is in it."""
+
+    folder: Path
+    knowledge: Knowledge
+    proposals: Proposals | None
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be told beside the local sensitivity.
+
+    Attributes
+    ----------
+    arena
+        m along x, y and up; None takes what the recorded flights took, and some more.
+    """
+
+    arena: Sequence[float] | None = None
+
+
+def examine_vehicle(
+    options: Options,
+    request: Request,
+    *,
+    out: Path,
+    command: str = "",
+    say: Callable[[str], None] = lambda _: None,
+) -> Examined:
+    """Tell what recordings say about the coefficients of a vehicle, nothing fitted.
+
+    Parameters
+    ----------
+    options
+        Flights, vehicle and everything else that decides the simulation; held-out flights are
+        examined like the others.
+    request
+        What else is asked for.
+    out
+        The folder to write into.
+    command
+        What the user typed, for the record.
+    say
+        Is told what is being done.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used; nothing was written.
+    """
+    settings = settle(options, fits=False)
+    if request.arena is not None:
+        Arena.of(request.arena)
+    job = job_of(settings, flights_of(settings), ())
+    out.mkdir(parents=True, exist_ok=True)
+    fitted = as_it_is(job)
+    say("simulating, and differentiating by every coefficient")
+    examination = examine(fitted)
+    say("simulating what could be flown next")
+    knowledge, proposals = write_examination(out, job, examination, fitted, arena=request.arena)
+    write_simulated(out, job.flights, _flown(job, fitted))
+    write_about(out, _about(settings, job, fitted, command))
+    render(out)
+    return Examined(out, knowledge, proposals, fitted.findings)
+
+
+def write_examination(
+    folder: Path,
+    job: Job,
+    examination: Examination,
+    fitted: Fitted,
+    *,
+    arena: Sequence[float] | None = None,
+) -> tuple[Knowledge, Proposals | None]:
+    """Write what is known, and what to fly next in an arena, into a result folder."""
+    knowledge = told_of(examination, job.space, fitted.point)
+    write_files(knowledge, folder)
+    proposals = propose(job, examination, fitted.stage, arena)
+    if proposals is not None:
+        write_proposals(proposals, folder)
+    return knowledge, proposals
+
+
+def as_it_is(job: Job) -> Fitted:
+    """Return the vehicle that a job would start from as if a search had found it.
+
+    Where rotors were clipped low, whether the rate integrator then stops is tried both ways.
+    """
+    space, said = job.space, job.settings.controller.mixer.saturation_feedback
+    vector = space.vector_of(values_of(job.settings.vehicle))
+    tried = {
+        feedback: _met(with_feedback(job.objective, float(feedback)), vector)
+        for feedback in ((said, not said) if job.clipped else (said,))
+    }
+    best = min(tried, key=lambda feedback: tried[feedback].loss)
+    if tried[said].loss <= FEEDBACK_GAIN * tried[best].loss:
+        best = said
+    met = tried[best]
+    names = [flight.name for flight in job.fitted]
+    return Fitted(
+        objective=met.objective,
+        point=met.point,
+        stage=met.stage,
+        noise=job.noise,
+        scales={
+            name: {channel: float(one[i]) for channel, one in met.scale.items()}
+            for i, name in enumerate(names)
+        },
+        iterations=(),
+        outcomes=(),
+        method="none",
+        evaluations=len(tried),
+        wall_time=0.0,
+        loss_initial=met.loss,
+        loss_best=met.loss,
+        converged=True,
+        message="nothing was fitted",
+        findings=tuple(_findings(met.scale, names, feedback=None if best == said else best)),
+    )
+
+
+@dataclass(frozen=True)
+class _Met:
+    """How closely a simulation meets the recordings: the problem, weighed accordingly."""
+
+    objective: Objective
+    point: Point
+    stage: Stage
+    scale: dict[str, NDArray[np.float64]]
+    loss: float
+
+
+def _met(objective: Objective, vector: NDArray[np.float64]) -> _Met:
+    """Return a problem whose noise is scaled to the residuals where these are larger."""
+    rate = float(objective.schedule.log_rate)
+    (*_, whole) = (
+        leg
+        for leg in schedule_of(objective.samples, rate, robust=False, steps=1)
+        if leg.name == WHOLE
+    )
+    fresh, point = beginning(objective, vector[None]), objective.start(vector)
+    offsets = np.asarray(point.offsets)
+    sums = objective.sums(
+        point, stage_of(whole, fresh.scales, offsets, fresh.states), derivatives=False
+    )
+    flight = np.asarray(objective.lanes.flight)
+    scale = {}
+    for name, squares in sums.squares.items():
+        total = np.bincount(flight, np.asarray(squares), minlength=objective.flights)
+        count = np.bincount(flight, np.asarray(sums.counts[name]), minlength=objective.flights)
+        scale[name] = np.maximum(np.sqrt(total / np.maximum(count, 1.0)), 1.0)
+    stage = stage_of(whole, scale, offsets, fresh.states)
+    return _Met(objective, point, stage, scale, float(np.sum(np.asarray(sums.loss))))
+
+
+def _findings(
+    scale: Mapping[str, NDArray[np.float64]], names: Sequence[str], *, feedback: bool | None
+) -> Iterator[Finding]:
+    if feedback is not None:
+        yield Finding(
+            "info",
+            "saturation_feedback",
+            "rotors were clipped low, and the recordings agree with a rate integrator that "
+            f"{'stops' if feedback else 'does not stop'} then; simulated so",
+            f"say mixer.saturation_feedback: {str(feedback).lower()} in the controller file",
+        )
+    for index, name in enumerate(names):
+        worst = max(scale, key=lambda channel: scale[channel][index])
+        if scale[worst][index] > UNTRUSTED:
+            yield Finding(
+                "warning",
+                name,
+                f"is met badly: the {worst.replace('_', ' ')} differs by "
+                f"{scale[worst][index]:.0f} times its noise, and intervals are widened for it",
+                "fit first, then examine the fitted vehicle",
+            )
+
+
+def propose(
+    job: Job, examination: Examination, stage: Stage, said: Sequence[float] | None = None
+) -> Proposals | None:
+    """Return what to fly next; None where the controllers that flew are not simulated."""
+    if not isinstance(examination.every.objective.lanes.inlet, ReferenceInlet):
+        return None
+    arena = arena_of(job.flights) if said is None else Arena.of(said)
+    seconds = float(np.median([flight.duration for flight in job.fitted]))
+    habits = Habits(SPIN_CHANNELS, round(max(seconds, SHORTEST)))
+    return next_flights(examination, stage, arena=arena, habits=habits)
+
+
+def arena_of(flights: Sequence[Flight]) -> Arena:
+    """Return the room about the origin that some flights took, and a little more."""
+    places = np.concatenate([flight.series["position"].values for flight in flights])
+    x, y = (2.0 * float(np.nanmax(np.abs(places[:, axis]))) for axis in (0, 1))
+    top = float(np.nanmax(places[:, 2]))
+    least = 2.0 * CLEARANCE + 2.0 * SMALLEST
+    return Arena(
+        x=round(max(x + ROOM, least), 1),
+        y=round(max(y + ROOM, least), 1),
+        z=round(max(top + ROOM, LEVEL + CLEARANCE), 1),
+    )
+
+
+def _about(settings: Settings, job: Job, fitted: Fitted, command: str) -> About:
+    return About(
+        command=command,
+        vehicle=settings.vehicle.name,
+        versions=versions(),
+        settings={
+            "vehicle": settings.vehicle.model_dump(mode="json"),
+            "controller": settings.controller.model_dump(mode="json"),
+            "job": settings.job.model_dump(mode="json"),
+            "origin": dict(settings.origin),
+            "noise": dict(fitted.noise),
+            "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+            "findings": [vars(finding) for finding in fitted.findings],
+        },
+        flights=[
+            Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
+            for f in job.flights
+        ],
+    )
+
+
+def _flown(job: Job, fitted: Fitted) -> dict[str, FlightErrors]:
+    """Fly every flight that holds a reference whole."""
+    whole = [flight for flight in job.flights if flight.has("reference_position")]
+    if not whole:
+        return {}
+    settings = job.settings
+    offsets = {flight.name: offset_of(settings, flight.name) for flight in whole}
+    comparison = Comparison(whole, controller_flown(job, fitted), offsets)
+    return comparison.fly(settings.vehicle)
