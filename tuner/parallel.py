@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jax.extend.core import jaxpr_as_fun
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 from numpy.typing import NDArray
@@ -83,9 +84,15 @@ def _shared(function: Callable[..., PyTree[Array]], count: int) -> Callable[...,
         return function
 
     def over_all(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
-        shapes = jax.eval_shape(function, batch, *whole)
+        own = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct(
+                (*leaf.shape[:-1], leaf.shape[-1] // count), leaf.dtype
+            ),
+            batch,
+        )
+        traced, shapes = _traced(function, own, *whole)
         return jax.shard_map(
-            function,
+            traced,
             mesh=Mesh(np.array(jax.devices()[:count]), (_AXIS,)),
             in_specs=(_last_axis(batch), *[PartitionSpec()] * len(whole)),
             out_specs=_last_axis(shapes),
@@ -95,6 +102,23 @@ def _shared(function: Callable[..., PyTree[Array]], count: int) -> Callable[...,
         )(batch, *whole)
 
     return over_all
+
+
+def _traced(
+    function: Callable[..., PyTree[Array]], *arguments: PyTree[Array]
+) -> tuple[Callable[..., PyTree[Array]], PyTree[jax.ShapeDtypeStruct]]:
+    """Return a function traced for some arguments, and the shapes of what it returns.
+
+    To ask for the shapes alone would trace twice, which for derivatives of a flight takes seconds.
+    """
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    structure = jax.tree.structure(shapes)
+    flat = jaxpr_as_fun(closed)
+
+    def again(*arguments: PyTree[Array]) -> PyTree[Array]:
+        return jax.tree.unflatten(structure, flat(*jax.tree.leaves(arguments)))
+
+    return again, shapes
 
 
 def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..., PyTree[Array]]:
@@ -120,11 +144,13 @@ def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..
         def begin(number: int | Array) -> Array:
             return jnp.minimum(number * piece, size - piece)
 
-        def part(first: Array) -> PyTree[Array]:
+        def part_from(first: Array) -> PyTree[Array]:
             taken = jax.tree.map(
                 lambda leaf: lax.dynamic_slice_in_dim(leaf, first, piece, axis=-1), batch
             )
             return function(taken, *whole)
+
+        part, shapes = _traced(part_from, begin(0))
 
         def one(number: Array, joined: PyTree[Array]) -> PyTree[Array]:
             first = begin(number)
@@ -134,7 +160,6 @@ def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..
                 part(first),
             )
 
-        shapes = jax.eval_shape(part, begin(0))
         empty = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape[:-1], size), leaf.dtype), shapes)
         return lax.fori_loop(0, -(-size // piece), one, empty)
 

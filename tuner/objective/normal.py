@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
@@ -21,10 +21,14 @@ from tuner.model import Model, with_coefficients
 from tuner.objective.freedom import eliminated
 from tuner.objective.lanes import OFFSETS, Lanes
 from tuner.objective.residuals import Trace, fly, residuals
-from tuner.parallel import over_devices
+from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
+
+
+MEMORY = 2**30
+"""bytes that derivatives take at most by default while they are computed, on all devices."""
 
 
 class Point(eqx.Module):
@@ -142,6 +146,8 @@ class Objective(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
+    memory: int = eqx.field(static=True, default=MEMORY)
+    """bytes that derivatives may take while they are computed: lanes beyond take turns."""
 
     @property
     def flights(self) -> int:
@@ -155,7 +161,7 @@ class Objective(eqx.Module):
     @property
     def flier(self) -> Flier:
         """The static half, by which compiled functions are kept."""
-        return Flier(self.space, self.schedule, self.samples, self.limits)
+        return Flier(self.space, self.schedule, self.samples, self.limits, self.memory)
 
     def simulate(self, coefficients: Float[Array, " K"], horizon: Int[Array, ""]) -> Trace:
         """Fly every lane with a search vector."""
@@ -218,19 +224,32 @@ class LaneData(eqx.Module):
 
 @lru_cache(maxsize=16)
 def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
-    return over_devices(flier.jacobian)
+    def lanewise(data: LaneData, *rest: Any) -> Jacobian:
+        pieces = in_pieces(flier.jacobian, flier.lanes_at_once(data, derivatives=True))
+        found: Jacobian = pieces(data, *rest)
+        return found
+
+    return over_devices(lanewise)
 
 
 @lru_cache(maxsize=16)
 def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
     """Return the sums over all devices for S points, compiled once however often used."""
 
-    def lanewise(data: LaneData, model: Model, coefficients: Array, *rest: Any) -> LaneSums:
-        def at(vector: Array, offsets: Array) -> LaneSums:
+    def some(data: LaneData, model: Model, coefficients: Array, *rest: Any) -> LaneSums:
+        def at(point: tuple[Array, Array]) -> LaneSums:
+            vector, offsets = point
             own = eqx.tree_at(lambda d: d.offsets, data, offsets)
             return flier.sums(own, model, vector, *rest, derivatives=derivatives)
 
-        found: LaneSums = jax.vmap(at)(coefficients, data.offsets)
+        # one start after the other: lanes and columns fill the processor already
+        found: LaneSums = lax.map(at, (coefficients, data.offsets))
+        return found
+
+    def lanewise(data: LaneData, *rest: Any) -> LaneSums:
+        wanted = derivatives or data.states is not None
+        pieces = in_pieces(some, flier.lanes_at_once(data, derivatives=wanted))
+        found: LaneSums = pieces(data, *rest)
         return found
 
     return over_devices(lanewise)
@@ -244,6 +263,18 @@ class Flier:
     schedule: Schedule
     samples: int
     limits: Limits
+    memory: int = MEMORY
+
+    def lanes_at_once(self, data: LaneData, *, derivatives: bool) -> int:
+        """Return how many lanes a device flies at a time: what fits its cache and the memory."""
+        starts = 0 if data.states is None else len(data.states)
+        columns = len(self.space) + starts if derivatives else 1
+        recorded = sum(m.values.shape[0] * m.values.shape[1] for m in data.lanes.measured.values())
+        logged = self.samples * sum(m.values.shape[1] for m in data.lanes.measured.values())
+        # the flown derivatives twice, those of the residuals as such and weighted
+        one = 8 * (columns + 1) * (2 * logged + 2 * recorded)
+        share = self.memory // len(jax.devices())
+        return max(1, min(piece_that_fits(8, columns), share // one))
 
     def fly(
         self,
@@ -321,12 +352,14 @@ class Flier:
         trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
         return Jacobian(errors, columns, trace.crash_time)
 
+    @partial(jax.jit, static_argnums=0)
     def _with_columns(
         self, data: LaneData, model: Model, coefficients: Array, horizon: Array
     ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
         """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 
-        An offset does not enter the simulation, so that its column costs an interpolation.
+        An offset does not enter the simulation, so that its column costs an interpolation. Compiled
+        by name, so that all that builds on it is traced only once.
         """
         offsets = data.offsets
         trace, moved = _jacobian_forward(
