@@ -136,8 +136,7 @@ class Space:
     def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
         scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
-        share = np.clip((scaled - self._lower) / self._range, 1e-6, 1 - 1e-6)
-        return np.asarray(np.log(share / (1 - share)) * self._stretch)
+        return self.at_share((scaled - self._lower) / self._range)
 
     def scaled(self, vector: Array) -> Array:
         """Return the scaled coordinates (K,) of a search vector; traceable."""
@@ -154,13 +153,27 @@ class Space:
             for name, ratio in parameter.ratios.items()
         }
 
+    @property
+    def width(self) -> NDArray[np.float64]:
+        """The bounds' distance (K,) in the scaled coordinate."""
+        return np.asarray(self._range)
+
+    def share(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
+        return np.asarray(1.0 / (1.0 + np.exp(-vector / self._stretch)))
+
+    def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the search vector (K,) that lies so far between the bounds, just inside them."""
+        inside = np.clip(share, 1e-6, 1 - 1e-6)
+        return np.asarray(np.log(inside / (1 - inside)) * self._stretch)
+
     def from_scaled(self, index: int, scaled: float) -> float:
         """Return a parameter's value from its scaled coordinate."""
         return float(np.exp(scaled)) if self._is_log[index] else float(scaled)
 
     def slope(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
-        share = 1.0 / (1.0 + np.exp(-vector / self._stretch))
+        share = self.share(vector)
         return np.asarray(self._range * share * (1 - share) / self._stretch)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from tuner.comparison.errors import Comparison
+from tuner.comparison.layout import Layout
 from tuner.comparison.table import Table, table_of
 from tuner.comparison.write import check_suffix, write_table
 from tuner.config import (
@@ -60,7 +60,7 @@ def compare(
     named = {label: _vehicle(said) for label, said in vehicles.items()}
     flights = flights_of(settings)
     offsets = {flight.name: offset_of(settings, flight.name) for flight in flights}
-    comparison = Comparison(flights, settings.controller, offsets)
+    comparison = Layout(flights, settings.controller, settings.job, offsets)
     table = table_of({word: comparison.fly(vehicle) for word, vehicle in named.items()})
     for path in out:
         write_table(table, path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
@@ -61,6 +61,14 @@ class FlightErrors:
             self.attitude[attitudes],
             self.laps,
             self.crash_time,
+        )
+
+    def later(self, seconds: float) -> FlightErrors:
+        """Return the same errors on a clock that began so many s earlier."""
+        return replace(
+            self,
+            position_time=self.position_time + seconds,
+            attitude_time=self.attitude_time + seconds,
         )
 
     @property
@@ -137,32 +145,69 @@ class Comparison:
         attitude = np.moveaxis(np.asarray(motion.attitude.stacked(), dtype=np.float64), 0, 1)
         crashes = np.asarray(flown.crash_time, dtype=np.float64)
         return {
-            flight.name: self._errors(
-                flight, position[..., lane], attitude[..., lane], float(crashes[lane])
+            flight.name: simulated_minus_recorded(
+                flight,
+                (position[..., lane], attitude[..., lane]),
+                rate=self._schedule.log_rate,
+                late=self._offsets.get(flight.name, 0.0),
+                crash_time=float(crashes[lane]),
             )
             for lane, flight in enumerate(self._flights)
         }
 
-    def _errors(
-        self, flight: Flight, position: Array, attitude: Array, crash_time: float
-    ) -> FlightErrors:
-        clock = np.arange(len(position)) / self._schedule.log_rate
-        offset = self._offsets.get(flight.name, 0.0)
-        place_time, place = _recorded(flight, "position")
-        turn_time, turn = _recorded(flight, "attitude")
-        simulated = [np.interp(place_time - offset, clock, column) for column in position.T]
-        between = np.column_stack(
-            [np.interp(turn_time - offset, clock, column) for column in attitude.T]
-        )
-        return FlightErrors(
-            name=flight.name,
-            position_time=place_time,
-            position=np.column_stack(simulated) - place,
-            attitude_time=turn_time,
-            attitude=short_way(roll_pitch_yaw(between) - roll_pitch_yaw(turn)),
-            laps=laps_of(flight),
-            crash_time=crash_time if crash_time <= flight.duration else None,
-        )
+
+def simulated_minus_recorded(
+    flight: Flight,
+    simulated: tuple[Array, Array],
+    *,
+    rate: float,
+    late: float,
+    crash_time: float,
+) -> FlightErrors:
+    """Return the errors of a simulated flight at the recorded stamps.
+
+    Parameters
+    ----------
+    flight
+        The recording.
+    simulated
+        (n, 3) positions and (n, 4) attitudes at a rate in Hz.
+    rate
+        Hz.
+    late
+        s by which the recorded poses' stamps are late.
+    crash_time
+        s, infinite if it flew on.
+    """
+    position, attitude = simulated
+    clock = np.arange(len(position)) / rate
+    place_time, place = _recorded(flight, "position")
+    turn_time, turn = _recorded(flight, "attitude")
+    places = [np.interp(place_time - late, clock, column) for column in position.T]
+    between = np.column_stack([np.interp(turn_time - late, clock, column) for column in attitude.T])
+    return FlightErrors(
+        name=flight.name,
+        position_time=place_time,
+        position=np.column_stack(places) - place,
+        attitude_time=turn_time,
+        attitude=short_way(roll_pitch_yaw(between) - roll_pitch_yaw(turn)),
+        laps=laps_of(flight),
+        crash_time=crash_time if crash_time <= flight.duration else None,
+    )
+
+
+def joined(name: str, parts: Sequence[FlightErrors], laps: Array) -> FlightErrors:
+    """Return the errors of stretches of one flight, behind each other."""
+    crashes = [part.crash_time for part in parts if part.crash_time is not None]
+    return FlightErrors(
+        name=name,
+        position_time=np.concatenate([part.position_time for part in parts]),
+        position=np.concatenate([part.position for part in parts]),
+        attitude_time=np.concatenate([part.attitude_time for part in parts]),
+        attitude=np.concatenate([part.attitude for part in parts]),
+        laps=laps,
+        crash_time=min(crashes, default=None),
+    )
 
 
 def short_way(degrees: Array) -> Array:

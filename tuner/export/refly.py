@@ -8,7 +8,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from tuner.comparison.compare import flights_of
-from tuner.comparison.errors import Comparison
+from tuner.comparison.layout import Layout
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
 from tuner.result import RESULT_FILE, AxesRmse, Run
@@ -36,7 +36,7 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
         if flight.sha256 != wanted[flight.name].sha256:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")
     offsets = {flight.name: flight.time_offset for flight in run.result.flights}
-    flown = Comparison(flights, settings.controller, offsets).fly(vehicle)
+    flown = Layout(flights, settings.controller, settings.job, offsets).fly(vehicle)
     return {name: errors.rmse for name, errors in flown.items()}
 
 

@@ -153,7 +153,7 @@ def information(job: Job) -> NDArray[np.float64]:
     objective = job.objective
     rate = float(objective.schedule.log_rate)
     horizon = min(round(HORIZON * rate), objective.samples)
-    leg = Leg("check", horizon, 1.0, False, False, 1, 1.0, False)
+    leg = Leg("check", horizon, 1.0, False, False, 1, 1.0, False, False)
     start = beginning(objective, job.space.initial[None])
     stage = stage_of(leg, start.scales, np.asarray(start.points.offsets[0]), start.states)
     sums = objective.sums(point_of(start.points, 0), stage)

@@ -10,11 +10,13 @@ import numpy as np
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients import Space, space_of
 from tuner.comparison.compare import flights_of
+from tuner.comparison.layout import said_inlet
 from tuner.config import Settings
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
-from tuner.objective.lanes import lanes_of, noise_of
+from tuner.objective.inlets import InletName, inlet_for
+from tuner.objective.lanes import lanes_of, noise_of, window_lanes
 from tuner.objective.noise import CHANNELS
 from tuner.objective.normal import Objective
 
@@ -40,7 +42,12 @@ class Job:
         Flights.
     noise
         Channel -> standard deviation in its unit (attitude: rad).
-    space, objective
+    space
+        Free coefficients.
+    inlet
+        Where the recordings enter the simulated loop: whole flights for ``reference``, else
+        windows.
+    objective
         What is searched.
     """
 
@@ -49,6 +56,7 @@ class Job:
     held_out: tuple[Flight, ...]
     noise: Mapping[str, float]
     space: Space
+    inlet: InletName
     objective: Objective
 
     @property
@@ -92,17 +100,49 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     space = space_of(settings.vehicle, job)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
-    lanes = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted))
-    steps = max(len(flight.time) for flight in fitted) * schedule.log_rate
+    inlet = _inlet(settings, fitted)
+    longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
+    weights = _weights(settings, fitted, whole=inlet == "reference")
+    if inlet == "reference":
+        lanes, limits = lanes_of(on_time, noise=noise, weights=weights), limits_for(fitted)
+    else:
+        lanes, limits = (
+            window_lanes(
+                on_time,
+                inlet=inlet,
+                seconds=job.search.window,
+                schedule=schedule,
+                lag=settings.vehicle.motor.time_constant_up,
+                noise=noise,
+                weights=weights,
+            ),
+            AIRBORNE,
+        )
+        longest = min(longest, job.search.window + 1.0 / fitted[0].rate)
     objective = Objective(
         model=model_of(settings.vehicle, settings.controller),
         lanes=lanes,
         space=space,
         schedule=schedule,
-        samples=int(np.ceil(steps / fitted[0].rate)),
-        limits=limits_for(fitted),
+        samples=int(np.ceil(longest * schedule.log_rate - 1e-6)),
+        limits=limits,
     )
-    return Job(settings, fitted, held_out, noise, space, objective)
+    return Job(settings, fitted, held_out, noise, space, inlet, objective)
+
+
+def _inlet(settings: Settings, flights: Sequence[Flight]) -> InletName:
+    """Return where the recordings enter the simulated loop."""
+    chosen = {}
+    for flight in flights:
+        chosen[flight.name] = inlet_for(flight, said_inlet(settings.job, flight.name))
+    kinds = sorted(set(chosen.values()))
+    if len(kinds) > 1:
+        raise ConfigError(
+            "inlet",
+            f"the flights would enter through {' and '.join(kinds)}",
+            f"name one that all can feed, as inlet: {kinds[0]}",
+        )
+    return chosen[flights[0].name]
 
 
 def given_offset(settings: Settings, name: str) -> float | None:
@@ -128,14 +168,6 @@ def _refuse_what_is_not_built(settings: Settings) -> None:
     method = settings.job.search.method
     if method in ("cma", "hybrid"):
         raise ConfigError("--method", f"'{method}' is not available yet", "use auto or gradient")
-    inlets = {"job": settings.job.inlet} | {
-        name: flight.inlet or "auto" for name, flight in settings.job.flights.items()
-    }
-    for name, inlet in inlets.items():
-        if inlet not in ("auto", "reference"):
-            raise ConfigError(
-                f"inlet of {name}", f"'{inlet}' is not available yet", "use auto or reference"
-            )
 
 
 def limits_for(flights: Sequence[Flight]) -> Limits:
@@ -144,13 +176,16 @@ def limits_for(flights: Sequence[Flight]) -> Limits:
     return Limits() if lowest > Limits().floor + CLEARANCE else AIRBORNE
 
 
-def _weights(settings: Settings, flights: Sequence[Flight]) -> dict[str, dict[str, float]]:
+def _weights(
+    settings: Settings, flights: Sequence[Flight], *, whole: bool
+) -> dict[str, dict[str, float]]:
+    """Return flight -> channel -> factor; a whole yaw spin's position means nothing."""
     weights: dict[str, dict[str, float]] = {}
     for flight in flights:
         own = settings.job.flights.get(flight.name)
         factor = 1.0 if own is None else own.weight
         of_flight = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
-        if flight.yaw_rate_setpoint is not None:
+        if whole and flight.yaw_rate_setpoint is not None:
             of_flight |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
         weights[flight.name] = of_flight
     return weights

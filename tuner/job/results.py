@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.comparison.errors import Comparison, FlightErrors
+from tuner.comparison.errors import FlightErrors
+from tuner.comparison.layout import Layout
 from tuner.config import (
     COEFFICIENTS,
     ControllerFile,
@@ -95,7 +96,9 @@ def validate(
     job: Job, fitted: Fitted, vehicle: VehicleFile
 ) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
     """Fly every flight whole with the initial and with the fitted vehicle."""
-    comparison = Comparison(job.flights, controller_flown(job, fitted), offsets_of(job, fitted))
+    comparison = Layout(
+        job.flights, controller_flown(job, fitted), job.settings.job, offsets_of(job, fitted)
+    )
     return comparison.fly(job.settings.vehicle), comparison.fly(vehicle)
 
 

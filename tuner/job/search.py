@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tuner.errors import InputError
 from tuner.job.prepare import Job, given_offset
+from tuner.objective.lanes import CLOCKS, OFFSETS
 from tuner.objective.normal import Objective, Point, Stage
 from tuner.search.fitted import Finding, Fitted, Iteration, Outcome
 from tuner.search.growing import (
@@ -25,6 +26,7 @@ from tuner.search.growing import (
     point_of,
     schedule_of,
     stage_of,
+    window_schedule,
     with_feedback,
 )
 from tuner.search.levenberg_marquardt import total
@@ -64,7 +66,8 @@ def search(
     """
     objective, settings = job.objective, job.settings.job.search
     rate = float(objective.schedule.log_rate)
-    legs = schedule_of(
+    legs_for = schedule_of if objective.lanes.freedom is None else window_schedule
+    legs = legs_for(
         objective.samples,
         rate,
         robust=settings.robust == "huber",
@@ -85,13 +88,27 @@ def search(
         objective,
         legs,
         progress,
-        free_offsets=np.array([given_offset(job.settings, f.name) is None for f in job.fitted]),
+        free_offsets=free_offsets(job),
         clipped=job.clipped,
         tell=keep,
     ):
         progress = reached
     spent += time.perf_counter() - clock
     return _fitted(job, legs[-1], progress, starts, wall_time=spent, findings=findings)
+
+
+def free_offsets(job: Job) -> NDArray[np.bool_]:
+    """Return (offsets, N) which offsets of which flight are fitted.
+
+    What enters below the reference does so on the flight controller's clock, which then is the
+    simulation's own.
+    """
+    free = np.ones((len(OFFSETS), len(job.fitted)), bool)
+    fixed = [given_offset(job.settings, flight.name) is not None for flight in job.fitted]
+    free[: len(CLOCKS), fixed] = False
+    if job.inlet != "reference":
+        free[CLOCKS.index("flight_controller")] = False
+    return free
 
 
 def starting_vectors(job: Job) -> NDArray[np.float64]:
@@ -119,7 +136,7 @@ def _fitted(
     best = int(np.argmin(progress.losses))
     point = point_of(progress.points, best)
     objective = with_feedback(job.objective, progress.feedback)
-    stage = stage_of(leg, progress.scales, np.asarray(point.offsets))
+    stage = stage_of(leg, progress.scales, np.asarray(point.offsets), progress.states)
     vectors = np.asarray(progress.points.coefficients)
     outcomes = tuple(
         Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
@@ -227,6 +244,7 @@ def _save(path: Path, key: str, progress: Progress, seconds: float) -> None:
             offsets=np.asarray(progress.points.offsets),
             scales=np.stack(list(progress.scales.values())),
             losses=progress.losses,
+            states=np.zeros(0) if progress.states is None else progress.states,
         )
     temporary.replace(path)
 
@@ -245,6 +263,7 @@ def _load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
                 points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
                 scales=dict(zip(head["channels"], data["scales"], strict=True)),
                 losses=data["losses"],
+                states=data["states"] if data["states"].size else None,
                 iterations=tuple(Iteration(**one) for one in head["iterations"]),
                 evaluations=head["evaluations"],
                 feedback=head["feedback"],

@@ -16,6 +16,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from sim_jax.inlet import ActuatorInlet, Inlet, RotorSpeedInlet
 from sim_jax.motor import reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
@@ -25,6 +26,9 @@ from sim_jax.vehicle import Vehicle
 
 #: What a start consists of: name -> (how many numbers, standard deviation of the smoothed one).
 #: m, m/s, rad about the body's axes, rad/s, share of the rotor's speed, rate controller's output.
+#: The trim is no state: rotors differ and the mass is never quite in the middle, so that what was
+#: recorded of the motors holds a steady torque about each axis that the model has no use for. In
+#: closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
 STATES: Mapping[str, tuple[int, float]] = {
     "position": (3, 0.01),
     "velocity": (3, 0.1),
@@ -32,6 +36,7 @@ STATES: Mapping[str, tuple[int, float]] = {
     "body_rate": (3, 0.3),
     "rotor_speed": (4, 0.05),
     "rate_integral": (3, 0.05),
+    "trim": (3, 0.02),
 }
 COUNT = sum(count for count, _ in STATES.values())
 
@@ -80,6 +85,27 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
     )
 
 
+def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
+    """Return an inlet whose rotors are told a steady difference about roll, pitch and yaw."""
+    if not isinstance(inlet, ActuatorInlet | RotorSpeedInlet):
+        return inlet
+    first = COUNT - STATES["trim"][0]
+    arms = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
+    width = sum(abs(y) for _, y in arms) / len(arms)
+    length = sum(abs(x) for x, _ in arms) / len(arms)
+    extra = [
+        change[first] * (y / width)
+        - change[first + 1] * (x / length)
+        - change[first + 2] * rotor.spin
+        for (x, y), rotor in zip(arms, vehicle.rotors, strict=True)
+    ]
+    if isinstance(inlet, ActuatorInlet):
+        a, b, c, d = (one + more for one, more in zip(inlet.command, extra, strict=True))
+        return ActuatorInlet((a, b, c, d))
+    a, b, c, d = (one * (1.0 + more) for one, more in zip(inlet.speed, extra, strict=True))
+    return RotorSpeedInlet((a, b, c, d))
+
+
 def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Start:
     """Return a start whose rotors without a tachometer turn as their commands ask.
 
@@ -119,13 +145,22 @@ def eliminated(
         Loss, gradient (P, F) and Hessian (P, P, F) of the others, and the best start (L, F).
     """
     kept = gradient.shape[0] - states.shape[0]
-    pull = jnp.moveaxis(gradient[kept:] + states, -1, 0)
-    own = jnp.moveaxis(hessian[kept:, kept:], -1, 0) + jnp.eye(states.shape[0])
-    across = jnp.moveaxis(hessian[kept:, :kept], -1, 0)
-    solved = jnp.linalg.solve(own, jnp.concatenate([pull[..., None], across], axis=-1))
-    step, follow = -solved[..., 0], -solved[..., 1:]
-    best = states + jnp.moveaxis(step, 0, -1)
-    least = loss + 0.5 * jnp.sum(states**2, axis=0) + 0.5 * jnp.sum(pull * step, axis=-1)
-    left = gradient[:kept] + jnp.einsum("flp,fl->pf", follow, pull)
-    information = hessian[:kept, :kept] + jnp.einsum("flp,flq->pqf", across, follow)
-    return jnp.maximum(least, 0.0), left, information, best
+    gradient = gradient.at[kept:].add(states)
+    hessian = hessian + jnp.diag(jnp.arange(len(gradient)) >= kept).astype(hessian.dtype)[..., None]
+    loss = loss + 0.5 * jnp.sum(states**2, axis=0)
+    # One at a time, for all lanes at once. A library's solver would take a lane at a time, and a
+    # blocking call inside a program of several devices can wait for ever for their single thread.
+    rows = []
+    while len(gradient) > kept:
+        row, pull = hessian[-1], gradient[-1]
+        rows.append((row[kept:-1], pull, row[-1]))
+        follow = row[:-1] / row[-1]
+        loss = loss - 0.5 * pull * pull / row[-1]
+        gradient = gradient[:-1] - follow * pull
+        hessian = hessian[:-1, :-1] - follow[:, None] * row[None, :-1]
+    step: list[Array] = []
+    for row, pull, own in reversed(rows):
+        across = sum((h * s for h, s in zip(row, step, strict=True)), jnp.zeros_like(pull))
+        step.append(-(pull + across) / own)
+    best = states + jnp.stack(step)
+    return jnp.maximum(loss, 0.0), gradient, hessian, best

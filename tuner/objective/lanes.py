@@ -11,15 +11,18 @@ from jax import Array
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from sim_jax.control.position import ReferencePoint
-from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.inlet import Inlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
+from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, InitialState
+from tuner.objective.freedom import freedom_of
+from tuner.objective.inlets import SILENT, InletName, inlet_of
 from tuner.objective.noise import CHANNELS, channel_noise
+from tuner.objective.windows import windows_of
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = ("pose", "flight_controller")
@@ -85,7 +88,7 @@ def lanes_of(
     noise: Mapping[str, float],
     weights: Mapping[str, Mapping[str, float]] | None = None,
 ) -> Lanes:
-    """Lay flights side by side for the ``reference`` inlet.
+    """Lay whole flights side by side for the ``reference`` inlet.
 
     Parameters
     ----------
@@ -108,25 +111,85 @@ def lanes_of(
                 "holds no reference and none is named",
                 "name its trajectory in the job file, or fit through another inlet",
             )
-    length = max(len(flight.time) for flight in flights)
-    columns = [_reference(flight, length) for flight in flights]
-    position, velocity, acceleration = (
-        Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
-    )
-    spins = [flight.yaw_rate_setpoint for flight in flights]
     return Lanes(
-        inlet=ReferenceInlet(
-            ReferencePoint(position, velocity, acceleration),
-            spins=jnp.asarray([spin is not None for spin in spins]),
-            yaw_rate=jnp.asarray([spin or 0.0 for spin in spins]),
-        ),
+        inlet=inlet_of("reference", flights, Schedule()),
         start=start_of([flight.initial for flight in flights]),
-        measured={
-            channel: _measured(flights, channel, sigma, weights or {})
-            for channel, sigma in noise.items()
-        },
+        measured=_all_measured(flights, noise, weights),
         flight=jnp.arange(len(flights)),
     )
+
+
+def window_lanes(
+    flights: Sequence[Flight],
+    *,
+    inlet: InletName,
+    seconds: float,
+    schedule: Schedule,
+    lag: float,
+    noise: Mapping[str, float],
+    weights: Mapping[str, Mapping[str, float]] | None = None,
+) -> Lanes:
+    """Lay the windows of all flights side by side, their starts free.
+
+    Parameters
+    ----------
+    flights
+        N flights.
+    inlet, schedule
+        What is fed in, and when.
+    seconds
+        s, length of a window.
+    lag
+        s after which a rotor has followed its command, to tell the speed of those without
+        tachometer at a start.
+    noise, weights
+        As of `lanes_of`.
+    """
+    cut = [
+        (number, window) for number, f in enumerate(flights) for window in windows_of(f, seconds)
+    ]
+    pieces = [window.flight for _, window in cut]
+    start = start_of([piece.initial for piece in pieces], resting=False)
+    acts = {
+        "rotor_speed": inlet != "rotor_speed",
+        "rate_integral": inlet in ("reference", "body_rate"),
+        "trim": inlet in ("actuator", "rotor_speed"),
+    }
+    freedom = np.repeat(freedom_of(acts)[:, None], len(pieces), axis=1)
+    heard = {name: sigma for name, sigma in noise.items() if name not in SILENT[inlet]}
+    return Lanes(
+        inlet=inlet_of(inlet, pieces, schedule),
+        start=start,
+        measured=_all_measured(pieces, heard, weights),
+        flight=jnp.asarray([number for number, _ in cut]),
+        turning=jnp.asarray(np.stack([_turning(piece, lag) for piece in pieces], axis=-1)),
+        freedom=jnp.asarray(freedom),
+    )
+
+
+def _turning(flight: Flight, lag: float) -> NDArray[np.float64]:
+    """Return the command (4,) that each rotor without tachometer has followed until time 0."""
+    found = np.full(4, np.nan)
+    series = flight.series.get("command")
+    if series is None:
+        return found
+    for rotor in np.flatnonzero(~np.isfinite(flight.initial.rotor_speed)):
+        known = np.isfinite(series.values[:, rotor]) & (series.time <= 0)
+        if known.any():
+            weight = np.exp(series.time[known] / lag)
+            found[rotor] = np.average(series.values[known, rotor], weights=weight)
+    return found
+
+
+def _all_measured(
+    flights: Sequence[Flight],
+    noise: Mapping[str, float],
+    weights: Mapping[str, Mapping[str, float]] | None,
+) -> dict[str, Measured]:
+    return {
+        channel: _measured(flights, channel, sigma, weights or {})
+        for channel, sigma in noise.items()
+    }
 
 
 def noise_of(flights: Sequence[Flight], channels: Sequence[str] = CHANNELS) -> dict[str, float]:
@@ -135,13 +198,15 @@ def noise_of(flights: Sequence[Flight], channels: Sequence[str] = CHANNELS) -> d
     return {channel: channel_noise(list(flights), channel) for channel in recorded}
 
 
-def start_of(initial: Sequence[InitialState]) -> Start:
+def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
     """Return the starts of F lanes; a hover starts at rest and level, heading as recorded.
+
+    (Unless ``resting`` is false: a slow moment in the middle of a flight is no hover.)
 
     Rotors that were not measured turn as fast as those that were; the rate integrator holds what
     the recorded commands differ by.
     """
-    rows = [_start(one) for one in initial]
+    rows = [_start(one, resting=resting) for one in initial]
     stacked = {key: jnp.asarray(np.stack([row[key] for row in rows], axis=-1)) for key in rows[0]}
     speed, command = stacked["rotor_speed"], stacked["command"]
     return Start(
@@ -157,10 +222,10 @@ def start_of(initial: Sequence[InitialState]) -> Start:
     )
 
 
-def _start(initial: InitialState) -> dict[str, NDArray[np.float64]]:
+def _start(initial: InitialState, *, resting: bool) -> dict[str, NDArray[np.float64]]:
     attitude, velocity, rate = initial.attitude, initial.velocity, initial.body_rate
     tilt = 2.0 * np.hypot(attitude[1], attitude[2])
-    resting = (
+    resting = resting and bool(
         np.linalg.norm(velocity) < REST_SPEED
         and np.linalg.norm(rate) < REST_RATE
         and tilt < REST_TILT
@@ -182,16 +247,6 @@ def _start(initial: InitialState) -> dict[str, NDArray[np.float64]]:
         "command": command,
         "integral": np.zeros(3),
     }
-
-
-def _reference(flight: Flight, length: int) -> list[NDArray[np.float64]]:
-    """Return position, velocity and acceleration, each (3, length), the last point held."""
-    parts = []
-    for name in ("reference_position", "reference_velocity", "reference_acceleration"):
-        values = flight.signals.get(name)
-        rows = np.zeros((len(flight.time), 3)) if values is None else np.nan_to_num(values)
-        parts.append(np.pad(rows, ((0, length - len(rows)), (0, 0)), mode="edge").T)
-    return parts
 
 
 def _measured(

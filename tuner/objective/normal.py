@@ -343,6 +343,10 @@ class Flier:
             gradient, hessian = _normal(columns, scaled, data.scale, huber)
         if data.states is not None:
             loss, gradient, hessian, states = eliminated(loss, gradient, hessian, data.states)
+            change = states - data.states
+            for name, column in (columns or {}).items():
+                there = errors[name] + jnp.einsum("lnkf,lf->nkf", column[size:], change)
+                squares[name] = jnp.sum(there * there, axis=(0, 1))
         return LaneSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
 
     def jacobian(

@@ -14,7 +14,7 @@ from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
-from tuner.objective.freedom import moved, spun_up
+from tuner.objective.freedom import moved, spun_up, trimmed
 from tuner.objective.lanes import CLOCK_OF, CLOCKS, Lanes, Measured
 
 
@@ -52,16 +52,17 @@ def fly(
     states
         How far the starts lie from the recorded ones, in the lanes' standard deviations.
     """
-    start = lanes.start
+    start, inlet = lanes.start, lanes.inlet
     if lanes.turning is not None:
         start = spun_up(start, model.vehicle, lanes.turning)
     if states is not None and lanes.freedom is not None:
         start = moved(start, states * lanes.freedom)
+        inlet = trimmed(inlet, model.vehicle, states * lanes.freedom)
     flown = rollout(
         model.vehicle,
         model.controller,
         schedule,
-        lanes.inlet,
+        inlet,
         start,
         samples=samples,
         horizon=horizon,

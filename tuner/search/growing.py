@@ -27,13 +27,15 @@ HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
 thrust is still near where it began, so that a bad start has a slope to go down."""
 LOOSENING = (20.0, 20.0, 20.0, 20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
 """Factor on every standard deviation, stage by stage; 1 on whole flights."""
+WINDOWS = ((0.3, 20.0, False), (0.6, 5.0, True))
+"""Share of a window, loosening, and whether offsets are free, before the windows are whole."""
 GENTLE = 1.0
 """s of horizon below which a Jacobian costs so little that a leg may take its time."""
 OFFSETS_FROM = 5.0
 """s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
 STRAY = 3.0
 """A flight this many times worse than the others is weighed down, channel by channel."""
-WHOLE = "whole flights"
+WHOLE = "whole length"
 FEEDBACK_AT = 3.0
 """s of horizon at which the mixer's saturation feedback is tried both ways."""
 FEEDBACK_GAIN = 1.2
@@ -68,8 +70,11 @@ class Leg:
         At most so many iterations.
     tolerance
         The stage ends when no start's loss falls by more than this share.
-    rescale
-        Whether scales are estimated from the residuals before it.
+    weighs
+        Whether each channel of each flight is weighed by its residuals after it, rather than only
+        strays.
+    prunes
+        Whether offsets too small to matter are dropped before it.
     """
 
     name: str
@@ -79,7 +84,8 @@ class Leg:
     offsets: bool
     steps: int
     tolerance: float
-    rescale: bool
+    weighs: bool
+    prunes: bool
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Leg, ...]:
@@ -97,14 +103,36 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     offsets=seconds >= OFFSETS_FROM,
                     steps=min(16 if seconds < GENTLE else 8, steps),
                     tolerance=0.005 if seconds < GENTLE else 0.02,
-                    rescale=False,
+                    weighs=False,
+                    prunes=False,
                 )
             )
-    whole = Leg(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, False)
-    legs.append(whole)
-    polish = replace(whole, robust=robust, tolerance=1e-5, rescale=True, steps=min(15, steps))
-    legs += [replace(polish, name="polish"), replace(polish, name="polish again")]
-    return tuple(legs)
+    return (*legs, *_whole_legs(samples, robust=robust, steps=steps))
+
+
+def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Leg, ...]:
+    """Return the legs for windows of so many samples, whose starts are free."""
+    legs = [
+        Leg(
+            name=f"first {samples * share / rate:.2g} s of every window",
+            horizon=round(samples * share),
+            loosening=loosening,
+            robust=False,
+            offsets=offsets,
+            steps=min(12, steps),
+            tolerance=0.01,
+            weighs=True,
+            prunes=False,
+        )
+        for share, loosening, offsets in WINDOWS
+    ]
+    return (*legs, *_whole_legs(samples, robust=robust, steps=steps))
+
+
+def _whole_legs(samples: int, *, robust: bool, steps: int) -> tuple[Leg, ...]:
+    whole = Leg(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
+    polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
+    return (whole, replace(polish, name="polish"), replace(polish, name="polish again"))
 
 
 @dataclass(frozen=True)
@@ -249,7 +277,7 @@ def run_leg(
         tell(progress)
         converged = _settled(progress.trail, np.asarray(step.accepted), leg.tolerance)
     found = root_mean_squares(objective, step)
-    scales = misfit(found) if leg.rescale or leg.name == WHOLE else strays(found, leg.loosening)
+    scales = misfit(found) if leg.weighs else strays(found, leg.loosening)
     return replace(
         progress,
         leg=progress.leg + 1,
@@ -266,7 +294,7 @@ def run_leg(
 def _offsets_that_matter(leg: Leg, progress: Progress) -> tuple[Point, NDArray[np.float64]]:
     """Return the points with small clock offsets set to none for the polish, and which are kept."""
     points = progress.points
-    if not leg.rescale:
+    if not leg.prunes:
         return points, np.ones(points.offsets.shape[1:])
     best = int(np.argmin(progress.losses))
     kept = (np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET[:, None]).astype(float)
