@@ -1,4 +1,4 @@
-"""Simulated minus recorded where the loop is not flown whole: window by window, from recorded starts.
+"""Simulated minus recorded, window by window from recorded starts, where no whole loop is flown.
 
 A simulation that is fed motor commands, rotor speeds or rate set-points drifts away within seconds,
 whatever its coefficients; over a window from the recorded state its error says how good they are.

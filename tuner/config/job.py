@@ -97,6 +97,8 @@ class Search(Section):
         Of everything random.
     starts
         How many starting points; the first is the vehicle file's, the others lie around it.
+    spread
+        Factor within which the others lie on either side of it.
     robust
         ``huber`` bounds the pull of outliers, ``none`` is plain least squares.
     window
@@ -108,6 +110,7 @@ class Search(Section):
     method: Method = "auto"
     seed: Annotated[Whole, Ge(0)] = 0
     starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
+    spread: Annotated[Number, Interval(gt=1, le=10)] = 2.0
     robust: Literal["huber", "none"] = "huber"
     window: Annotated[Number, Interval(ge=0.1, le=60)] = 1.0
     max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100

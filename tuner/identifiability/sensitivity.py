@@ -234,17 +234,18 @@ def _when(
     squares = np.zeros((len(moved), flights, BINS))
     counts = np.zeros((flights, BINS))
     middles = np.zeros((flights, BINS))
+    begins = objective.lanes.begins
     for flight in range(flights):
         lanes = sigmas.lanes(flight)
         end = max(
-            float(np.max(np.asarray(m.time)[:, lanes], initial=0.0))
+            float(np.max(np.asarray(m.time)[:, lanes] + begins[lanes], initial=0.0))
             for m in objective.lanes.measured.values()
         )
         middles[flight] = (np.arange(BINS) + 0.5) * end / BINS
         for channel, measured in objective.lanes.measured.items():
             scale = np.asarray(stage.scale[channel])
             for lane in lanes:
-                time = np.asarray(measured.time)[:, lane]
+                time = np.asarray(measured.time)[:, lane] + begins[lane]
                 weight = np.asarray(measured.weight)[..., lane]
                 which = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
                 rows = (

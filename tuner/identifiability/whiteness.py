@@ -61,18 +61,22 @@ def whiteness(
 ) -> tuple[Residual, ...]:
     """Return every flight's and channel's residuals, told by their own past."""
     found = []
-    for lane, number in enumerate(np.asarray(objective.lanes.flight)):
+    seconds = float(stage.horizon) / float(objective.schedule.log_rate)
+    lane_flight = np.asarray(objective.lanes.flight)
+    for number, name in enumerate(flights):
+        lanes = np.flatnonzero(lane_flight == number)  # windows follow each other
         for channel, measured in objective.lanes.measured.items():
-            weight = np.asarray(measured.weight)[..., lane]
-            time = np.asarray(measured.time)[:, lane]
-            seconds = float(stage.horizon) / float(objective.schedule.log_rate)
-            used = (weight > 0).any(axis=1) & (time < seconds)
+            weight = np.concatenate(np.moveaxis(np.asarray(measured.weight)[..., lanes], -1, 0))
+            own = np.asarray(measured.time)[:, lanes]
+            time = (own + objective.lanes.begins[lanes]).T.ravel()
+            used = (weight > 0).any(axis=1) & (own.T.ravel() < seconds)
             if used.sum() < FEWEST:
                 continue
-            error = np.asarray(jacobian.residuals[channel])[used][..., lane]
+            residuals = np.asarray(jacobian.residuals[channel])[..., lanes]
+            error = np.concatenate(np.moveaxis(residuals, -1, 0))[used]
             axes = (weight[used] > 0).all(axis=0)
             if axes.any():
-                found.append(_residual(flights[number], channel, time[used], error[:, axes]))
+                found.append(_residual(name, channel, time[used], error[:, axes]))
     return tuple(found)
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.search.fitted import Finding
-from tuner.search.growing import Leg, beginning, point_of, stage_of
+from tuner.search.legs import Leg
+from tuner.search.progress import beginning, point_of, stage_of
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""

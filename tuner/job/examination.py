@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.comparison.compare import flights_of, offset_of
-from tuner.comparison.errors import Comparison, FlightErrors
+from tuner.comparison.errors import FlightErrors
+from tuner.comparison.layout import Layout
 from tuner.config import Options, Settings, settle, values_of
 from tuner.flights.flight import Flight
 from tuner.identifiability.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
@@ -28,7 +29,8 @@ from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
 from tuner.search.fitted import Finding, Fitted
-from tuner.search.growing import WHOLE, beginning, schedule_of, stage_of, with_feedback
+from tuner.search.legs import WHOLE, schedule_of
+from tuner.search.progress import beginning, stage_of, with_feedback
 
 FEEDBACK_GAIN = 1.2
 """Factor on the squares by which the other saturation feedback must meet the flights better."""
@@ -267,11 +269,7 @@ def _about(settings: Settings, job: Job, fitted: Fitted, command: str) -> About:
 
 
 def _flown(job: Job, fitted: Fitted) -> dict[str, FlightErrors]:
-    """Fly every flight that holds a reference whole."""
-    whole = [flight for flight in job.flights if flight.has("reference_position")]
-    if not whole:
-        return {}
     settings = job.settings
-    offsets = {flight.name: offset_of(settings, flight.name) for flight in whole}
-    comparison = Comparison(whole, controller_flown(job, fitted), offsets)
-    return comparison.fly(settings.vehicle)
+    offsets = {flight.name: offset_of(settings, flight.name) for flight in job.flights}
+    layout = Layout(job.flights, controller_flown(job, fitted), settings.job, offsets)
+    return layout.fly(settings.vehicle)

@@ -24,6 +24,7 @@ from tuner.config import (
 from tuner.config.yaml_file import write_text
 from tuner.flights.flight import Flight
 from tuner.identifiability import Uncertainty
+from tuner.identifiability.uncertainty import Estimate
 from tuner.job.prepare import Job, given_offset
 from tuner.objective.lanes import CLOCKS
 from tuner.objective.normal import OFFSET_UNIT
@@ -52,25 +53,27 @@ def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
     return said.replace(mixer=said.mixer.replace(saturation_feedback=feedback))
 
 
-def vehicle_fitted(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> VehicleFile:
+def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
     """Return the vehicle with the best coefficients.
 
     A coefficient that the flights do not determine keeps its initial value.
     """
-    return with_values(job.settings.vehicle, best_values(job, fitted, uncertainty))
+    return with_values(job.settings.vehicle, best_values(job, fitted))
 
 
-def best_values(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> dict[str, float]:
-    """Return the coefficients that are reported: the fitted ones, where they are identifiable."""
+def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return the coefficients that are reported: the fitted ones, but for those that are held."""
     start = values_of(job.settings.vehicle)
     found = job.space.values(fitted.point.coefficients)
-    kept = impossible(job, fitted)
-    return {
-        name: float(value)
-        if uncertainty.estimates[name].identifiable and name not in kept
-        else start[name]
-        for name, value in found.items()
-    }
+    kept = {*impossible(job, fitted), *_held(job, fitted)}
+    return {name: start[name] if name in kept else float(value) for name, value in found.items()}
+
+
+def _held(job: Job, fitted: Fitted) -> frozenset[str]:
+    """Return the coefficients that were held at their initial values, tied ones too."""
+    held = set(fitted.held.values())
+    groups = (p.ratios for p in job.space.parameters if p.name in held)
+    return frozenset(name for ratios in groups for name in ratios)
 
 
 def impossible(job: Job, fitted: Fitted) -> tuple[str, ...]:
@@ -157,8 +160,14 @@ def _coefficients(
     cutoff = job.settings.controller.filters.gyro_cutoff
     if cutoff is not None:
         start.setdefault("gyro_cutoff", float(cutoff))
-    best = best_values(job, fitted, uncertainty)
+    best = best_values(job, fitted)
     raw, kept = job.space.values(fitted.point.coefficients), impossible(job, fitted)
+    untold = {
+        name: fitted.held[parameter.name]
+        for parameter in job.space.parameters
+        if parameter.name in fitted.held
+        for name in parameter.ratios
+    }
     bounds = {
         name: (parameter.lower * ratio, parameter.upper * ratio)
         for parameter in job.space.parameters
@@ -183,15 +192,26 @@ def _coefficients(
             upper=high,
             std_error=_finite(estimate.std_error),
             ci95=_interval(estimate.ci95),
-            identifiable=estimate.identifiable and name not in kept,
+            identifiable=estimate.identifiable and name not in kept and name not in untold,
             note=(
                 f"kept as given: fitted to {float(raw[name]):.4g}, which with the other moments no "
                 "rigid body has"
                 if name in kept
-                else f"{estimate.verdict.value}: {estimate.reason}"
+                else _note(name, estimate, untold.get(name))
             ),
         )
     return found
+
+
+def _note(name: str, estimate: Estimate, held: str | None) -> str:
+    if held is None:
+        return f"{estimate.verdict.value}: {estimate.reason}"
+    untold = f"not identifiable: {estimate.reason}"
+    if estimate.identifiable:
+        untold = "not identifiable with all others free"
+    if held == name:
+        return f"{untold}; kept as given"
+    return f"{untold}; the value goes with {held} as given"
 
 
 def _finite(value: float) -> float | None:

@@ -79,9 +79,9 @@ def run(
     configure()
     from tuner.export.after_run import export_as_asked  # noqa: PLC0415
     from tuner.export.refly import refly  # noqa: PLC0415
-    from tuner.identifiability.examine import examine  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.examination import write_examination  # noqa: PLC0415
+    from tuner.job.hold import with_the_untold_held  # noqa: PLC0415
     from tuner.job.prepare import Job, prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
         result_of,
@@ -91,7 +91,7 @@ def run(
     )
     from tuner.job.search import parameters_of, search  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
-    from tuner.search.growing import Progress  # noqa: PLC0415
+    from tuner.search.progress import Progress  # noqa: PLC0415
 
     settings = settle(options)
     listener.settled(settings)
@@ -115,9 +115,9 @@ def run(
 
     fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
     listener.message("telling how far each coefficient can be trusted")
-    examination = examine(fitted)
+    fitted, examination = with_the_untold_held(job, fitted, tell, listener.message)
     uncertainty = examination.uncertainty
-    vehicle = vehicle_fitted(job, fitted, uncertainty)
+    vehicle = vehicle_fitted(job, fitted)
     listener.message("flying every flight with the initial and the fitted coefficients")
     errors = validate(job, fitted, vehicle)
     status = "converged" if fitted.converged else "stopped"

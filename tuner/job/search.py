@@ -2,38 +2,38 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.errors import InputError
+from tuner.job.checkpoint import fingerprint, load, save
+from tuner.job.noticed import noticed, unmatched
 from tuner.job.prepare import Job, given_offset
+from tuner.job.starts import starting_vectors
 from tuner.objective.lanes import CLOCKS, OFFSETS
 from tuner.objective.normal import Objective, Point, Stage
-from tuner.search.fitted import Finding, Fitted, Iteration, Outcome
-from tuner.search.growing import (
-    Leg,
+from tuner.search.fitted import Finding, Fitted, Outcome
+from tuner.search.growing import grow
+from tuner.search.legs import Leg, plan
+from tuner.search.levenberg_marquardt import total
+from tuner.search.progress import (
+    Free,
     Progress,
     beginning,
-    grow,
     point_of,
-    schedule_of,
     stage_of,
-    window_schedule,
     with_feedback,
 )
-from tuner.search.levenberg_marquardt import total
 
 CHECKPOINT = "checkpoint.npz"
-SPREAD = np.log(1.7)
-"""Standard deviation of random starts around the vehicle file's, in the scaled coordinate."""
+SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
+AGREE = 0.01
+"""Starts whose losses differ by less than this share have reached the same minimum."""
 
 
 def search(
@@ -64,37 +64,86 @@ def search(
     InputError
         There is no checkpoint to resume from, or it belongs to another job.
     """
+    said = job.settings.job.search.method
+    method = "gradient" if said == "auto" else said
+    found = _run(job, folder / CHECKPOINT, method, resume=resume, tell=tell, findings=findings)
+    doubt = _doubt(job, found) if said == "auto" else ""
+    if not doubt:
+        return found
+    resume = resume and (folder / SECOND_CHECKPOINT).exists()
+    rival = _run(
+        job, folder / SECOND_CHECKPOINT, "hybrid", resume=resume, tell=tell, findings=findings
+    )
+    better = rival if _misfit(rival) < _misfit(found) else found
+    return replace(
+        better,
+        method="auto",
+        evaluations=found.evaluations + rival.evaluations,
+        wall_time=found.wall_time + rival.wall_time,
+        outcomes=(*found.outcomes, *rival.outcomes),
+        findings=(*better.findings, _second_opinion(doubt, better is rival)),
+    )
+
+
+def _second_opinion(doubt: str, changed: bool) -> Finding:
+    kept = "its end is better and was kept" if changed else "it found nothing better"
+    return Finding("info", "search", f"{doubt}; CMA-ES looked from further away, and {kept}")
+
+
+def _doubt(job: Job, found: Fitted) -> str:
+    """Return why least squares should not be believed, if it should not."""
+    losses = np.array([outcome.loss for outcome in found.outcomes])
+    if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
+        return f"no two of {len(losses)} starts ended in the same minimum"
+    lost = unmatched(found.scales)
+    if job.inlet == "reference" and len(lost) > len(job.fitted) / 2:
+        return f"{len(lost)} of {len(job.fitted)} flights stayed far from the recording"
+    return ""
+
+
+def _misfit(found: Fitted) -> float:
+    """Return how far all channels of all flights are met, each by its own noise."""
+    return float(np.mean([np.log(s) for scale in found.scales.values() for s in scale.values()]))
+
+
+def _run(
+    job: Job,
+    checkpoint: Path,
+    method: str,
+    *,
+    resume: bool,
+    tell: Callable[[Job, Progress], None],
+    findings: tuple[Finding, ...],
+) -> Fitted:
+    """Run one method from the starts, or from where its checkpoint stands."""
     objective, settings = job.objective, job.settings.job.search
-    rate = float(objective.schedule.log_rate)
-    legs_for = schedule_of if objective.lanes.freedom is None else window_schedule
-    legs = legs_for(
+    legs = plan(
+        method,
         objective.samples,
-        rate,
+        float(objective.schedule.log_rate),
+        windows=objective.lanes.freedom is not None,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
     starts = starting_vectors(job)
     progress, spent = beginning(objective, starts), 0.0
-    path, key = folder / CHECKPOINT, fingerprint(job)
+    key = fingerprint(job)
     if resume:
-        progress, spent = _load(path, key, progress)
+        progress, spent = load(checkpoint, key, progress)
     clock = time.perf_counter()
 
     def keep(now: Progress) -> None:
-        _save(path, key, now, spent + time.perf_counter() - clock)
+        save(checkpoint, key, now, spent + time.perf_counter() - clock)
         tell(job, now)
 
+    free = Free(np.ones(len(job.space), bool), free_offsets(job))
     for reached in grow(
-        objective,
-        legs,
-        progress,
-        free_offsets=free_offsets(job),
-        clipped=job.clipped,
-        tell=keep,
+        objective, legs, progress, free=free, clipped=job.clipped, tell=keep, seed=settings.seed
     ):
         progress = reached
+    save(checkpoint, key, progress, spent + time.perf_counter() - clock)
     spent += time.perf_counter() - clock
-    return _fitted(job, legs[-1], progress, starts, wall_time=spent, findings=findings)
+    return _fitted(job, legs[-1], progress, starts, method=method, seconds=spent, findings=findings)
 
 
 def free_offsets(job: Job) -> NDArray[np.bool_]:
@@ -111,26 +160,14 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     return free
 
 
-def starting_vectors(job: Job) -> NDArray[np.float64]:
-    """Return S start vectors (S, K): the vehicle file's, then random ones around it."""
-    settings, space = job.settings.job.search, job.space
-    generator = np.random.default_rng(settings.seed)
-    first = space.initial
-    slope = space.slope(first)
-    others = [
-        first + SPREAD * generator.standard_normal(len(space)) / np.maximum(slope, 0.2)
-        for _ in range(settings.starts - 1)
-    ]
-    return np.stack([first, *others])
-
-
 def _fitted(
     job: Job,
     leg: Leg,
     progress: Progress,
     starts: NDArray[np.float64],
     *,
-    wall_time: float,
+    method: str,
+    seconds: float,
     findings: tuple[Finding, ...],
 ) -> Fitted:
     best = int(np.argmin(progress.losses))
@@ -155,14 +192,14 @@ def _fitted(
         scales=scales,
         iterations=progress.iterations,
         outcomes=outcomes,
-        method="gradient",
+        method=method,
         evaluations=progress.evaluations,
-        wall_time=wall_time,
+        wall_time=seconds,
         loss_initial=_loss_at(objective, objective.start(starts[0]), stage),
         loss_best=float(progress.losses[best]),
         converged=progress.converged,
         message="the last steps gained nothing" if progress.converged else "stopped at its limit",
-        findings=(*findings, *_findings(job, progress)),
+        findings=(*findings, *noticed(job, progress.feedback, scales)),
     )
 
 
@@ -174,105 +211,6 @@ def _loss_at(objective: Objective, point: Point, stage: Stage) -> float:
     """Return the loss at a point, as the search counts it."""
     flight = np.asarray(objective.lanes.flight)
     return float(total(objective.space, flight, point, stage, objective.sums(point, stage))[0])
-
-
-def _findings(job: Job, progress: Progress) -> tuple[Finding, ...]:
-    found: list[Finding] = []
-    said = 1.0 if job.settings.controller.mixer.saturation_feedback else 0.0
-    if progress.feedback != said:
-        found.append(
-            Finding(
-                "warning",
-                "saturation_feedback",
-                "rotors were clipped low, and the recording agrees with a rate integrator that "
-                + ("does not stop then" if progress.feedback == 0 else "stops then")
-                + f"; fitted with mixer.saturation_feedback: {str(progress.feedback == 1).lower()}",
-                "say so in the controller file",
-            )
-        )
-    for index, flight in enumerate(job.fitted):
-        worst = {name: float(scale[index]) for name, scale in progress.scales.items()}
-        bad = {name: value for name, value in worst.items() if value > UNMATCHED}
-        if len(bad) > len(worst) / 2:
-            text = ", ".join(f"{name} {value:.1f}" for name, value in bad.items())
-            found.append(
-                Finding(
-                    "warning",
-                    flight.name,
-                    f"cannot be matched: residuals in multiples of the noise are {text}; "
-                    "it was weighed down accordingly",
-                    "look at its plots: wrong controller, clock, wind, damage, or another vehicle",
-                )
-            )
-    return tuple(found)
-
-
-UNMATCHED = 10.0
-"""Multiple of the noise beyond which a channel counts as not matched."""
-
-
-def fingerprint(job: Job) -> str:
-    """Return a digest of everything that decides a job's numbers."""
-    settings = job.settings
-    parts = {
-        "flights": [(flight.name, flight.sha256) for flight in job.flights],
-        "vehicle": settings.vehicle.model_dump(mode="json"),
-        "controller": settings.controller.model_dump(mode="json"),
-        "job": settings.job.model_dump(mode="json"),
-    }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
-
-
-def _save(path: Path, key: str, progress: Progress, seconds: float) -> None:
-    """Write a checkpoint that appears whole: the leg under way begins again when resumed."""
-    done = len(progress.iterations) - len(progress.trail)
-    head = {
-        "key": key,
-        "leg": progress.leg,
-        "evaluations": progress.evaluations - len(progress.trail),
-        "feedback": progress.feedback,
-        "seconds": seconds,
-        "iterations": [asdict(iteration) for iteration in progress.iterations[:done]],
-        "channels": list(progress.scales),
-    }
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        np.savez(
-            file,
-            head=np.frombuffer(json.dumps(head).encode(), np.uint8),
-            coefficients=np.asarray(progress.points.coefficients),
-            offsets=np.asarray(progress.points.offsets),
-            scales=np.stack(list(progress.scales.values())),
-            losses=progress.losses,
-            states=np.zeros(0) if progress.states is None else progress.states,
-        )
-    temporary.replace(path)
-
-
-def _load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
-    if not path.exists():
-        raise InputError(path, "there is no checkpoint to resume from", "leave --resume out")
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            head = json.loads(data["head"].tobytes())
-            if head["key"] != key:
-                raise InputError(path, "belongs to other flights or settings", "leave --resume out")
-            progress = replace(
-                fresh,
-                leg=head["leg"],
-                points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
-                scales=dict(zip(head["channels"], data["scales"], strict=True)),
-                losses=data["losses"],
-                states=data["states"] if data["states"].size else None,
-                iterations=tuple(Iteration(**one) for one in head["iterations"]),
-                evaluations=head["evaluations"],
-                feedback=head["feedback"],
-            )
-            return progress, float(head["seconds"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            path, f"cannot be read ({type(error).__name__})", "leave --resume out"
-        ) from None
 
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:

@@ -73,8 +73,15 @@ class Lanes(eqx.Module):
     """Number of the flight that a lane belongs to."""
     turning: Float[Array, "4 F"] | None = None
     """Recent commands 0..1 of rotors whose speed at the start was not measured, else NaN."""
+    begin: Float[Array, " F"] | None = None
+    """s since the mission's start at which each lane begins; None where all begin there."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of the start, see `tuner.objective.freedom`; None where it is known."""
+
+    @property
+    def begins(self) -> NDArray[np.float64]:
+        """The s (F,) since the missions' starts at which the lanes begin."""
+        return np.zeros(self.count) if self.begin is None else np.asarray(self.begin)
 
     @property
     def count(self) -> int:
@@ -163,6 +170,7 @@ def window_lanes(
         measured=_all_measured(pieces, heard, weights),
         flight=jnp.asarray([number for number, _ in cut]),
         turning=jnp.asarray(np.stack([_turning(piece, lag) for piece in pieces], axis=-1)),
+        begin=jnp.asarray([window.begin for _, window in cut]),
         freedom=jnp.asarray(freedom),
     )
 

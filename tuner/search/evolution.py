@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from tuner.objective.batch import CHUNK, evaluate
 from tuner.objective.normal import Objective, Point, Stage
 from tuner.search.fitted import Iteration
-from tuner.search.growing import Leg, Progress, point_of, stage_of, with_feedback
+from tuner.search.legs import Leg
+from tuner.search.progress import Free, Progress, point_of, stage_of, with_feedback
 
 POPULATION = CHUNK
 """Vectors in one generation."""
 SPREAD = 0.5
 """First standard deviation, in those of the coefficients' priors."""
-GENERATIONS = 60
-"""At most so many in one leg."""
 FLAT = 1e-3
 """A leg ends when the best losses of the last generations differ by less than this share."""
 
@@ -30,6 +29,7 @@ def evolve(
     leg: Leg,
     progress: Progress,
     *,
+    free: Free,
     seed: int,
     tell: Callable[[Progress], None],
 ) -> Progress:
@@ -39,6 +39,8 @@ def evolve(
     ----------
     objective, leg, progress
         As for `tuner.search.growing.run_leg`.
+    free
+        What may move.
     seed
         Of the population; each leg draws its own.
     tell
@@ -55,28 +57,31 @@ def evolve(
     best = int(np.argmin(progress.losses))
     point = point_of(progress.points, best)
     stage = stage_of(leg, progress.scales, np.asarray(point.offsets), progress.states)
-    space = objective.space
+    space, centre = objective.space, np.asarray(point.coefficients)
     loss_of = _loss(objective, point, stage)
-    spread = SPREAD * space.prior_sd / space.width
+    moves = np.flatnonzero(free.coefficients)
+    spread = SPREAD * (space.prior_sd / space.width)[moves]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         strategy = cma.CMAEvolutionStrategy(
-            space.share(np.asarray(point.coefficients)),
+            space.share(centre)[moves],
             1.0,
             {
                 "bounds": [0.0, 1.0],
                 "CMA_stds": np.minimum(spread, 0.25),
                 "seed": 1 + seed + 1000 * progress.leg,
                 "popsize": POPULATION,
-                "maxiter": min(leg.steps, GENERATIONS),
+                "maxiter": leg.steps,
                 "tolfunrel": FLAT,
                 "verbose": -9,
             },
         )
-        vector, least = np.asarray(point.coefficients), np.inf
+        vector, least = centre, np.inf
         while not strategy.stop():
             shares = strategy.ask()
-            vectors = np.stack([space.at_share(np.asarray(share)) for share in shares])
+            every = np.repeat(space.share(centre)[None], len(shares), axis=0)
+            every[:, moves] = shares
+            vectors = np.stack([space.at_share(share) for share in every])
             losses, position_rmse = loss_of(vectors)
             strategy.tell(shares, list(losses))
             here = int(np.argmin(losses))

@@ -114,6 +114,9 @@ class Fitted:
         Whether the last stage stopped by itself, and why.
     findings
         Everything noticed on the way.
+    held
+        Coefficient that the flights do not tell -> the one kept at its initial value for it:
+        itself, or one that it trades off against.
     """
 
     objective: Objective
@@ -131,3 +134,4 @@ class Fitted:
     converged: bool
     message: str
     findings: tuple[Finding, ...] = field(default=())
+    held: Mapping[str, str] = field(default_factory=dict)

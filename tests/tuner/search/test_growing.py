@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.identifiability.making import problem, truth, with_data
-from tuner.search.growing import beginning, grow, schedule_of
+from tuner.objective.lanes import OFFSETS
+from tuner.search.growing import grow
+from tuner.search.legs import schedule_of
+from tuner.search.progress import Free, beginning
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
 
@@ -19,10 +22,9 @@ def fit():
 def searched(fit, vectors, *, offsets=False):
     legs = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
     told = []
+    free = Free(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = beginning(fit, np.asarray(vectors))
-    for state in grow(
-        fit, legs, progress, free_offsets=np.full(2, offsets), clipped=False, tell=told.append
-    ):
+    for state in grow(fit, legs, progress, free=free, clipped=False, tell=told.append):
         progress = state
     return progress, told
 

@@ -1,0 +1,88 @@
+"""A search on disk: written whole after every iteration, gone on with to the same numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from tuner.errors import InputError
+from tuner.job.prepare import Job
+from tuner.objective.normal import Point
+from tuner.search.fitted import Iteration
+from tuner.search.progress import Progress
+
+
+def fingerprint(job: Job) -> str:
+    """Return a digest of everything that decides a job's numbers."""
+    settings = job.settings
+    parts = {
+        "flights": [(flight.name, flight.sha256) for flight in job.flights],
+        "vehicle": settings.vehicle.model_dump(mode="json"),
+        "controller": settings.controller.model_dump(mode="json"),
+        "job": settings.job.model_dump(mode="json"),
+    }
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
+    """Write a checkpoint that appears whole: the leg under way begins again when resumed."""
+    done = len(progress.iterations) - len(progress.trail)
+    head = {
+        "key": key,
+        "leg": progress.leg,
+        "evaluations": progress.evaluations - len(progress.trail),
+        "feedback": progress.feedback,
+        "seconds": seconds,
+        "iterations": [asdict(iteration) for iteration in progress.iterations[:done]],
+        "channels": list(progress.scales),
+    }
+    temporary = path.with_suffix(".tmp")
+    with temporary.open("wb") as file:
+        np.savez(
+            file,
+            head=np.frombuffer(json.dumps(head).encode(), np.uint8),
+            coefficients=np.asarray(progress.points.coefficients),
+            offsets=np.asarray(progress.points.offsets),
+            scales=np.stack(list(progress.scales.values())),
+            losses=progress.losses,
+            states=np.zeros(0) if progress.states is None else progress.states,
+        )
+    temporary.replace(path)
+
+
+def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
+    """Return where a search stood and the s that it had taken.
+
+    Raises
+    ------
+    InputError
+        There is no checkpoint, it belongs to another job, or it cannot be read.
+    """
+    if not path.exists():
+        raise InputError(path, "there is no checkpoint to resume from", "leave --resume out")
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            head = json.loads(data["head"].tobytes())
+            if head["key"] != key:
+                raise InputError(path, "belongs to other flights or settings", "leave --resume out")
+            progress = replace(
+                fresh,
+                leg=head["leg"],
+                points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
+                scales=dict(zip(head["channels"], data["scales"], strict=True)),
+                losses=data["losses"],
+                states=data["states"] if data["states"].size else None,
+                iterations=tuple(Iteration(**one) for one in head["iterations"]),
+                evaluations=head["evaluations"],
+                feedback=head["feedback"],
+            )
+            return progress, float(head["seconds"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            path, f"cannot be read ({type(error).__name__})", "leave --resume out"
+        ) from None

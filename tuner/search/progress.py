@@ -1,0 +1,135 @@
+"""Where a search stands: all that is needed to go on, and what the solver needs to know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.lanes import CLOCKS
+from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
+from tuner.search.fitted import Iteration
+from tuner.search.legs import Leg
+from tuner.search.levenberg_marquardt import Step, on_host
+
+HUBER = 4.0
+"""Standard deviations beyond which a residual counts linearly, in the polish."""
+
+
+@dataclass(frozen=True)
+class Free:
+    """What a search may move.
+
+    Attributes
+    ----------
+    coefficients
+        (K,) of the search vector.
+    offsets
+        (offsets, N) of the flights.
+    """
+
+    coefficients: NDArray[np.bool_]
+    offsets: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a growing-horizon search stands: all that is needed to go on.
+
+    Attributes
+    ----------
+    leg
+        Number of the leg that comes next, or that is under way where ``step`` is not None.
+    points
+        S points.
+    scales
+        Channel -> (N,) how much larger than the noise the residuals are taken to be.
+    states
+        (L, F) starts of the lanes, in their standard deviations; None where they are known.
+    losses
+        (S,) at the end of the last leg.
+    iterations
+        The trace so far.
+    evaluations
+        Jacobians so far.
+    converged
+        Whether the last leg ended by itself.
+    feedback
+        The mixer's saturation feedback that is flown: 1 as in PX4.
+    step, trail
+        The solver's state inside a leg, and the losses (S,) of the leg so far; None between legs.
+    """
+
+    leg: int
+    points: Point
+    scales: dict[str, NDArray[np.float64]]
+    states: NDArray[np.float64] | None
+    losses: NDArray[np.float64]
+    iterations: tuple[Iteration, ...]
+    evaluations: int
+    converged: bool = False
+    feedback: float = 1.0
+    step: Step | None = None
+    trail: tuple[NDArray[np.float64], ...] = ()
+
+
+def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
+    """Return the state before the first leg for S start vectors (S, K)."""
+    offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
+    freedom = objective.lanes.freedom
+    return Progress(
+        leg=0,
+        points=Point(jnp.asarray(vectors), jnp.asarray(offsets)),
+        scales={name: np.ones(objective.flights) for name in objective.lanes.measured},
+        states=None if freedom is None else np.zeros(freedom.shape),
+        losses=np.full(len(vectors), np.inf),
+        iterations=(),
+        evaluations=0,
+    )
+
+
+def stage_of(
+    leg: Leg,
+    scales: dict[str, NDArray[np.float64]],
+    offsets: NDArray[np.float64],
+    states: NDArray[np.float64] | None = None,
+) -> Stage:
+    """Return what the solver needs to know of a leg.
+
+    Parameters
+    ----------
+    leg, scales
+        Horizon and weights.
+    offsets
+        (offsets, N) at which commands are read exactly, as in a `Point`.
+    states
+        (L, F) starts around which is linearised.
+    """
+    stage = Stage(
+        horizon=jnp.asarray(leg.horizon),
+        scale={name: jnp.asarray(leg.loosening * scale) for name, scale in scales.items()},
+        held=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
+        huber=jnp.asarray(HUBER if leg.robust else np.inf),
+        prior=jnp.asarray(1.0),
+        states=None if states is None else jnp.asarray(states),
+    )
+    return cast(Stage, on_host(stage))
+
+
+def point_of(points: Point, start: int) -> Point:
+    """Return one of S points."""
+    picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
+    return picked
+
+
+def with_feedback(objective: Objective, feedback: float) -> Objective:
+    """Return the objective with the mixer's saturation feedback set: 1 as in PX4, 0 without."""
+    changed: Objective = eqx.tree_at(
+        lambda o: o.model.controller.rate.saturation_feedback, objective, jnp.asarray(feedback)
+    )
+    return changed
