@@ -1,7 +1,8 @@
 """Simulated minus recorded, window by window from recorded starts, where no whole loop is flown.
 
 A simulation that is fed motor commands, rotor speeds or rate set-points drifts away within seconds,
-whatever its coefficients; over a window from the recorded state its error says how good they are.
+whatever its coefficients; over a window its error says how good they are. What no recording holds
+exactly, each window's start and the trim of its rotors, is the likeliest for the vehicle that flies.
 """
 
 from __future__ import annotations
@@ -10,18 +11,21 @@ import math
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.crash import AIRBORNE
-from sim_jax.rollout import rollout
+from tuner.coefficients import Space
 from tuner.comparison.errors import FlightErrors, joined, laps_of, simulated_minus_recorded
 from tuner.config import ControllerFile, VehicleFile
-from tuner.flights.flight import Flight
+from tuner.flights.flight import Array, Flight
 from tuner.model import model_of, schedule_of
-from tuner.objective.freedom import spun_up
 from tuner.objective.inlets import InletName
-from tuner.objective.lanes import window_lanes
+from tuner.objective.lanes import CLOCKS, noise_of, window_lanes
+from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.residuals import Trace
 from tuner.objective.windows import windows_of
+from tuner.search.growing import FAR
 
 
 class WindowComparison:
@@ -55,26 +59,28 @@ class WindowComparison:
         self._schedule = schedule_of(controller)
         self._windows = [windows_of(flight, seconds) for flight in flights]
         self._lanes = window_lanes(
-            flights, inlet=inlet, seconds=seconds, schedule=self._schedule, lag=LAG, noise={}
+            flights,
+            inlet=inlet,
+            seconds=seconds,
+            schedule=self._schedule,
+            lag=LAG,
+            noise=noise_of(flights),
         )
         self._samples = math.ceil((seconds + BEYOND) * self._schedule.log_rate)
 
     def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, all windows behind each other."""
-        model, lanes = model_of(vehicle, self._controller), self._lanes
-        assert lanes.turning is not None
-        flown = eqx.filter_jit(rollout)(
-            model.vehicle,
-            model.controller,
-            self._schedule,
-            lanes.inlet,
-            spun_up(lanes.start, model.vehicle, lanes.turning),
+        objective = Objective(
+            model=model_of(vehicle, self._controller),
+            lanes=self._lanes,
+            space=_NOTHING,
+            schedule=self._schedule,
             samples=self._samples,
             limits=AIRBORNE,
         )
-        motion = flown.log.motion
-        position = np.moveaxis(np.asarray(motion.position.stacked(), dtype=np.float64), 0, 1)
-        attitude = np.moveaxis(np.asarray(motion.attitude.stacked(), dtype=np.float64), 0, 1)
+        point = objective.start(np.zeros(0))
+        flown = self._flown(objective, point, self._starts(objective, point))
+        position, attitude = (np.asarray(flown.channels[name]) for name in ("position", "attitude"))
         found, lane = {}, 0
         for flight, windows in zip(self._flights, self._windows, strict=True):
             parts = []
@@ -91,8 +97,38 @@ class WindowComparison:
             found[flight.name] = joined(flight.name, parts, laps_of(flight))
         return found
 
+    def _starts(self, objective: Objective, point: Point) -> Array:
+        """Return the likeliest starts (L, F), in the lanes' standard deviations."""
+        assert self._lanes.freedom is not None
+        states = np.zeros(self._lanes.freedom.shape)
+        flights = len(self._flights)
+        for _ in range(ROUNDS):
+            stage = Stage(
+                horizon=jnp.asarray(self._samples),
+                scale={name: jnp.full(flights, LOOSE) for name in self._lanes.measured},
+                held=jnp.zeros((len(CLOCKS), flights)),
+                huber=jnp.asarray(jnp.inf),
+                prior=jnp.asarray(1.0),
+                states=jnp.asarray(states),
+            )
+            asked = np.asarray(objective.sums(point, stage, derivatives=False).states)
+            states = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
+        return states
 
+    def _flown(self, objective: Objective, point: Point, states: Array) -> Trace:
+        horizon = jnp.asarray(self._samples)
+        trace: Trace = eqx.filter_jit(objective.flier.fly)(
+            objective.model, self._lanes, point.coefficients, horizon, jnp.asarray(states)
+        )
+        return trace
+
+
+_NOTHING = Space([], {})
 LAG = 0.03
 """s over which recent commands tell the speed of a rotor without tachometer."""
 BEYOND = 0.02
 """s simulated beyond a window, for stamps that are late."""
+LOOSE = 10.0
+"""Multiple of the noise by which a simulation may miss before its start is doubted."""
+ROUNDS = 3
+"""Steps towards the likeliest start."""
