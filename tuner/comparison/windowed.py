@@ -2,7 +2,7 @@
 
 A simulation that is fed motor commands, rotor speeds or rate set-points drifts away within seconds,
 whatever its coefficients; over a window its error says how good they are. What no recording holds
-exactly, each window's start and the trim of its rotors, is the likeliest for the vehicle that flies.
+exactly, a window's start and the trim of its rotors, is the likeliest for the vehicle that flies.
 """
 
 from __future__ import annotations

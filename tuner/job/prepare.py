@@ -82,7 +82,6 @@ def prepare(settings: Settings) -> Job:
     InputError
         A recording cannot be read or used, or the job leaves nothing to fit.
     """
-    _refuse_what_is_not_built(settings)
     flights = flights_of(settings)
     held = set(settings.job.holdout)
     fitted = tuple(flight for flight in flights if flight.name not in held)
@@ -161,13 +160,6 @@ def _shifted(flight: Flight, late: float) -> Flight:
         for name, one in flight.series.items()
     }
     return replace(flight, series=series)
-
-
-def _refuse_what_is_not_built(settings: Settings) -> None:
-    """Say so rather than ignore a setting."""
-    method = settings.job.search.method
-    if method in ("cma", "hybrid"):
-        raise ConfigError("--method", f"'{method}' is not available yet", "use auto or gradient")
 
 
 def limits_for(flights: Sequence[Flight]) -> Limits:
