@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ from tuner.cli.tables import console
 
 if TYPE_CHECKING:
     from tuner.config import Settings
+    from tuner.job.cross_validation import Fold
     from tuner.job.examination import Examined
     from tuner.job.run import Listener
     from tuner.result import RunResult
@@ -50,7 +51,7 @@ def listening(*, quiet: bool) -> Iterator[Listener]:
             live.update(line)
 
     try:
-        yield Listener(settled, iteration, screen.print)
+        yield Listener(settled, iteration, screen.print, lambda folds: screen.print(_folds(folds)))
     finally:
         if live is not None:
             live.stop()
@@ -130,6 +131,21 @@ def _errors(result: RunResult) -> Table:
             cells.append(f"{_number(before)} → {_number(after)}")
         held = " (held out)" if flight.split == "holdout" else ""
         table.add_row(flight.name + held, *cells)
+    return table
+
+
+def _folds(folds: Sequence[Fold]) -> Table:
+    table = Table(box=None, title="Each flight foretold by the others", title_justify="left")
+    table.add_column("left out")
+    for axis in AXES:
+        unit = "m" if axis in ("x", "y", "z") else "deg"
+        table.add_column(f"{axis} {unit}", justify="right")
+    for fold in folds:
+        cells = [
+            "impossible" if fold.rmse is None else _number(getattr(fold.rmse, axis))
+            for axis in AXES
+        ]
+        table.add_row(fold.left_out, *cells)
     return table
 
 

@@ -41,6 +41,7 @@ def tune(
     out: Path | None = None,
     resume: Annotated[bool, Parameter(negative=())] = False,
     force: Annotated[bool, Parameter(negative=())] = False,
+    cross_validate: Annotated[bool, Parameter(negative=())] = False,
     seed: int | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -62,6 +63,8 @@ def tune(
         Go on from the checkpoint in the result folder.
     force
         Search although the check before it failed.
+    cross_validate
+        Also leave each fitted flight out in turn, and tabulate how the others foretell it.
     seed
         Of everything random.
     """
@@ -85,7 +88,13 @@ def tune(
     )
     with listening(quiet=quiet) as listener:
         folder, result = run(
-            options, out=out, resume=resume, force=force, listener=listener, command=TYPED.get()
+            options,
+            out=out,
+            resume=resume,
+            force=force,
+            cross_validated=cross_validate,
+            listener=listener,
+            command=TYPED.get(),
         )
     if not quiet:
         print_run(folder, result)

@@ -16,13 +16,12 @@ import numpy as np
 
 from tuner.identifiability import Uncertainty
 from tuner.identifiability.examine import Examination, examine
+from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
 from tuner.objective.normal import Point
 from tuner.search.fitted import Fitted
-from tuner.search.growing import grow
-from tuner.search.legs import plan
-from tuner.search.progress import Free, Progress, point_of, stage_of
+from tuner.search.progress import Free, Progress
 
 FIRST_HELD = ("mass", "input_scaling", "zero_position_armed", "actuator_latency")
 """Of coefficients that trade off, the one to hold: what is weighed or set rather than flown."""
@@ -91,50 +90,15 @@ def hold(
     keeps = np.array([name in names for name in space.names])
     if not keeps.any():
         return fitted
-    clock, objective = time.perf_counter(), fitted.objective
+    clock = time.perf_counter()
     vector = np.where(keeps, space.initial, np.asarray(fitted.point.coefficients))
-    settings = job.settings.job.search
-    *_, first, last = plan(
-        "gradient",
-        objective.samples,
-        float(objective.schedule.log_rate),
-        windows=objective.lanes.freedom is not None,
-        robust=settings.robust == "huber",
-        steps=settings.max_iterations,
-    )
-    legs = tuple(replace(leg, name=f"with {len(names)} held, {leg.name}") for leg in (first, last))
-    before = len(fitted.iterations)
-    progress = Progress(
-        leg=0,
-        points=Point(jnp.asarray(vector)[None], fitted.point.offsets[None]),
-        scales={
-            channel: np.array([fitted.scales[flight.name][channel] for flight in job.fitted])
-            for channel in objective.lanes.measured
-        },
-        states=None if fitted.stage.states is None else np.asarray(fitted.stage.states),
-        losses=np.array([fitted.loss_best]),
-        iterations=fitted.iterations,
-        evaluations=fitted.evaluations,
-        feedback=float(objective.model.controller.rate.saturation_feedback),
-    )
     free = Free(~keeps, free_offsets(job))
-    for reached in grow(
-        objective, legs, progress, free=free, clipped=False, tell=lambda now: tell(job, now)
-    ):
-        progress = reached
-    point = point_of(progress.points, 0)
-    names_of = [flight.name for flight in job.fitted]
-    return replace(
-        fitted,
-        point=point,
-        stage=stage_of(last, progress.scales, np.asarray(point.offsets), progress.states),
-        scales={
-            name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
-            for i, name in enumerate(names_of)
-        },
-        iterations=progress.iterations,
-        evaluations=fitted.evaluations + len(progress.iterations) - before,
-        loss_best=float(progress.losses[0]),
-        held=dict(held),
-        wall_time=fitted.wall_time + time.perf_counter() - clock,
+    point = Point(jnp.asarray(vector), fitted.point.offsets)
+    end = polished(
+        job,
+        replace(fitted, point=point),
+        free=free,
+        title=f"with {len(names)} held",
+        tell=lambda now: tell(job, now),
     )
+    return replace(end, held=dict(held), wall_time=fitted.wall_time + time.perf_counter() - clock)

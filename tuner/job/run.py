@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import datetime
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tuner.config import Options, Settings, settle, with_values, write_vehicle
 from tuner.errors import ConfigError, InputError
 from tuner.result import BEST_FIT_FILE, RunResult
+
+if TYPE_CHECKING:
+    from tuner.job.cross_validation import Fold
 
 logger = logging.getLogger(__name__)
 
@@ -28,14 +32,17 @@ class Listener:
         Stage, iteration number, horizon in s, loss and position RMSE in m.
     message
         One line for people.
+    folds
+        What leaving each flight out in turn gave.
     """
 
     settled: Callable[[Settings], None]
     iteration: Callable[[str, int, float, float, float], None]
     message: Callable[[str], None]
+    folds: Callable[[Sequence[Fold]], None]
 
 
-SILENT = Listener(lambda _: None, lambda *_: None, lambda _: None)
+SILENT = Listener(lambda _: None, lambda *_: None, lambda _: None, lambda _: None)
 
 
 def run(
@@ -44,6 +51,7 @@ def run(
     out: Path | None = None,
     resume: bool = False,
     force: bool = False,
+    cross_validated: bool = False,
     listener: Listener = SILENT,
     command: str = "",
 ) -> tuple[Path, RunResult]:
@@ -59,6 +67,8 @@ def run(
         Go on from the folder's checkpoint.
     force
         Search although the check before it failed.
+    cross_validated
+        Also leave each fitted flight out in turn.
     listener
         Is told how it goes.
     command
@@ -80,6 +90,7 @@ def run(
     from tuner.export.after_run import export_as_asked  # noqa: PLC0415
     from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
+    from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
     from tuner.job.examination import write_examination  # noqa: PLC0415
     from tuner.job.hold import with_the_untold_held  # noqa: PLC0415
     from tuner.job.prepare import Job, prepare  # noqa: PLC0415
@@ -126,6 +137,8 @@ def run(
     write_traces(folder, job.flights, *errors)
     write_laps(folder, *errors)
     write_search(folder, fitted)
+    if cross_validated:
+        listener.folds(cross_validate(job, fitted, folder, tell))
     listener.message("simulating what could be flown next")
     write_examination(folder, job, examination, fitted)
     render(folder)

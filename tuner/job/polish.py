@@ -1,0 +1,83 @@
+"""The last legs of a search once more, from where it ended, with something changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from tuner.job.prepare import Job
+from tuner.objective.normal import Point
+from tuner.search.fitted import Fitted
+from tuner.search.growing import grow
+from tuner.search.legs import plan
+from tuner.search.progress import Free, Progress, point_of, stage_of
+
+
+def polished(
+    job: Job,
+    fitted: Fitted,
+    *,
+    free: Free,
+    title: str,
+    tell: Callable[[Progress], None],
+) -> Fitted:
+    """Return a fit polished again.
+
+    Parameters
+    ----------
+    job
+        Gives the settings and the flights' names.
+    fitted
+        Its objective, which need not be the job's, and the point to begin at.
+    free
+        What may move.
+    title
+        For people, before the legs' names.
+    tell
+        Called after every iteration.
+    """
+    objective, settings = fitted.objective, job.settings.job.search
+    *_, first, last = plan(
+        "gradient",
+        objective.samples,
+        float(objective.schedule.log_rate),
+        windows=objective.lanes.freedom is not None,
+        robust=settings.robust == "huber",
+        steps=settings.max_iterations,
+    )
+    legs = tuple(replace(leg, name=f"{title}, {leg.name}") for leg in (first, last))
+    names = [flight.name for flight in job.fitted]
+    progress = Progress(
+        leg=0,
+        points=Point(
+            jnp.asarray(fitted.point.coefficients)[None], jnp.asarray(fitted.point.offsets)[None]
+        ),
+        scales={
+            channel: np.array([fitted.scales[name][channel] for name in names])
+            for channel in objective.lanes.measured
+        },
+        states=None if fitted.stage.states is None else np.asarray(fitted.stage.states),
+        losses=np.array([fitted.loss_best]),
+        iterations=fitted.iterations,
+        evaluations=fitted.evaluations,
+        feedback=float(objective.model.controller.rate.saturation_feedback),
+    )
+    for reached in grow(objective, legs, progress, free=free, clipped=False, tell=tell):
+        progress = reached
+    point = point_of(progress.points, 0)
+    return replace(
+        fitted,
+        point=point,
+        stage=stage_of(last, progress.scales, np.asarray(point.offsets), progress.states),
+        scales={
+            name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
+            for i, name in enumerate(names)
+        },
+        iterations=progress.iterations,
+        evaluations=progress.evaluations,
+        loss_best=float(progress.losses[0]),
+        converged=progress.converged,
+    )
