@@ -54,6 +54,7 @@ def fit(
     out: Named | None = None,
     resume: bool = False,
     force: bool = False,
+    cross_validate: bool = False,
 ) -> Run:
     """Fit the coefficients of a vehicle to recordings; what ``tune --flights`` does.
 
@@ -83,6 +84,8 @@ def fit(
         Go on from the folder's checkpoint.
     force
         Search although the check before it failed.
+    cross_validate
+        Also leave each fitted flight out in turn, into ``cross_validation.csv``.
 
     Returns
     -------
@@ -115,6 +118,7 @@ def fit(
         out=None if out is None else Path(out),
         resume=resume,
         force=force,
+        cross_validated=cross_validate,
         command=f"tuner.fit from Python: {options.flights}",
     )
     return read_run(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -39,11 +40,14 @@ def listening(*, quiet: bool) -> Iterator[Listener]:
         for name, origin in settings.origin.items():
             screen.print(f"{name}: {origin}")
 
-    def iteration(stage: str, number: int, horizon: float, loss: float, rmse: float) -> None:
+    def iteration(  # noqa: PLR0917 (a listener's)
+        stage: str, number: int, horizon: float, loss: float, rmse: float, left: float
+    ) -> None:
         seconds = time.perf_counter() - began
+        rest = "" if math.isnan(left) else f", some {left:.0f} s left"
         line = (
             f"{stage}: iteration {number}, horizon {horizon:.3g} s, position RMSE "
-            f"{1000 * rmse:.2f} mm, loss {loss:.4g}, {seconds:.0f} s so far"
+            f"{1000 * rmse:.2f} mm, loss {loss:.4g}, {seconds:.0f} s so far{rest}"
         )
         if live is None:
             screen.print(line)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.job.prepare import Job
+from tuner.objective.lanes import CLOCKS, OFFSETS
 from tuner.search.fitted import Finding
 
 UNMATCHED = 10.0
@@ -31,6 +33,30 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
         if len(bad) > len(channels) / 2:
             found[flight] = bad
     return found
+
+
+def offsets_found(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ...]:
+    """Say which clocks and gyros were found to be off.
+
+    Parameters
+    ----------
+    job
+        Gives the flights' names.
+    offsets
+        (offsets, N) in s and rad/s.
+    """
+    found = []
+    for number, flight in enumerate(job.fitted):
+        for kind, value in zip(OFFSETS, offsets[:, number], strict=True):
+            if value != 0.0:
+                what = kind.replace("_", " ")
+                text = (
+                    f"the {what} clock is {1000 * value:+.2f} ms late"
+                    if kind in CLOCKS
+                    else f"the {what} axis reads {value:+.4f} rad/s too much"
+                )
+                found.append(Finding("info", flight.name, f"{text}; taken into account"))
+    return tuple(found)
 
 
 def noticed(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ...]:

@@ -16,7 +16,7 @@ from tuner.errors import ConfigError, RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.inlets import InletName, inlet_for
-from tuner.objective.lanes import lanes_of, noise_of, window_lanes
+from tuner.objective.lanes import Lanes, begins_gently, lanes_of, noise_of, window_lanes
 from tuner.objective.noise import CHANNELS
 from tuner.objective.normal import Objective
 
@@ -49,6 +49,9 @@ class Job:
         windows.
     objective
         What is searched.
+    windows
+        The same flights in windows, searched first where one does not begin gently; None where
+        all do.
     """
 
     settings: Settings
@@ -58,6 +61,7 @@ class Job:
     space: Space
     inlet: InletName
     objective: Objective
+    windows: Objective | None = None
 
     @property
     def flights(self) -> tuple[Flight, ...]:
@@ -101,32 +105,30 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
     inlet = _inlet(settings, fitted)
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
-    weights = _weights(settings, fitted, whole=inlet == "reference")
-    if inlet == "reference":
-        lanes, limits = lanes_of(on_time, noise=noise, weights=weights), limits_for(fitted)
-    else:
-        lanes, limits = (
-            window_lanes(
-                on_time,
-                inlet=inlet,
-                seconds=job.search.window,
-                schedule=schedule,
-                lag=settings.vehicle.motor.time_constant_up,
-                noise=noise,
-                weights=weights,
-            ),
-            AIRBORNE,
+    model = model_of(settings.vehicle, settings.controller)
+
+    def problem(lanes: Lanes, seconds: float, limits: Limits) -> Objective:
+        samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
+        return Objective(model, lanes, space, schedule, samples, limits)
+
+    windows = None
+    if inlet != "reference" or not all(begins_gently(flight) for flight in fitted):
+        lanes = window_lanes(
+            on_time,
+            inlet=inlet,
+            seconds=job.search.window,
+            schedule=schedule,
+            lag=settings.vehicle.motor.time_constant_up,
+            noise=noise,
+            weights=_weights(settings, fitted, whole=False),
         )
-        longest = min(longest, job.search.window + 1.0 / fitted[0].rate)
-    objective = Objective(
-        model=model_of(settings.vehicle, settings.controller),
-        lanes=lanes,
-        space=space,
-        schedule=schedule,
-        samples=int(np.ceil(longest * schedule.log_rate - 1e-6)),
-        limits=limits,
-    )
-    return Job(settings, fitted, held_out, noise, space, inlet, objective)
+        windows = problem(lanes, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE)
+    if inlet == "reference":
+        whole = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
+        objective = problem(whole, longest, limits_for(fitted))
+        return Job(settings, fitted, held_out, noise, space, inlet, objective, windows)
+    assert windows is not None
+    return Job(settings, fitted, held_out, noise, space, inlet, windows)
 
 
 def _inlet(settings: Settings, flights: Sequence[Flight]) -> InletName:

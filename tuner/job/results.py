@@ -10,6 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
+from pydantic import JsonValue
 
 from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
@@ -26,7 +27,7 @@ from tuner.flights.flight import Flight
 from tuner.identifiability import Uncertainty
 from tuner.identifiability.uncertainty import Estimate
 from tuner.job.prepare import Job, given_offset
-from tuner.objective.lanes import CLOCKS
+from tuner.objective.lanes import CLOCKS, OFFSETS
 from tuner.objective.normal import OFFSET_UNIT
 from tuner.result import (
     BEST_FIT_FILE,
@@ -95,6 +96,15 @@ def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
     return found
 
 
+def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
+    """Return flight -> what it was found to get wrong by a constant, in s and rad/s."""
+    table = np.asarray(fitted.point.offsets) * OFFSET_UNIT
+    return {
+        flight.name: dict(zip(OFFSETS, table[:, number].tolist(), strict=True))
+        for number, flight in enumerate(job.fitted)
+    }
+
+
 def validate(
     job: Job, fitted: Fitted, vehicle: VehicleFile
 ) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
@@ -130,6 +140,7 @@ def result_of(
             "origin": dict(settings.origin),
             "noise": dict(fitted.noise),
             "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
+            "offsets": offsets_by_flight(job, fitted),
             "findings": [vars(finding) for finding in fitted.findings],
             "starts": [
                 {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes

@@ -16,6 +16,9 @@ from tuner.result import BEST_FIT_FILE, RunResult
 
 if TYPE_CHECKING:
     from tuner.job.cross_validation import Fold
+    from tuner.job.prepare import Job
+    from tuner.search.fitted import Finding
+    from tuner.search.progress import Progress
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +32,8 @@ class Listener:
     settled
         The settings, before anything is read.
     iteration
-        Stage, iteration number, horizon in s, loss and position RMSE in m.
+        Stage, iteration number, horizon in s, loss, position RMSE in m, and the s that the search
+        may still take (NaN where nobody knows).
     message
         One line for people.
     folds
@@ -37,7 +41,7 @@ class Listener:
     """
 
     settled: Callable[[Settings], None]
-    iteration: Callable[[str, int, float, float, float], None]
+    iteration: Callable[[str, int, float, float, float, float], None]
     message: Callable[[str], None]
     folds: Callable[[Sequence[Fold]], None]
 
@@ -93,38 +97,29 @@ def run(
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
     from tuner.job.examination import write_examination  # noqa: PLC0415
     from tuner.job.hold import with_the_untold_held  # noqa: PLC0415
-    from tuner.job.prepare import Job, prepare  # noqa: PLC0415
+    from tuner.job.prepare import prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
         result_of,
         validate,
         vehicle_fitted,
         write_folder,
     )
-    from tuner.job.search import parameters_of, search  # noqa: PLC0415
+    from tuner.job.search import search  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
-    from tuner.search.progress import Progress  # noqa: PLC0415
 
     settings = settle(options)
     listener.settled(settings)
     folder = folder_for(out, resume=resume)
     job = prepare(settings)
     findings = check(job)
-    for finding in findings:
-        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
-    failures = [finding for finding in findings if finding.kind == "failure"]
-    if failures and not force:
-        first = failures[0]
-        raise InputError(first.subject, first.text, f"{first.remedy}, or use --force")
+    _refuse_failures(findings, listener, force=force)
     folder.mkdir(parents=True, exist_ok=True)
-
-    def tell(job: Job, progress: Progress) -> None:
-        last = progress.iterations[-1]
-        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
-            best = with_values(settings.vehicle, parameters_of(job, progress))
-            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
-        listener.iteration(last.stage, last.number, last.horizon, last.loss, last.position_rmse)
-
-    fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
+    tell = _teller(folder, listener)
+    try:
+        fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
+    except KeyboardInterrupt:
+        listener.message(f"the best so far is in {folder}; go on with --out {folder} --resume")
+        raise
     listener.message("telling how far each coefficient can be trusted")
     fitted, examination = with_the_untold_held(job, fitted, tell, listener.message)
     uncertainty = examination.uncertainty
@@ -147,6 +142,31 @@ def run(
     ):
         listener.message(line)
     return folder, result
+
+
+def _refuse_failures(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:
+    for finding in findings:
+        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
+    failures = [finding for finding in findings if finding.kind == "failure"]
+    if failures and not force:
+        first = failures[0]
+        raise InputError(first.subject, first.text, f"{first.remedy}, or use --force")
+
+
+def _teller(folder: Path, listener: Listener) -> Callable[[Job, Progress], None]:
+    """Return what keeps the best set so far on disk, and tells the listener."""
+    from tuner.job.search import parameters_of  # noqa: PLC0415
+
+    def tell(job: Job, progress: Progress) -> None:
+        last = progress.iterations[-1]
+        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
+            best = with_values(job.settings.vehicle, parameters_of(job, progress))
+            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
+        listener.iteration(
+            last.stage, last.number, last.horizon, last.loss, last.position_rmse, progress.left
+        )
+
+    return tell
 
 
 def folder_for(out: Path | None, *, resume: bool = False) -> Path:

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.job.checkpoint import fingerprint, load, save
-from tuner.job.noticed import noticed, unmatched
+from tuner.job.noticed import noticed, offsets_found, unmatched
 from tuner.job.prepare import Job, given_offset
 from tuner.job.starts import starting_vectors
 from tuner.objective.lanes import CLOCKS, OFFSETS
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
 from tuner.search.fitted import Finding, Fitted, Outcome
 from tuner.search.growing import grow
-from tuner.search.legs import Leg, plan
+from tuner.search.legs import Leg, left, plan
 from tuner.search.levenberg_marquardt import total
 from tuner.search.progress import (
     Free,
@@ -126,6 +126,9 @@ def _run(
         steps=settings.max_iterations,
     )
     starts = starting_vectors(job)
+    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    if job.windows is not None:
+        legs = tuple(leg for leg in legs if leg.horizon == objective.samples)
     progress, spent = beginning(objective, starts), 0.0
     key = fingerprint(job)
     if resume:
@@ -133,10 +136,12 @@ def _run(
     clock = time.perf_counter()
 
     def keep(now: Progress) -> None:
-        save(checkpoint, key, now, spent + time.perf_counter() - clock)
-        tell(job, now)
+        seconds = spent + time.perf_counter() - clock
+        save(checkpoint, key, now, seconds)
+        tell(job, replace(now, left=left(legs, now.leg, len(now.trail), seconds)))
 
-    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    if job.windows is not None and not resume:
+        progress = beginning(objective, _through_windows(job, starts, free))
     for reached in grow(
         objective, legs, progress, free=free, clipped=job.clipped, tell=keep, seed=settings.seed
     ):
@@ -144,6 +149,26 @@ def _run(
     save(checkpoint, key, progress, spent + time.perf_counter() - clock)
     spent += time.perf_counter() - clock
     return _fitted(job, legs[-1], progress, starts, method=method, seconds=spent, findings=findings)
+
+
+def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArray[np.float64]:
+    """Return where windows lead each start (S, K), for flights that do not begin gently."""
+    objective, settings = job.windows, job.settings.job.search
+    assert objective is not None
+    legs = plan(
+        "gradient",
+        objective.samples,
+        float(objective.schedule.log_rate),
+        windows=True,
+        robust=settings.robust == "huber",
+        steps=settings.max_iterations,
+    )
+    progress = beginning(objective, starts)
+    for reached in grow(
+        objective, legs[:-1], progress, free=free, clipped=False, tell=lambda _: None
+    ):
+        progress = reached
+    return np.asarray(progress.points.coefficients)
 
 
 def free_offsets(job: Job) -> NDArray[np.bool_]:
@@ -199,7 +224,11 @@ def _fitted(
         loss_best=float(progress.losses[best]),
         converged=progress.converged,
         message="the last steps gained nothing" if progress.converged else "stopped at its limit",
-        findings=(*findings, *noticed(job, progress.feedback, scales)),
+        findings=(
+            *findings,
+            *noticed(job, progress.feedback, scales),
+            *offsets_found(job, np.asarray(point.offsets) * OFFSET_UNIT),
+        ),
     )
 
 

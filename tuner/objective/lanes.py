@@ -39,6 +39,8 @@ OFFSETS = (*CLOCKS, "gyro_x", "gyro_y", "gyro_z")
 
 #: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
+#: m/s and rad/s at the start above which a recording does not begin gently.
+GENTLE_SPEED, GENTLE_RATE = 0.5, 0.5
 
 
 class Measured(eqx.Module):
@@ -227,6 +229,15 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
         rotor_speed=(speed[0], speed[1], speed[2], speed[3]),
         command=(command[0], command[1], command[2], command[3]),
         rate_integral=Vec3.of(stacked["integral"]),
+    )
+
+
+def begins_gently(flight: Flight) -> bool:
+    """Tell whether a flight begins slowly enough for a fit to follow it from its beginning."""
+    start = flight.initial
+    return bool(
+        np.linalg.norm(start.velocity) < GENTLE_SPEED
+        and np.linalg.norm(start.body_rate) < GENTLE_RATE
     )
 
 

@@ -21,6 +21,10 @@ EVOLVED = (0.8, 3.0)
 GENERATIONS = 60
 """Of CMA-ES in one leg, at most."""
 WHOLE = "whole length"
+USUAL = 5
+"""Steps that a leg takes, more or less."""
+PAUSE = 400
+"""What a step costs beside its simulation, in samples of it."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,24 @@ def _whole_legs(samples: int, *, robust: bool, steps: int) -> tuple[Leg, ...]:
     whole = Leg(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
     polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
     return (whole, replace(polish, name="polish"), replace(polish, name="polish again"))
+
+
+def left(legs: tuple[Leg, ...], leg: int, steps: int, spent: float) -> float:
+    """Return the s that a search may still take, told from what it took so far.
+
+    Parameters
+    ----------
+    legs
+        The whole plan.
+    leg, steps
+        Number of the leg under way, and how many steps of it are done.
+    spent
+        s so far.
+    """
+    costs = [min(one.steps, USUAL) * (one.horizon + PAUSE) for one in legs]
+    under_way = costs[leg] * min(steps / min(legs[leg].steps, USUAL), 1.0) if leg < len(legs) else 0
+    done = sum(costs[:leg]) + under_way
+    return spent * (sum(costs) - done) / done if done else float("nan")
 
 
 def plan(

@@ -61,6 +61,8 @@ class Progress:
         Whether the last leg ended by itself.
     feedback
         The mixer's saturation feedback that is flown: 1 as in PX4.
+    left
+        s that the search may still take; NaN where nobody said.
     step, trail
         The solver's state inside a leg, and the losses (S,) of the leg so far; None between legs.
     """
@@ -74,6 +76,7 @@ class Progress:
     evaluations: int
     converged: bool = False
     feedback: float = 1.0
+    left: float = float("nan")
     step: Step | None = None
     trail: tuple[NDArray[np.float64], ...] = ()
 
