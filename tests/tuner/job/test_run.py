@@ -128,7 +128,7 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
         run(
             short_job(),
             out=tmp_path / "cut",
-            listener=Listener(SILENT.settled, interrupt, SILENT.message),
+            listener=Listener(SILENT.settled, interrupt, SILENT.message, SILENT.folds),
         )
     assert (tmp_path / "cut" / "best_fit.yaml").exists()
     assert not (tmp_path / "cut" / "result.json").exists()

@@ -1,0 +1,182 @@
+"""How the search fares on the shipped recordings when something is made hard for it.
+
+    python examples/search_trials.py reference   # from the original coefficients
+    python examples/search_trials.py starts      # from random starts in a box of a factor 3
+    python examples/search_trials.py mass        # mass freed, which no flight can tell
+    python examples/search_trials.py clock       # one recording's poses stamped 20 ms late
+    python examples/search_trials.py noise       # one recording replaced by noise
+
+Each prints one row of the README's table.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from tuner.runtime import configure
+
+configure()
+
+from tuner.comparison.compare import flights_of  # noqa: E402 (jax is configured first)
+from tuner.config import Options, Settings, settle, with_values  # noqa: E402
+from tuner.flights.flight import Flight, Series  # noqa: E402
+from tuner.identifiability import uncertainty  # noqa: E402
+from tuner.job.prepare import Job, job_of  # noqa: E402
+from tuner.job.results import validate, vehicle_fitted  # noqa: E402
+from tuner.job.search import search  # noqa: E402
+from tuner.objective.normal import OFFSET_UNIT  # noqa: E402
+from tuner.search.fitted import Fitted  # noqa: E402
+
+FOLDER = Path(__file__).parents[1] / "reference_flights"
+TIMES = ("time_constant_up", "time_constant_down", "estimate_latency", "actuator_latency")
+BOX = 3.0
+STARTS = 16
+LATE = 0.020
+SPOILT = "diagonal_3mps"
+
+
+def settings_of(**said: object) -> Settings:
+    """Return the settings of the shipped job, some of them changed."""
+    options = Options([str(path) for path in sorted(FOLDER.glob("*.bag"))], **said)  # type: ignore[arg-type]
+    return settle(options)
+
+
+def truth() -> dict[str, float]:
+    """Return the coefficients with which the recordings were flown."""
+    return dict(yaml.safe_load((FOLDER / "truth.yaml").read_text()))
+
+
+def solved(
+    settings: Settings, change: Callable[[Flight], Flight] = lambda flight: flight
+) -> tuple[Job, Fitted, float]:
+    """Return a job on changed recordings, its solution, and the s that the search took."""
+    flights = [change(flight) for flight in flights_of(settings)]
+    held = set(settings.job.holdout)
+    job = job_of(
+        settings,
+        tuple(flight for flight in flights if flight.name not in held),
+        tuple(flight for flight in flights if flight.name in held),
+    )
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        fitted = search(job, Path(folder), resume=False, tell=lambda *_: None)
+    return job, fitted, time.perf_counter() - began
+
+
+def worst(job: Job, fitted: Fitted) -> str:
+    """Return how far the coefficients are from the truth."""
+    true, found = truth(), job.space.values(fitted.point.coefficients)
+    off = {name: abs(float(value) / true[name] - 1.0) for name, value in found.items()}
+    mechanical = max((name for name in off if name not in TIMES), key=lambda name: off[name])
+    lag = max(TIMES[:2], key=lambda name: off[name])
+    latency = abs(float(found["estimate_latency"]) - true["estimate_latency"])
+    return (
+        f"{mechanical} {100 * off[mechanical]:.2f} % off, {lag} {100 * off[lag]:.1f} % off, "
+        f"estimate latency {1e3 * latency:.3f} ms off"
+    )
+
+
+def reference() -> str:
+    """Fit from the original coefficients, and fly the held-out flight."""
+    job, fitted, seconds = solved(settings_of())
+    before, after = validate(job, fitted, vehicle_fitted(job, fitted))
+    (held,) = job.held_out
+    first, last = before[held.name].rmse, after[held.name].rmse
+    ratios = [getattr(first, axis) / getattr(last, axis) for axis in ("x", "y", "z")]
+    place = ", ".join(f"{1e3 * getattr(last, axis):.2f}" for axis in ("x", "y", "z"))
+    return (
+        f"{worst(job, fitted)}; {held.name}, held out: {place} mm, "
+        f"{min(ratios):.0f} to {max(ratios):.0f} times better; "
+        f"{fitted.evaluations} Jacobians, {seconds:.0f} s"
+    )
+
+
+def starts() -> str:
+    """Fit from random starts around the truth."""
+    settings = settings_of()
+    settings = replace(settings, vehicle=with_values(settings.vehicle, truth()))
+    plan = settings.job.search.model_copy(
+        update={"starts": 1 + STARTS, "spread": BOX, "method": "gradient"}
+    )
+    settings = replace(settings, job=settings.job.model_copy(update={"search": plan}))
+    job, fitted, seconds = solved(settings)
+    losses = np.array([outcome.loss for outcome in fitted.outcomes[1:]])
+    reached = int((losses < 1.01 * losses.min()).sum())
+    return f"{reached} of {STARTS} reach the same minimum: {worst(job, fitted)}; {seconds:.0f} s"
+
+
+def mass() -> str:
+    """Free the mass, which scales with everything that carries or drags it."""
+    settings = settings_of()
+    free = [name for name in truth() if name not in ("rolling_moment_coefficient",)]
+    start = settings.vehicle.replace(mass=1.1 * settings.vehicle.mass)
+    settings = replace(settings, vehicle=start, job=settings.job.model_copy(update={"free": free}))
+    _, fitted, _ = solved(settings)
+    found = uncertainty(fitted)
+    return f"{found.estimates['mass'].verdict.value}: {found.directions[0].text}"
+
+
+def clock() -> str:
+    """Stamp one recording's poses late."""
+
+    def late(flight: Flight) -> Flight:
+        if flight.name != SPOILT:
+            return flight
+        series = dict(flight.series)
+        for name in ("position", "velocity", "attitude"):
+            series[name] = Series(series[name].time + LATE, series[name].values)
+        return replace(flight, series=series)
+
+    job, fitted, _ = solved(settings_of(), late)
+    number = [flight.name for flight in job.fitted].index(SPOILT)
+    found = float(fitted.point.offsets[0, number]) * OFFSET_UNIT
+    others = np.delete(np.asarray(fitted.point.offsets[0]) * OFFSET_UNIT, number)
+    return (
+        f"{SPOILT} found {1e3 * found:.2f} ms late, the others at most "
+        f"{1e3 * np.abs(others).max():.2f} ms: {worst(job, fitted)}"
+    )
+
+
+def noise() -> str:
+    """Replace everything measured on one flight by noise as wide as what it measured."""
+    generator = np.random.default_rng(0)
+
+    def spoilt(flight: Flight) -> Flight:
+        if flight.name != SPOILT:
+            return flight
+        series = dict(flight.series)
+        for name in ("position", "body_rate", "rotor_speed", "command"):
+            one = series[name]
+            spread = np.nanstd(one.values, axis=0)
+            middle = np.nanmean(one.values, axis=0)
+            drawn = middle + spread * generator.standard_normal(one.values.shape)
+            series[name] = Series(one.time, np.where(np.isfinite(one.values), drawn, np.nan))
+        turns = generator.standard_normal(series["attitude"].values.shape)
+        turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+        series["attitude"] = Series(series["attitude"].time, turns)
+        return replace(flight, series=series)
+
+    job, fitted, _ = solved(settings_of(), spoilt)
+    named = [f.subject for f in fitted.findings if "cannot be matched" in f.text]
+    return f"named: {', '.join(named)}; the others: {worst(job, fitted)}"
+
+
+TRIALS = {trial.__name__: trial for trial in (reference, starts, mass, clock, noise)}
+
+
+def main(names: list[str]) -> None:
+    """Run the named trials, or all."""
+    for name in names or list(TRIALS):
+        print(f"| `python examples/search_trials.py {name}` | {TRIALS[name]()} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

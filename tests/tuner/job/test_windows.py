@@ -1,0 +1,71 @@
+"""Fits through the inlets below the reference, on a simulated recording whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuner.comparison.layout import Layout
+from tuner.config import JobFile, Options, settle, values_of, with_values
+from tuner.config.job import Search
+from tuner.job.hold import with_the_untold_held
+from tuner.job.prepare import job_of
+from tuner.job.search import search
+
+WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
+FREE = ("inertia_xx", "inertia_yy", "motor_constant", "moment_constant", "rotor_drag_coefficient")
+
+
+def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
+    start = with_values(
+        updated, {name: values_of(updated)[name] * WRONG.get(name, 1.0) for name in free}
+    )
+    settings = settle(Options([str(bag)], vehicle=start))
+    job = JobFile(free=free, inlet=inlet, search=Search(method=method, window=0.5))
+    return job_of(replace(settings, job=job), (flight,), ())
+
+
+def fitted_through(job, folder):
+    folder.mkdir(exist_ok=True)
+    return search(job, folder, resume=False, tell=lambda *_: None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
+def test_the_truth_is_found_through_every_inlet(inlet, flight, bag, updated, tmp_path):
+    job = job_through(inlet, flight, bag, updated)
+    fitted = fitted_through(job, tmp_path)
+    assert fitted.objective.lanes.count > 15
+    found = job.space.values(fitted.point.coefficients)
+    truth = values_of(updated)
+    for name in ("inertia_xx", "inertia_yy", "motor_constant"):
+        assert float(found[name]) == pytest.approx(truth[name], rel=0.03), name
+
+
+@pytest.mark.slow
+def test_windows_are_compared_from_their_likeliest_starts(flight, bag, updated):
+    job = job_through("actuator", flight, bag, updated)
+    layout = Layout([flight], job.settings.controller, job.settings.job)
+    right = layout.fly(updated)[flight.name]
+    wrong = layout.fly(job.settings.vehicle)[flight.name]
+    assert right.rmse.x < 0.002
+    assert wrong.rmse.z > 3 * right.rmse.z
+    assert right.position_time[-1] == pytest.approx(flight.duration, abs=0.6)
+    assert np.all(np.diff(right.position_time) > 0)
+
+
+@pytest.mark.slow
+def test_one_of_what_trades_off_is_held_and_the_rest_follows(flight, bag, updated, tmp_path):
+    free = (*FREE, "mass", "inertia_zz")
+    job = job_through("rotor_speed", flight, bag, updated, free=free)
+    said = []
+    fitted, examination = with_the_untold_held(
+        job, fitted_through(job, tmp_path), lambda *_: None, said.append
+    )
+    assert fitted.held["motor_constant"] == "mass"
+    assert "mass" in said[0]
+    found = job.space.values(fitted.point.coefficients)
+    assert float(found["mass"]) == pytest.approx(updated.mass, rel=1e-9)
+    truth = values_of(updated)["motor_constant"]
+    assert float(found["motor_constant"]) == pytest.approx(truth, rel=0.02)
+    assert not examination.uncertainty.estimates["motor_constant"].identifiable

@@ -1,0 +1,90 @@
+"""Windows of a flight, through every inlet: the truth meets them, and is found again."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim_jax.inlet import ActuatorInlet
+from sim_jax.schedule import Schedule
+from tuner.errors import RecordingError
+from tuner.flights.flight import Series
+from tuner.objective.inlets import between, held, inlet_for, inlet_of
+from tuner.objective.lanes import window_lanes
+from tuner.objective.windows import windows_of
+
+
+def test_windows_follow_each_other_and_start_where_the_flight_is(flight):
+    windows = windows_of(flight, 1.0)
+    assert [round(window.begin) for window in windows] == list(range(len(windows)))
+    for window in windows[1:]:
+        index = np.searchsorted(flight.time, window.begin)
+        np.testing.assert_allclose(
+            window.flight.initial.position, flight.signals["position"][index], atol=2e-3
+        )
+        np.testing.assert_allclose(
+            window.flight.initial.velocity, flight.signals["velocity"][index], atol=0.05
+        )
+
+
+def test_a_stretch_without_poses_is_no_window(flight):
+    position = flight.series["position"]
+    gap = (position.time > 3.0) & (position.time < 4.2)
+    series = dict(flight.series) | {"position": Series(position.time[~gap], position.values[~gap])}
+    begins = [round(window.begin) for window in windows_of(replace(flight, series=series), 1.0)]
+    assert 3 not in begins
+    assert 5 in begins
+
+
+def test_a_flight_without_poses_is_refused(flight):
+    series = {name: one for name, one in flight.series.items() if name != "position"}
+    with pytest.raises(RecordingError, match="poses throughout"):
+        windows_of(replace(flight, series=series), 1.0)
+
+
+def test_auto_takes_the_most_upstream_inlet_that_can_be_fed(flight):
+    assert inlet_for(flight, "auto") == "reference"
+    signals = dict(flight.signals)
+    del signals["reference_velocity"]
+    assert inlet_for(replace(flight, signals=signals), "reference") == "reference"
+    without = inlet_for(replace(flight, signals=signals), "auto")
+    assert without in ("body_rate", "actuator")
+    for name in ("rate_setpoint", "thrust_setpoint"):
+        signals.pop(name, None)
+    assert inlet_for(replace(flight, signals=signals), "auto") == "actuator"
+    with pytest.raises(RecordingError, match="no rate_setpoint"):
+        inlet_for(replace(flight, signals=signals), "body_rate")
+
+
+def test_commands_recorded_in_full_are_held_and_sparse_ones_joined():
+    series = Series(np.array([0.0, 0.1, 0.2]), np.array([[0.0], [1.0], [np.nan]]))
+    clock = np.array([0.0, 0.05, 0.1, 0.3])
+    assert held(series, clock)[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert between(series, clock)[:, 0].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
+
+
+def test_the_actuator_inlet_holds_what_was_recorded(flight):
+    schedule = Schedule()
+    inlet = inlet_of("actuator", [flight], schedule)
+    assert isinstance(inlet, ActuatorInlet)
+    series = flight.series["command"]
+    at = 4.0
+    recorded = np.interp(at, series.time, series.values[:, 2])
+    fed = float(inlet.command[2][round(at * schedule.physics_rate), 0])
+    assert fed == pytest.approx(recorded, abs=0.02)
+
+
+@pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
+def test_every_inlet_makes_lanes_whose_starts_are_free(flight, inlet):
+    lanes = window_lanes(
+        [flight],
+        inlet=inlet,
+        seconds=1.0,
+        schedule=Schedule(),
+        lag=0.02,
+        noise={"position": 1e-3, "body_rate": 0.02, "rotor_speed": 2.0, "command": 1e-3},
+    )
+    assert lanes.freedom is not None
+    assert ("command" in lanes.measured) == (inlet == "body_rate")
+    assert ("rotor_speed" in lanes.measured) == (inlet != "rotor_speed")
+    assert lanes.begins.tolist() == pytest.approx(list(range(lanes.count)), abs=0.02)

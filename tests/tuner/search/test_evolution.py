@@ -1,0 +1,81 @@
+"""CMA-ES on two short simulated flights whose truth is known."""
+
+import numpy as np
+import pytest
+
+from tests.tuner.identifiability.making import problem, truth, with_data
+from tuner.objective.lanes import OFFSETS
+from tuner.search.growing import grow
+from tuner.search.legs import Leg, plan
+from tuner.search.progress import Free, beginning
+
+FREE = ("inertia_zz", "motor_constant", "moment_constant")
+
+
+@pytest.fixture(scope="module")
+def fit():
+    exact = problem(FREE)
+    return with_data(exact, truth(exact), noise=np.random.default_rng(5))
+
+
+def evolved(fit, *, seed, free=None):
+    leg = Leg("CMA-ES", 400, 5.0, False, False, 12, 1e-3, False, False, "cma")
+    free = Free(
+        np.ones(len(FREE), bool) if free is None else free, np.zeros((len(OFFSETS), 2), bool)
+    )
+    start = fit.space.vector_of(
+        {
+            p.name: p.initial * factor
+            for p, factor in zip(fit.space.parameters, (1.4, 0.8, 0.7), strict=True)
+        }
+    )
+    told = []
+    (end,) = grow(
+        fit,
+        (leg,),
+        beginning(fit, start[None]),
+        free=free,
+        clipped=False,
+        tell=told.append,
+        seed=seed,
+    )
+    return start, end, told
+
+
+def test_generations_come_closer_to_the_truth(fit):
+    start, end, told = evolved(fit, seed=0)
+    right = np.asarray(fit.space.initial)
+    found = np.asarray(end.points.coefficients[0])
+    assert np.linalg.norm(found - right) < 0.5 * np.linalg.norm(start - right)
+    losses = [now.iterations[-1].loss for now in told]
+    assert losses == sorted(losses, reverse=True)
+    assert end.losses[0] == losses[-1]
+
+
+def test_a_seed_decides_the_numbers(fit):
+    _, first, _ = evolved(fit, seed=3)
+    _, again, _ = evolved(fit, seed=3)
+    _, other, _ = evolved(fit, seed=4)
+    np.testing.assert_array_equal(first.points.coefficients, again.points.coefficients)
+    assert not np.array_equal(first.points.coefficients, other.points.coefficients)
+
+
+def test_what_is_held_stays(fit):
+    held = np.array([True, False, True])
+    start, end, _ = evolved(fit, seed=0, free=held)
+    found = np.asarray(end.points.coefficients[0])
+    assert found[1] == pytest.approx(start[1], rel=1e-9)
+    assert found[0] != start[0]
+
+
+@pytest.mark.parametrize("windows", [True, False])
+def test_plans_do_what_their_method_says(windows):
+    def solvers(method):
+        legs = plan(method, 4000, 400.0, windows=windows, robust=True, steps=50)
+        return [leg.solver for leg in legs]
+
+    assert set(solvers("gradient")) == {"gradient"}
+    hybrid = solvers("hybrid")
+    assert hybrid[0] == "cma"
+    assert hybrid[-1] == "gradient"
+    assert set(solvers("cma")) == {"cma", "offsets"}
