@@ -7,7 +7,7 @@ from typing import TypeAlias
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from sim_jax.control.mixer import PerRotor
 from sim_jax.control.position import ReferencePoint
@@ -48,4 +48,16 @@ class RotorSpeedInlet(eqx.Module):
     speed: PerRotor
 
 
-Inlet: TypeAlias = ReferenceInlet | BodyRateInlet | ActuatorInlet | RotorSpeedInlet
+SingleInlet: TypeAlias = ReferenceInlet | BodyRateInlet | ActuatorInlet | RotorSpeedInlet
+
+
+class MixedInlet(eqx.Module):
+    """Each vehicle of a batch has its own inlet; the loop is stepped once for every part."""
+
+    parts: tuple[SingleInlet, ...]
+    """For the whole batch each; what a part holds for a vehicle of another part is ignored."""
+    kind: Int[Array, "*batch"]
+    """Number of the part that each vehicle uses."""
+
+
+Inlet: TypeAlias = SingleInlet | MixedInlet

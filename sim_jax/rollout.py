@@ -21,7 +21,14 @@ from sim_jax.control.position import (
     wanted_acceleration,
 )
 from sim_jax.crash import Limits
-from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
+from sim_jax.inlet import (
+    ActuatorInlet,
+    BodyRateInlet,
+    Inlet,
+    MixedInlet,
+    ReferenceInlet,
+    RotorSpeedInlet,
+)
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
@@ -139,8 +146,21 @@ class _Plant(eqx.Module):
         command = mixer.mix(controller.mixer, torque, state.setpoints.thrust, counts=flying)
         return _replace(state, gyro=gyro, integral=integral, command=command)
 
+    def mixed(self, result: Callable[[_Plant], T]) -> T:
+        """Return a result with each part's inlet, every vehicle's from its own."""
+        assert isinstance(self.inlet, MixedInlet)
+        found = [
+            result(eqx.tree_at(lambda p: p.inlet, self, part, is_leaf=_is_inlet))
+            for part in self.inlet.parts
+        ]
+        for number, one in enumerate(found[1:], start=1):
+            found[0] = _where(self.inlet.kind == number, one, found[0])
+        return found[0]
+
     def setpoints(self, state: State, step: Int[Array, ""]) -> Setpoints:
         """Return what the rate controller is to follow: from position control or the inlet."""
+        if isinstance(self.inlet, MixedInlet):
+            return self.mixed(lambda plant: plant.setpoints(state, step))
         if isinstance(self.inlet, BodyRateInlet):
             given = Setpoints(self.inlet.rate, self.inlet.thrust)
             return _like(_row(given, step), state.setpoints)
@@ -154,6 +174,8 @@ class _Plant(eqx.Module):
 
     def command(self, state: State, step: Int[Array, ""]) -> State:
         """Bring the motor commands up to date, by rate control or from the inlet."""
+        if isinstance(self.inlet, MixedInlet):
+            return self.mixed(lambda plant: plant.command(state, step))
         if isinstance(self.inlet, BodyRateInlet):
             state = _replace(state, setpoints=self.setpoints(state, step))
         if isinstance(self.inlet, ActuatorInlet):
@@ -167,8 +189,10 @@ class _Plant(eqx.Module):
         commanded: State = lax.cond(due, lambda: self.stabilise(state), lambda: state)
         return commanded
 
-    def _spin_up(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor, PerRotor]:
+    def spin_up(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor, PerRotor]:
         """Return the rotor speeds after this step and those that act during it, in rad/s."""
+        if isinstance(self.inlet, MixedInlet):
+            return self.mixed(lambda plant: plant.spin_up(state, step))
         if isinstance(self.inlet, RotorSpeedInlet):
             now = _like(_row(self.inlet.speed, step), state.rotor_speed)
             later = _like(_row(self.inlet.speed, step + 1), state.rotor_speed)
@@ -194,7 +218,7 @@ class _Plant(eqx.Module):
 
     def physics(self, state: State, step: Int[Array, ""]) -> State:
         """Advance rotors and body by one step."""
-        speeds, acting = self._spin_up(state, step)
+        speeds, acting = self.spin_up(state, step)
 
         def wrench_at(rotation: Matrix3, velocity: Vec3, body_rate: Vec3) -> Wrench:
             return vehicle_wrench(
@@ -286,6 +310,10 @@ def _frd(flu: Vec3) -> Vec3:
     return Vec3(flu.x, -flu.y, -flu.z)
 
 
+def _is_inlet(node: object) -> bool:
+    return isinstance(node, Inlet)
+
+
 def _row(tree: PyTree[Array], index: Int[Array, ""]) -> PyTree[Array]:
     return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, keepdims=False), tree)
 
@@ -316,6 +344,9 @@ def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
 def _batch_shape(
     vehicle: Vehicle, controller: Controller, inlet: Inlet, start: Start
 ) -> tuple[int, ...]:
+    if isinstance(inlet, MixedInlet):
+        shapes = [_batch_shape(vehicle, controller, part, start) for part in inlet.parts]
+        return jnp.broadcast_shapes(*shapes, jnp.shape(inlet.kind))
     series = inlet.points if isinstance(inlet, ReferenceInlet) else inlet
     flags = (inlet.spins, inlet.yaw_rate) if isinstance(inlet, ReferenceInlet) else ()
     shapes = [jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(series)]

@@ -24,6 +24,26 @@ def bag(updated, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
+def full_bag(updated, tmp_path_factory):
+    """Six seconds of the same, every command of the 400 Hz loop recorded."""
+    from tuner.simulation.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.simulation.write import write_flights  # noqa: PLC0415
+
+    shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
+    path = tmp_path_factory.mktemp("lab") / "full_circle.bag"
+    write_flights(simulate(updated, ControllerFile(), shape, duration=8.0, rate=400.0), path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def full_flight(full_bag):
+    """The same, read."""
+    from tuner.flights.load import load_flight  # noqa: PLC0415
+
+    return load_flight(full_bag)
+
+
+@pytest.fixture(scope="session")
 def flight(bag):
     """The same, read."""
     from tuner.flights.load import load_flight  # noqa: PLC0415

@@ -60,7 +60,7 @@ class WindowComparison:
         self._windows = [windows_of(flight, seconds) for flight in flights]
         self._lanes = window_lanes(
             flights,
-            inlet=inlet,
+            inlets=[inlet] * len(flights),
             seconds=seconds,
             schedule=self._schedule,
             lag=LAG,
@@ -92,7 +92,8 @@ class WindowComparison:
                     late=self._offsets.get(flight.name, 0.0),
                     crash_time=math.inf,
                 )
-                parts.append(errors.later(window.begin))
+                inside = errors.between(0.0, window.flight.duration)
+                parts.append(inside.later(window.begin))
                 lane += 1
             found[flight.name] = joined(flight.name, parts, laps_of(flight))
         return found

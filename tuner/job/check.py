@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
+from tuner.objective.inlets import NEEDS, sparse
 from tuner.search.fitted import Finding
 from tuner.search.legs import Leg
 from tuner.search.progress import beginning, point_of, stage_of
@@ -43,7 +44,7 @@ def check(job: Job) -> tuple[Finding, ...]:
     tuple of Finding
         ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
     """
-    found = [*_recordings(job), *_excitation(job), *_bounds(job), *_moved(job)]
+    found = [*_recordings(job), *_inputs(job), *_excitation(job), *_bounds(job), *_moved(job)]
     found += _information(job)
     return tuple(found)
 
@@ -70,6 +71,30 @@ def _recordings(job: Job) -> list[Finding]:
         if gap > GAP:
             found.append(
                 Finding("warning", flight.name, f"no pose for {gap:.2f} s", "check the cameras")
+            )
+    return found
+
+
+def _inputs(job: Job) -> list[Finding]:
+    """Warn of inputs that were recorded less often than the loop that makes them ran."""
+    rates = {
+        "body_rate": job.objective.schedule.position_control_rate,
+        "actuator": job.objective.schedule.rate_control_rate,
+    }
+    found = []
+    for flight, inlet in zip(job.fitted, job.inlets, strict=True):
+        signal = NEEDS[inlet][0]
+        if inlet in rates and sparse([flight], signal, rates[inlet]):
+            recorded = 1.0 / float(np.median(np.diff(flight.series[signal].time)))
+            found.append(
+                Finding(
+                    "warning",
+                    flight.name,
+                    f"its {signal.replace('_', ' ')}s were recorded at {recorded:.0f} Hz, but made "
+                    f"at {rates[inlet]} Hz: what happened in between is lost, and moments of "
+                    "inertia may be wrong by tens of percent, more than their intervals say",
+                    "log them at the full rate, or use an inlet further upstream",
+                )
             )
     return found
 

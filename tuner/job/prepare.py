@@ -12,7 +12,7 @@ from tuner.coefficients import Space, space_of
 from tuner.comparison.compare import flights_of
 from tuner.comparison.layout import said_inlet
 from tuner.config import Settings
-from tuner.errors import ConfigError, RecordingError
+from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.inlets import InletName, inlet_for
@@ -44,9 +44,9 @@ class Job:
         Channel -> standard deviation in its unit (attitude: rad).
     space
         Free coefficients.
-    inlet
-        Where the recordings enter the simulated loop: whole flights for ``reference``, else
-        windows.
+    inlets
+        Where each fitted recording enters the simulated loop: whole flights where all enter as
+        reference, else windows.
     objective
         What is searched.
     windows
@@ -59,7 +59,7 @@ class Job:
     held_out: tuple[Flight, ...]
     noise: Mapping[str, float]
     space: Space
-    inlet: InletName
+    inlets: tuple[InletName, ...]
     objective: Objective
     windows: Objective | None = None
 
@@ -103,7 +103,8 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     space = space_of(settings.vehicle, job)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
-    inlet = _inlet(settings, fitted)
+    inlets = _inlets(settings, fitted)
+    closed = set(inlets) == {"reference"}
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
 
@@ -112,10 +113,10 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
         return Objective(model, lanes, space, schedule, samples, limits)
 
     windows = None
-    if inlet != "reference" or not all(begins_gently(flight) for flight in fitted):
+    if not closed or not all(begins_gently(flight) for flight in fitted):
         lanes = window_lanes(
             on_time,
-            inlet=inlet,
+            inlets=inlets,
             seconds=job.search.window,
             schedule=schedule,
             lag=settings.vehicle.motor.time_constant_up,
@@ -123,27 +124,17 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
             weights=_weights(settings, fitted, whole=False),
         )
         windows = problem(lanes, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE)
-    if inlet == "reference":
+    if closed:
         whole = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
         objective = problem(whole, longest, limits_for(fitted))
-        return Job(settings, fitted, held_out, noise, space, inlet, objective, windows)
+        return Job(settings, fitted, held_out, noise, space, inlets, objective, windows)
     assert windows is not None
-    return Job(settings, fitted, held_out, noise, space, inlet, windows)
+    return Job(settings, fitted, held_out, noise, space, inlets, windows)
 
 
-def _inlet(settings: Settings, flights: Sequence[Flight]) -> InletName:
-    """Return where the recordings enter the simulated loop."""
-    chosen = {}
-    for flight in flights:
-        chosen[flight.name] = inlet_for(flight, said_inlet(settings.job, flight.name))
-    kinds = sorted(set(chosen.values()))
-    if len(kinds) > 1:
-        raise ConfigError(
-            "inlet",
-            f"the flights would enter through {' and '.join(kinds)}",
-            f"name one that all can feed, as inlet: {kinds[0]}",
-        )
-    return chosen[flights[0].name]
+def _inlets(settings: Settings, flights: Sequence[Flight]) -> tuple[InletName, ...]:
+    """Return where each recording enters the simulated loop."""
+    return tuple(inlet_for(flight, said_inlet(settings.job, flight.name)) for flight in flights)
 
 
 def given_offset(settings: Settings, name: str) -> float | None:

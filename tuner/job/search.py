@@ -96,7 +96,7 @@ def _doubt(job: Job, found: Fitted) -> str:
     if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
         return f"no two of {len(losses)} starts ended in the same minimum"
     lost = unmatched(found.scales)
-    if job.inlet == "reference" and len(lost) > len(job.fitted) / 2:
+    if set(job.inlets) == {"reference"} and len(lost) > len(job.fitted) / 2:
         return f"{len(lost)} of {len(job.fitted)} flights stayed far from the recording"
     return ""
 
@@ -180,8 +180,8 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     free = np.ones((len(OFFSETS), len(job.fitted)), bool)
     fixed = [given_offset(job.settings, flight.name) is not None for flight in job.fitted]
     free[: len(CLOCKS), fixed] = False
-    if job.inlet != "reference":
-        free[CLOCKS.index("flight_controller")] = False
+    fed = [inlet != "reference" for inlet in job.inlets]
+    free[CLOCKS.index("flight_controller"), fed] = False
     return free
 
 

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from sim_jax.inlet import ActuatorInlet, Inlet, RotorSpeedInlet
+from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, RotorSpeedInlet
 from sim_jax.motor import reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
@@ -87,6 +88,10 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
 
 def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
     """Return an inlet whose rotors are told a steady difference about roll, pitch and yaw."""
+    if isinstance(inlet, MixedInlet):
+        parts = (trimmed(part, vehicle, change) for part in inlet.parts)
+        changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
+        return changed
     if not isinstance(inlet, ActuatorInlet | RotorSpeedInlet):
         return inlet
     first = COUNT - STATES["trim"][0]

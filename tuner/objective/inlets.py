@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import jax
@@ -10,11 +11,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.control.position import ReferencePoint
-from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
+from sim_jax.inlet import (
+    ActuatorInlet,
+    BodyRateInlet,
+    Inlet,
+    MixedInlet,
+    ReferenceInlet,
+    RotorSpeedInlet,
+    SingleInlet,
+)
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.errors import RecordingError
-from tuner.flights.flight import Array, Flight, Series
+from tuner.flights.flight import SIGNALS, Array, Flight, Series
 
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
 
@@ -71,7 +80,43 @@ def _complete(flight: Flight, signal: str) -> bool:
     return flight.has(signal) and bool(np.isfinite(flight.signals[signal]).any(axis=0).all())
 
 
-def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> Inlet:
+def inlets_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
+    """Lay what was recorded side by side, each lane's for its own inlet.
+
+    Parameters
+    ----------
+    names
+        F inlets.
+    flights, schedule
+        As of `inlet_of`.
+    """
+    kinds = [name for name in NEEDS if name in names]
+    if len(kinds) == 1:
+        return inlet_of(kinds[0], flights, schedule)
+    parts = []
+    for kind in kinds:
+        feeding = [
+            flight if name == kind else _silent(flight, NEEDS[kind])
+            for name, flight in zip(names, flights, strict=True)
+        ]
+        parts.append(inlet_of(kind, feeding, schedule))
+    return MixedInlet(tuple(parts), jnp.asarray([kinds.index(name) for name in names]))
+
+
+def _silent(flight: Flight, signals: Sequence[str]) -> Flight:
+    """Return a flight whose signals are zero throughout."""
+    widths = {name: SIGNALS[name][0] for name in signals}
+    ends = np.array([0.0, flight.duration])
+    return replace(
+        flight,
+        signals=dict(flight.signals)
+        | {name: np.zeros((len(flight.time), width)) for name, width in widths.items()},
+        series=dict(flight.series)
+        | {name: Series(ends, np.zeros((2, width))) for name, width in widths.items()},
+    )
+
+
+def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> SingleInlet:
     """Lay what was recorded side by side; after its end the last value holds.
 
     Set-points and commands hold until the loop that makes them runs again. Where they were recorded
@@ -94,7 +139,7 @@ def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> 
     clock = np.arange(int(np.ceil(longest * physics_rate)) + 2) / physics_rate
 
     def laid(signal: str, update_rate: float | None) -> list[jax.Array]:
-        read = between if update_rate is None or _sparse(flights, signal, update_rate) else held
+        read = between if update_rate is None or sparse(flights, signal, update_rate) else held
         table = np.stack([read(flight.series[signal], clock) for flight in flights], axis=-1)
         return [jnp.asarray(table[:, column]) for column in range(table.shape[1])]
 
@@ -108,7 +153,8 @@ def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> 
     return RotorSpeedInlet((a, b, c, d))
 
 
-def _sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
+def sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
+    """Tell whether a signal was recorded less often than it was made, at a rate in Hz."""
     gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in flights])
     return bool(np.median(gaps) * update_rate > MISSED)
 

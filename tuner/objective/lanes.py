@@ -20,7 +20,7 @@ from sim_jax.vector import Vec3
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, InitialState
 from tuner.objective.freedom import freedom_of
-from tuner.objective.inlets import SILENT, InletName, inlet_of
+from tuner.objective.inlets import SILENT, InletName, inlet_of, inlets_of
 from tuner.objective.noise import CHANNELS, channel_noise
 from tuner.objective.windows import windows_of
 
@@ -131,7 +131,7 @@ def lanes_of(
 def window_lanes(
     flights: Sequence[Flight],
     *,
-    inlet: InletName,
+    inlets: Sequence[InletName],
     seconds: float,
     schedule: Schedule,
     lag: float,
@@ -144,8 +144,8 @@ def window_lanes(
     ----------
     flights
         N flights.
-    inlet, schedule
-        What is fed in, and when.
+    inlets, schedule
+        What is fed in of each flight, and when.
     seconds
         s, length of a window.
     lag
@@ -159,21 +159,35 @@ def window_lanes(
     ]
     pieces = [window.flight for _, window in cut]
     start = start_of([piece.initial for piece in pieces], resting=False)
-    acts = {
-        "rotor_speed": inlet != "rotor_speed",
-        "rate_integral": inlet in ("reference", "body_rate"),
-        "trim": inlet in ("actuator", "rotor_speed"),
+    names = [inlets[number] for number, _ in cut]
+    freedom = np.stack([_freedom(name) for name in names], axis=-1)
+    heard = {
+        channel: sigma
+        for channel, sigma in noise.items()
+        if any(channel not in SILENT[inlet] for inlet in inlets)
     }
-    freedom = np.repeat(freedom_of(acts)[:, None], len(pieces), axis=1)
-    heard = {name: sigma for name, sigma in noise.items() if name not in SILENT[inlet]}
+    told = {
+        flight.name: dict((weights or {}).get(flight.name, {})) | dict.fromkeys(SILENT[inlet], 0.0)
+        for flight, inlet in zip(flights, inlets, strict=True)
+    }
     return Lanes(
-        inlet=inlet_of(inlet, pieces, schedule),
+        inlet=inlets_of(names, pieces, schedule),
         start=start,
-        measured=_all_measured(pieces, heard, weights),
+        measured=_all_measured(pieces, heard, told),
         flight=jnp.asarray([number for number, _ in cut]),
         turning=jnp.asarray(np.stack([_turning(piece, lag) for piece in pieces], axis=-1)),
         begin=jnp.asarray([window.begin for _, window in cut]),
         freedom=jnp.asarray(freedom),
+    )
+
+
+def _freedom(inlet: InletName) -> NDArray[np.float64]:
+    return freedom_of(
+        {
+            "rotor_speed": inlet != "rotor_speed",
+            "rate_integral": inlet in ("reference", "body_rate"),
+            "trim": inlet in ("actuator", "rotor_speed"),
+        }
     )
 
 

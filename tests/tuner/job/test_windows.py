@@ -7,10 +7,13 @@ import pytest
 
 from tuner.comparison.layout import Layout
 from tuner.config import JobFile, Options, settle, values_of, with_values
-from tuner.config.job import Search
+from tuner.config.job import FlightSettings, Search
+from tuner.job.check import check
 from tuner.job.hold import with_the_untold_held
 from tuner.job.prepare import job_of
 from tuner.job.search import search
+from tuner.search.legs import WHOLE, plan
+from tuner.search.progress import beginning, stage_of
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
 FREE = ("inertia_xx", "inertia_yy", "motor_constant", "moment_constant", "rotor_drag_coefficient")
@@ -32,8 +35,8 @@ def fitted_through(job, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
-def test_the_truth_is_found_through_every_inlet(inlet, flight, bag, updated, tmp_path):
-    job = job_through(inlet, flight, bag, updated)
+def test_the_truth_is_found_through_every_inlet(inlet, full_flight, full_bag, updated, tmp_path):
+    job = job_through(inlet, full_flight, full_bag, updated)
     fitted = fitted_through(job, tmp_path)
     assert fitted.objective.lanes.count > 15
     found = job.space.values(fitted.point.coefficients)
@@ -43,21 +46,66 @@ def test_the_truth_is_found_through_every_inlet(inlet, flight, bag, updated, tmp
 
 
 @pytest.mark.slow
-def test_windows_are_compared_from_their_likeliest_starts(flight, bag, updated):
-    job = job_through("actuator", flight, bag, updated)
-    layout = Layout([flight], job.settings.controller, job.settings.job)
-    right = layout.fly(updated)[flight.name]
-    wrong = layout.fly(job.settings.vehicle)[flight.name]
-    assert right.rmse.x < 0.002
-    assert wrong.rmse.z > 3 * right.rmse.z
-    assert right.position_time[-1] == pytest.approx(flight.duration, abs=0.6)
-    assert np.all(np.diff(right.position_time) > 0)
+def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updated, tmp_path):
+    single = job_through("actuator", full_flight, full_bag, updated)
+    second = replace(full_flight, name="second")
+    job = single.settings.job.model_copy(
+        update={"flights": {"second": FlightSettings(inlet="rotor_speed")}}
+    )
+    settings = replace(single.settings, job=job)
+    mixed = job_of(settings, (full_flight, second), ())
+    assert mixed.inlets == ("actuator", "rotor_speed")
+    start = mixed.objective.start(mixed.space.initial)
+    stage = stage_for(mixed)
+    both = mixed.objective.sums(start, stage)
+    alone = single.objective.sums(single.objective.start(single.space.initial), stage_for(single))
+    count = single.objective.lanes.count
+    np.testing.assert_allclose(both.loss[:count], alone.loss, rtol=1e-8)
+    np.testing.assert_allclose(both.gradient[..., :count], alone.gradient, rtol=1e-6, atol=1e-6)
+    fitted = fitted_through(mixed, tmp_path)
+    found = mixed.space.values(fitted.point.coefficients)
+    truth = values_of(updated)
+    for name in ("inertia_xx", "motor_constant"):
+        assert float(found[name]) == pytest.approx(truth[name], rel=0.03), name
+
+
+def stage_for(job):
+    progress = beginning(job.objective, job.space.initial[None])
+    (leg,) = [leg for leg in plan_of(job) if leg.name == WHOLE]
+    return stage_of(leg, progress.scales, np.asarray(progress.points.offsets[0]), progress.states)
+
+
+def plan_of(job):
+    return plan("gradient", job.objective.samples, 400.0, windows=True, robust=False, steps=5)
 
 
 @pytest.mark.slow
-def test_one_of_what_trades_off_is_held_and_the_rest_follows(flight, bag, updated, tmp_path):
+def test_windows_are_compared_from_their_likeliest_starts(full_flight, full_bag, updated):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    layout = Layout([full_flight], job.settings.controller, job.settings.job)
+    right = layout.fly(updated)[full_flight.name]
+    wrong = layout.fly(job.settings.vehicle)[full_flight.name]
+    assert right.rmse.x < 0.002
+    assert wrong.rmse.z > 3 * right.rmse.z
+    assert right.position_time[-1] == pytest.approx(full_flight.duration, abs=0.6)
+    assert np.all(np.diff(right.position_time) > 0)
+
+
+def test_commands_recorded_too_seldom_are_said(flight, bag, updated, full_flight, full_bag):
+    seldom = check(job_through("actuator", flight, bag, updated))
+    said = [finding.text for finding in seldom if "recorded at 100 Hz" in finding.text]
+    assert len(said) == 1
+    assert "made at 400 Hz" in said[0]
+    full = check(job_through("actuator", full_flight, full_bag, updated))
+    assert not any("recorded at" in finding.text for finding in full)
+
+
+@pytest.mark.slow
+def test_one_of_what_trades_off_is_held_and_the_rest_follows(
+    full_flight, full_bag, updated, tmp_path
+):
     free = (*FREE, "mass", "inertia_zz")
-    job = job_through("rotor_speed", flight, bag, updated, free=free)
+    job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
     said = []
     fitted, examination = with_the_untold_held(
         job, fitted_through(job, tmp_path), lambda *_: None, said.append

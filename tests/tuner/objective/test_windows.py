@@ -78,7 +78,7 @@ def test_the_actuator_inlet_holds_what_was_recorded(flight):
 def test_every_inlet_makes_lanes_whose_starts_are_free(flight, inlet):
     lanes = window_lanes(
         [flight],
-        inlet=inlet,
+        inlets=[inlet],
         seconds=1.0,
         schedule=Schedule(),
         lag=0.02,
