@@ -19,6 +19,7 @@ from tuner.result import Run, read_run
 from tuner.runtime import configure
 
 if TYPE_CHECKING:
+    from sim_jax.precision import Precision
     from tuner.comparison.table import Table
     from tuner.export.export import Exported, Format
     from tuner.export.sdf.snippet import Simulator
@@ -248,6 +249,7 @@ def simulate(
     duration: float = 40.0,
     rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
+    precision: Precision = "float64",
 ) -> tuple[Simulation, ...]:
     """Fly a trajectory; what ``tune simulate`` does.
 
@@ -272,6 +274,8 @@ def simulate(
     grid
         Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.sweep.grid_of`
         makes every combination of several ranges.
+    precision
+        What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
 
     Returns
     -------
@@ -302,6 +306,7 @@ def simulate(
             duration=duration,
             rate=rate,
             grid=grid,
+            precision=precision,
         )
     )
 
