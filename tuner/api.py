@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tuner.config import (
     ControllerFile,
@@ -183,6 +183,10 @@ def sensitivity(
     topics: Named | None = None,
     namespace: str | None = None,
     arena: Sequence[float] | None = None,
+    global_method: Literal["morris", "sobol"] | None = None,
+    samples: int | None = None,
+    span: float = 30.0,
+    profile: Sequence[str] | None = None,
     out: Named | None = None,
 ) -> Examined:
     """Tell what recordings say of each coefficient of a vehicle; what ``tune sensitivity`` does.
@@ -198,6 +202,14 @@ def sensitivity(
     arena
         m from wall to wall along x and y, about the origin, and up: where the next flight must
         fit. None takes what the recorded flights took, and some more.
+    global_method
+        Whose indices over the range of the coefficients to tell too.
+    samples
+        For them: trajectories of Morris, base points of Sobol.
+    span
+        Percent by which coefficients are varied for them, where the job file gives no bounds.
+    profile
+        Coefficients for which the others are fitted again along a grid of values.
     out
         Folder for the tables and the report; None makes one under ``runs/``.
 
@@ -230,7 +242,13 @@ def sensitivity(
     )
     return examine_vehicle(
         options,
-        Request(arena=arena),
+        Request(
+            arena=arena,
+            whole_range=global_method,
+            samples=samples,
+            span=span / 100.0,
+            profiles=tuple(profile or ()),
+        ),
         out=folder_for(None if out is None else Path(out)),
         command=f"tuner.sensitivity from Python: {options.flights}",
     )
