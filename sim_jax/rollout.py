@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from sim_jax.inlet import (
 )
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.rotor import Wrench, vehicle_wrench
@@ -40,6 +41,7 @@ from sim_jax.state import Setpoints, Start, State, first_state
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -85,6 +87,7 @@ class _Plant(eqx.Module):
     schedule: Schedule = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
     gravity: float = eqx.field(static=True)
+    reversible: bool = eqx.field(static=True)
     inlet: Inlet
     lag: Lag | SwitchedLag
     gyro: GyroFilter
@@ -265,7 +268,8 @@ class _Plant(eqx.Module):
             after = self.step(before, number * count + offset)
             return after, _where(offset == 0, after.command, command)
 
-        end, command = _repeat(count, one, (state, state.command))
+        body = _forgetful(one) if self.reversible else one
+        end, command = _repeat(count, body, (state, state.command))
         row = Sample(
             start.motion, start.rotor_speed, _where(gone, start.command, command), state.setpoints
         )
@@ -284,7 +288,7 @@ class _Plant(eqx.Module):
         def one(state: State, offset: Int[Array, ""]) -> tuple[State, Sample]:
             return self.block(state, number * count + offset)
 
-        state, rows = lax.scan(one, state, jnp.arange(count))
+        state, rows = lax.scan(_forgetful(one), state, jnp.arange(count))
         return state, jax.tree.map(lambda leaf: leaf[0], rows)
 
 
@@ -304,6 +308,12 @@ def _repeat(count: int, body: Callable[[Array, T], T], start: T) -> T:
         return body(jnp.asarray(0), start)
     end: T = lax.fori_loop(0, count, body, start)
     return end
+
+
+def _forgetful(function: Callable[P, T]) -> Callable[P, T]:
+    """Let reverse mode remember a function's arguments only, and compute the rest again."""
+    again: Callable[P, T] = jax.checkpoint(function, prevent_cse=False)
+    return again
 
 
 def _frd(flu: Vec3) -> Vec3:
@@ -365,6 +375,7 @@ def rollout(
     horizon: Int[Array, ""] | None = None,
     limits: Limits | None = None,
     gravity: float = GRAVITY,
+    precision: Precision | None = None,
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
 
@@ -383,17 +394,24 @@ def rollout(
         a time is the state at that time, before the physics that follows it.
     horizon
         If given, only so many samples are flown, and the rest of the log is zero. It may be traced:
-        one compiled function serves every horizon; derivatives are then forward-mode only.
+        one compiled function serves every horizon; derivatives are then forward-mode only. Reverse
+        mode remembers the state at every tick and computes the steps between again.
     limits
         The space in which a flight counts as flying.
     gravity
         m/s², acting on the vehicle. (PX4's Gazebo worlds have 9.8066.)
+    precision
+        What to compute in; by default what holds all arguments. Single precision is twice as fast
+        for a batch, and stays within a fiftieth of a millimetre of double over 40 s.
 
     Returns
     -------
     Rollout
         Log with leaves (samples, \\*batch), and the time of a crash.
     """
+    given = vehicle, controller, inlet, start
+    dtype = precision_of(given) if precision is None else jnp.dtype(precision)
+    vehicle, controller, inlet, start = in_precision(given, dtype)
     shape = _batch_shape(vehicle, controller, inlet, start)
     plant = _Plant(
         vehicle=vehicle,
@@ -401,6 +419,7 @@ def rollout(
         schedule=schedule,
         limits=Limits() if limits is None else limits,
         gravity=gravity,
+        reversible=horizon is None,
         inlet=inlet,
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
@@ -411,7 +430,7 @@ def rollout(
         return plant.sample(state, number)
 
     if horizon is None:
-        state, log = lax.scan(sample, state, jnp.arange(samples))
+        state, log = lax.scan(_forgetful(sample), state, jnp.arange(samples))
         return Rollout(log, state.crash_time)
 
     def logged(number: Int[Array, ""], carried: tuple[State, Sample]) -> tuple[State, Sample]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 from tuner.cli.options import (
     TYPED,
@@ -30,6 +32,12 @@ def sensitivity(
     fit: Annotated[list[str] | None, Many] = None,
     fix: Annotated[list[str] | None, Many] = None,
     arena: str | None = None,
+    global_method: Annotated[
+        Literal["morris", "sobol"] | None, Parameter(name="--global", negative=())
+    ] = None,
+    samples: int | None = None,
+    span: float = 30.0,
+    profile: Annotated[list[str] | None, Many] = None,
     out: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -46,6 +54,14 @@ def sensitivity(
     arena
         X,Y,Z in m from wall to wall and up, about the origin: where the next flight must fit.
         Default: what the recorded flights took, and some more.
+    global_method
+        Tell the indices of one of them over the range of the coefficients, too.
+    samples
+        For them: trajectories of Morris (default 16), base points of Sobol (default 64).
+    span
+        Percent by which coefficients are varied for them, where the job file gives no bounds.
+    profile
+        Coefficients for which the others are fitted again along a grid of values.
     out
         Folder for the tables and the report; default runs/ and the time.
     """
@@ -69,7 +85,13 @@ def sensitivity(
         fit=fit,
         fix=fix,
     )
-    request = Request(arena=None if arena is None else lengths("--arena", arena))
+    request = Request(
+        arena=None if arena is None else lengths("--arena", arena),
+        whole_range=global_method,
+        samples=samples,
+        span=span / 100.0,
+        profiles=profile or (),
+    )
     with listening(quiet=quiet) as listener:
         found = examine_vehicle(
             options, request, out=folder_for(out), command=TYPED.get(), say=listener.message

@@ -29,11 +29,14 @@ class Covariance:
         (K, K), the same from the flights alone; huge where they say nothing.
     inflation
         (K,) standard error over that of independent residuals, at least 1.
+    beyond_noise
+        (K,) standard error over that of independent residuals as large as assumed.
     """
 
     matrix: Array
     alone: Array
     inflation: Array
+    beyond_noise: Array
 
     @property
     def error(self) -> Array:
@@ -79,6 +82,7 @@ def covariance(evidence: Evidence) -> Covariance:
         matrix=matrix,
         alone=alone_inverse * np.outer(beyond_noise, beyond_noise),
         inflation=inflation,
+        beyond_noise=beyond_noise,
     )
 
 

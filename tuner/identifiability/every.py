@@ -26,17 +26,22 @@ class Every:
         With K + L parameters: the fit's own K first, then the L fixed ones.
     fitted, fixed
         Their names.
+    own
+        The fit's own space.
     """
 
     objective: Objective
     point: Point
     fitted: tuple[str, ...]
     fixed: tuple[str, ...]
+    own: Space
 
     def only(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
         """Return the space of some parameters, and where they lie in the whole one."""
         space = self.objective.space
         places = np.array([space.names.index(name) for name in names])
+        if names == self.fitted:
+            return self.own, places  # so that what is compiled for it serves again
         return Space([space.parameters[place] for place in places], {}), places
 
 
@@ -52,14 +57,16 @@ def every_coefficient(objective: Objective, point: Point) -> Every:
     vector = whole.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
     return Every(
-        objective=_with_space(objective, whole),
+        objective=with_space(objective, whole),
         point=Point(jnp.asarray(vector), point.offsets),
         fitted=space.names,
         fixed=tuple(fixed),
+        own=space,
     )
 
 
-def _with_space(objective: Objective, space: Space) -> Objective:
+def with_space(objective: Objective, space: Space) -> Objective:
+    """Return the same problem in other coordinates."""
     return Objective(
         model=objective.model,
         lanes=objective.lanes,

@@ -13,15 +13,20 @@ from sim_jax.inlet import ReferenceInlet
 from tuner.comparison.compare import flights_of, offset_of
 from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
-from tuner.config import Options, Settings, settle, values_of
+from tuner.config import Options, Settings, check_names, settle, values_of
+from tuner.errors import InputError
 from tuner.flights.flight import Flight
 from tuner.identifiability.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.identifiability.examine import Examination, examine
 from tuner.identifiability.files import write_files
+from tuner.identifiability.global_indices import Method, write_global
 from tuner.identifiability.knowledge import Knowledge
 from tuner.identifiability.next_flight import Habits, next_flights
+from tuner.identifiability.profile import profile
+from tuner.identifiability.profiles import write_profiles
 from tuner.identifiability.proposals import Proposals, write_proposals
 from tuner.identifiability.telling import tell as told_of
+from tuner.identifiability.whole_range import whole_range
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
 from tuner.job.results import controller_flown, versions
 from tuner.objective.normal import Objective, Point, Stage
@@ -60,9 +65,21 @@ class Request:
     ----------
     arena
         m along x, y and up; None takes what the recorded flights took, and some more.
+    whole_range
+        Whose indices between the bounds to tell too; None tells none.
+    samples
+        How many for them; None for the usual number.
+    span
+        Share by which coefficients are varied for them, where the job file gives no bounds.
+    profiles
+        Coefficients whose likelihood to profile.
     """
 
     arena: Sequence[float] | None = None
+    whole_range: Method | None = None
+    samples: int | None = None
+    span: float = 0.3
+    profiles: Sequence[str] = ()
 
 
 def examine_vehicle(
@@ -97,6 +114,11 @@ def examine_vehicle(
     settings = settle(options, fits=False)
     if request.arena is not None:
         Arena.of(request.arena)
+    check_names(request.profiles, "--profile")
+    if not 0 < request.span <= 10:
+        raise InputError("--span", f"{100 * request.span:g} % is no span", "give 30 for ±30 %")
+    if request.samples is not None and request.samples < 2:
+        raise InputError("--samples", f"{request.samples} tell nothing", "give at least 2")
     job = job_of(settings, flights_of(settings), ())
     out.mkdir(parents=True, exist_ok=True)
     fitted = as_it_is(job)
@@ -104,10 +126,64 @@ def examine_vehicle(
     examination = examine(fitted)
     say("simulating what could be flown next")
     knowledge, proposals = write_examination(out, job, examination, fitted, arena=request.arena)
+    _on_request(request, job, fitted, examination, folder=out, say=say)
     write_simulated(out, job.flights, _flown(job, fitted))
     write_about(out, _about(settings, job, fitted, command))
     render(out)
     return Examined(out, knowledge, proposals, fitted.findings)
+
+
+def _on_request(
+    request: Request,
+    job: Job,
+    fitted: Fitted,
+    examination: Examination,
+    *,
+    folder: Path,
+    say: Callable[[str], None],
+) -> None:
+    """Write what takes longer."""
+    if request.whole_range is not None:
+        say(f"flying vehicles between the bounds for {request.whole_range.capitalize()}'s indices")
+        found = whole_range(
+            fitted.objective,
+            fitted.point,
+            fitted.stage,
+            method=request.whole_range,
+            flights=[flight.name for flight in job.fitted],
+            bounds=range_of(job, examination, request.span),
+            samples=request.samples,
+            seed=job.settings.job.search.seed,
+        )
+        write_global(found, folder)
+    profiles = []
+    for name in request.profiles:
+        say(f"fitting the others again for each value of {name}")
+        profiles.append(profile(examination, fitted.stage, name))
+    if profiles:
+        write_profiles(profiles, folder)
+
+
+def range_of(job: Job, examination: Examination, span: float) -> dict[str, tuple[float, float]]:
+    """Return where each fitted coefficient is varied: the job file's bounds, else some percent.
+
+    The search's own bounds are guards: most vehicles between them cannot fly.
+    """
+    sensitivity = examination.sensitivity
+    steps = dict(zip(sensitivity.names, sensitivity.step, strict=True))
+    found = {}
+    for parameter in job.space.parameters:
+        own = job.settings.job.coefficients.get(parameter.name)
+        value = examination.uncertainty.estimates[parameter.name].value
+        if parameter.scale == "log":
+            low, high = value / (1.0 + span), value * (1.0 + span)
+        else:
+            low, high = (value + side * span * float(steps[parameter.name]) for side in (-1, 1))
+        said = (None, None) if own is None else (own.lower, own.upper)
+        low = max(low, parameter.lower) if said[0] is None else said[0]
+        high = min(high, parameter.upper) if said[1] is None else said[1]
+        found[parameter.name] = (low, high)
+    return found
 
 
 def write_examination(

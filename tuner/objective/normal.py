@@ -281,10 +281,10 @@ class Flier:
         model: Model,
         lanes: Lanes,
         coefficients: Array,
-        horizon: Array,
+        horizon: Array | None,
         states: Array | None = None,
     ) -> Trace:
-        """Simulate some lanes with a search vector (K,) up to a horizon in samples."""
+        """Simulate some lanes with a search vector (K,) up to a horizon in samples, or whole."""
         return fly(
             with_coefficients(model, self.space.values(coefficients)),
             lanes,
@@ -296,10 +296,20 @@ class Flier:
         )
 
     def compared(
-        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
+        self,
+        data: LaneData,
+        model: Model,
+        coefficients: Array,
+        horizon: Array,
+        *,
+        whole: bool = False,
     ) -> tuple[Trace, dict[str, Array]]:
-        """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
-        trace = self.fly(model, data.lanes, coefficients, horizon, data.states)
+        """Return the simulation and channel -> (n, k, F) residuals in standard deviations.
+
+        Reverse mode needs the ``whole`` flights flown; the residuals end at the horizon anyway.
+        """
+        flown = None if whole else horizon
+        trace = self.fly(model, data.lanes, coefficients, flown, data.states)
         return trace, self._compare(data, horizon, trace, data.offsets)
 
     def _compare(

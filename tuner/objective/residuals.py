@@ -39,7 +39,7 @@ def fly(
     schedule: Schedule,
     *,
     samples: int,
-    horizon: Int[Array, ""],
+    horizon: Int[Array, ""] | None,
     limits: Limits,
     states: Float[Array, "L F"] | None = None,
 ) -> Trace:

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from tuner.errors import InputError
 from tuner.flights.flight import Array
+from tuner.identifiability.global_indices import GlobalIndices, read_global
 from tuner.identifiability.knowledge import Knowledge, read_knowledge
+from tuner.identifiability.profiles import Profiles, read_profiles
 from tuner.identifiability.proposals import Proposals, read_proposals
 from tuner.report.record import (
     About,
@@ -39,6 +41,8 @@ class Contents:
         What is known about each coefficient.
     proposals
         What to fly next.
+    whole_range, profiles
+        Indices between the bounds, and profiles of the likelihood.
     search, laps
         How the fit went, and how closely laps are met.
     traces
@@ -50,6 +54,8 @@ class Contents:
     run: Run | None
     knowledge: Knowledge | None
     proposals: Proposals | None
+    whole_range: GlobalIndices | None
+    profiles: Profiles | None
     search: SearchRecord | None
     laps: LapTable | None
     traces: Mapping[str, Mapping[str, Array]]
@@ -76,6 +82,8 @@ def read_contents(folder: str | Path) -> Contents:
         run=run,
         knowledge=read_knowledge(folder),
         proposals=read_proposals(folder),
+        whole_range=read_global(folder),
+        profiles=read_profiles(folder),
         search=read_search(folder),
         laps=read_laps(folder),
         traces=read_traces(folder),

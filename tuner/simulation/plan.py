@@ -8,6 +8,7 @@ from typing import Annotated, NotRequired, TypedDict, Unpack
 
 from annotated_types import Interval
 
+from sim_jax.precision import Precision
 from tuner.config import (
     ControllerFile,
     TrajectorySettings,
@@ -31,6 +32,7 @@ class Plan(Section):
     trajectory: TrajectorySettings
     duration: Annotated[Number, Interval(gt=0, le=3600)]
     rate: Annotated[Number, Interval(gt=0, le=10_000)]
+    precision: Precision
 
 
 class Flown(TypedDict):
@@ -42,6 +44,7 @@ class Flown(TypedDict):
     speed: NotRequired[float | None]
     duration: NotRequired[float]
     rate: NotRequired[float]
+    precision: NotRequired[Precision]
 
 
 def fly(
@@ -53,6 +56,7 @@ def fly(
     duration: float = 40.0,
     rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
+    precision: Precision = "float64",
 ) -> Iterator[Simulation]:
     """Fly a trajectory once, or with each vehicle of a grid.
 
@@ -70,13 +74,20 @@ def fly(
         Hz of the result.
     grid
         Coefficient -> (B,) values.
+    precision
+        What to compute in.
 
     Raises
     ------
     InputError
         Something named does not exist, or cannot be flown.
     """
-    said = {"trajectory": dict(trajectory), "duration": duration, "rate": rate}
+    said = {
+        "trajectory": dict(trajectory),
+        "duration": duration,
+        "rate": rate,
+        "precision": precision,
+    }
     plan = build(Plan, said, "command line")
     shape = plan.trajectory if speed is None else at_speed(plan.trajectory, speed)
     check_names(grid or (), "grid")
@@ -84,7 +95,15 @@ def fly(
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
     if isinstance(controller, str):
         controller = read_controller(find_config("controllers", controller, Path()))
-    return simulate(vehicle, controller, shape, duration=plan.duration, rate=plan.rate, grid=grid)
+    return simulate(
+        vehicle,
+        controller,
+        shape,
+        duration=plan.duration,
+        rate=plan.rate,
+        grid=grid,
+        precision=plan.precision,
+    )
 
 
 def simulate_to_file(

@@ -134,3 +134,24 @@ def test_what_stays_in_place_has_no_speed():
         at_speed(TrajectorySettings(name="hover"), 3.0)
     with pytest.raises(InputError, match="is no speed"):
         at_speed(TrajectorySettings(name="circle"), -3.0)
+
+
+@pytest.mark.parametrize("name", ["lemniscate", "yaw_spin"])
+def test_single_precision_costs_less_than_a_twentieth_of_a_millimetre(vehicle, name):
+    whole = {"duration": 40.0}
+    (exact,) = fly(vehicle, name, **whole)
+    (quick,) = fly(vehicle, name, **whole, precision="float32")
+    apart = np.linalg.norm(exact.signals["position"] - quick.signals["position"], axis=1)
+    assert 0.0 < apart.max() < 5e-5
+    turned = np.abs(np.sum(exact.signals["attitude"] * quick.signals["attitude"], axis=1))
+    assert np.degrees(2 * np.arccos(np.minimum(turned, 1.0))).max() < 0.01
+
+
+def test_a_grid_in_single_precision_is_the_grid(vehicle):
+    grid = {"mass": np.linspace(2.0, 2.4, 3)}
+    exact, quick = (
+        fly(vehicle, grid=grid, precision=precision) for precision in ("float64", "float32")
+    )
+    for one, other in zip(exact, quick, strict=True):
+        assert one.coefficients == other.coefficients
+        np.testing.assert_allclose(other.signals["position"], one.signals["position"], atol=1e-4)

@@ -18,8 +18,10 @@ from tuner.report.sections.flights import flights
 from tuner.report.sections.information import information
 from tuner.report.sections.made import made
 from tuner.report.sections.next_flight import next_flight
+from tuner.report.sections.profiles import profiles
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
+from tuner.report.sections.whole_range import whole_range
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
@@ -29,6 +31,8 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     effects,
     information,
     next_flight,
+    profiles,
+    whole_range,
     residuals,
     search,
     made,

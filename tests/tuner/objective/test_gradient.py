@@ -1,0 +1,45 @@
+"""Reverse mode against the gradient that forward mode gives, and what it remembers."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.identifiability.making import problem, stage_of
+from tuner.objective.gradient import gradients
+from tuner.objective.normal import Point
+
+FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return problem(FREE)
+
+
+def test_reverse_mode_gives_forward_modes_gradient(fit):
+    stage = eqx.tree_at(lambda s: s.huber, stage_of(fit), jnp.asarray(2.0))
+    late = jnp.full((5, 2), 0.1)
+    steps = np.random.default_rng(1).normal(0.0, 0.2, (3, len(FREE)))
+    vectors = np.asarray(fit.space.initial) + steps
+    found = gradients(fit, vectors, Point(jnp.asarray(vectors[0]), late), stage)
+    assert found.gradient.shape == (len(FREE), 3)
+    for number, vector in enumerate(vectors):
+        sums = fit.sums(Point(jnp.asarray(vector), late), stage)
+        np.testing.assert_allclose(found.loss[number], np.sum(sums.loss), rtol=1e-9)
+        forward = np.sum(sums.gradient, axis=-1)[: len(FREE)]
+        np.testing.assert_allclose(
+            found.gradient[:, number], forward, rtol=1e-6, atol=1e-8 * np.abs(forward).max()
+        )
+
+
+def test_a_smaller_memory_gives_the_same_sums(fit):
+    stage = stage_of(fit)
+    point = fit.start(np.asarray(fit.space.initial))
+    small = type(fit)(**{**vars(fit), "memory": 1})
+    data = small.data(point.offsets, stage)
+    assert small.flier.lanes_at_once(data, derivatives=True) == 1
+    assert fit.flier.lanes_at_once(data, derivatives=True) > 1
+    want, got = fit.sums(point, stage), small.sums(point, stage)
+    np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
+    np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)

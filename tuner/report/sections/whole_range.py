@@ -1,0 +1,60 @@
+"""Which coefficients matter anywhere between their bounds."""
+
+from __future__ import annotations
+
+from tuner.identifiability.global_indices import MEANING, GlobalIndices
+from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
+from tuner.report.contents import Contents
+from tuner.report.section import Section
+
+
+def whole_range(contents: Contents) -> Section | None:
+    """Return the indices over all and for each channel of each flight."""
+    found = contents.whole_range
+    if found is None:
+        return None
+    values = {"found": found, "meaning": MEANING[found.method]}
+    return Section("whole_range", "Over the whole range", values, (_over_all(found), _each(found)))
+
+
+def _over_all(found: GlobalIndices) -> Chart:
+    own = sorted((i for i in found.indices if not i.flight), key=lambda i: -i.total)
+    meaning = MEANING[found.method]
+    texts = [
+        f"{i.coefficient}: {meaning[1]} {i.total:.3g}, {meaning[2]} {i.spread:.3g}" for i in own
+    ]
+    names, totals = [i.coefficient for i in own], [i.total for i in own]
+    bars = Bars(meaning[1], names, totals, PALETTE[0], texts)
+    return Chart(
+        key="global",
+        title=f"{meaning[1][0].upper()}{meaning[1][1:]} of each coefficient",
+        caption="Of the mean logarithm (base 10) of all channels' RMSE.",
+        panels=(Panel((bars,)),),
+        x_title=meaning[1],
+        height=120 + 24 * len(own),
+    )
+
+
+def _each(found: GlobalIndices) -> Chart:
+    outputs = list(dict.fromkeys((i.flight, i.channel) for i in found.indices if i.flight))
+    names = list(found.bounds)
+    totals = {(i.coefficient, i.flight, i.channel): i.total for i in found.indices}
+    heat = Heat(
+        columns=[f"{flight} {channel.replace('_', ' ')}" for flight, channel in outputs],
+        rows=names,
+        values=[[round(totals[name, *output], 4) for output in outputs] for name in names],
+        text=[
+            [
+                f"{name} on {channel} of {flight}: {totals[name, flight, channel]:.3g}"
+                for flight, channel in outputs
+            ]
+            for name in names
+        ],
+        bar=MEANING[found.method][1],
+    )
+    return Chart(
+        key="global_each",
+        title="The same for each channel of each flight",
+        panels=(Panel((heat,)),),
+        height=260 + 22 * len(names),
+    )
