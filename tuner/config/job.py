@@ -22,7 +22,7 @@ from tuner.config.shipped import Kind, find_config
 from tuner.errors import ConfigError, did_you_mean
 
 #: Recorded signals whose residuals a fit can weigh, by their names in a `Flight`.
-CHANNELS = ("position", "velocity", "attitude", "body_rate", "rotor_speed", "command")
+CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 
 InletName = Literal["auto", "reference", "body_rate", "actuator", "rotor_speed"]
 Method = Literal["auto", "gradient", "cma", "hybrid"]

@@ -1,0 +1,32 @@
+"""Real Crazyflie flights through the actuator inlet; skipped where they are not at hand."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tuner.config import Options
+from tuner.job.run import run
+
+ROOT = Path(__file__).parents[3]
+FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights")) / "nanobench"
+HELD_OUT = ("B2_circle_slow_rep1", "B3_figure8_medium_rep1")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FLIGHTS.is_dir(), reason=f"no real recordings in {FLIGHTS}")
+def test_held_out_flights_are_met_twice_as_well_as_by_the_unfitted_vehicle(tmp_path):
+    options = Options(
+        [str(path) for path in sorted(FLIGHTS.glob("*.csv"))],
+        config=str(ROOT / "configs" / "jobs" / "crazyflie.yaml"),
+        holdout=list(HELD_OUT),
+    )
+    folder, result = run(options, out=tmp_path / "run")
+    held = [flight for flight in result.flights if flight.split == "holdout"]
+    assert {flight.name for flight in held} == set(HELD_OUT)
+    for flight in held:
+        for axis, before in flight.rmse_initial:
+            assert getattr(flight.rmse_best, axis) < 0.5 * before, (flight.name, axis)
+    assert result.coefficients["motor_constant"].identifiable is False
+    assert "input_scaling as given" in result.coefficients["motor_constant"].note
+    assert (folder / "report.html").exists()
