@@ -9,7 +9,9 @@ from tuner.config import Options
 from tuner.job.run import run
 
 ROOT = Path(__file__).parents[3]
-FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights")) / "nanobench"
+FLIGHTS = (
+    Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights")) / "nanobench"
+)
 HELD_OUT = ("B2_circle_slow_rep1", "B3_figure8_medium_rep1")
 
 

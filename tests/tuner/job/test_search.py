@@ -1,0 +1,96 @@
+"""What a search starts from, and when it asks for a second opinion."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.tuner.identifiability.making import fitted_of, problem, truth
+from tuner.coefficients import space_of
+from tuner.config import JobFile
+from tuner.config.job import Search
+from tuner.job import search as module
+from tuner.job.noticed import noticed, unmatched
+from tuner.job.starts import starting_vectors
+from tuner.search.fitted import Outcome
+from tuner.search.legs import left, plan
+
+FREE = ("inertia_xx", "motor_constant", "estimate_latency")
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    fit = problem(FREE)
+    return fitted_of(fit, truth(fit))
+
+
+def job_with(updated, **search):
+    settings = SimpleNamespace(job=JobFile(free=FREE, search=Search(**search)))
+    return SimpleNamespace(
+        settings=settings,
+        space=space_of(updated, settings.job),
+        inlets=("reference", "reference"),
+        fitted=("a", "b"),
+    )
+
+
+def test_random_starts_lie_in_the_box_and_the_first_is_the_vehicles(updated):
+    job = job_with(updated, starts=50, spread=3.0)
+    vectors = starting_vectors(job)
+    assert vectors.shape == (50, 3)
+    np.testing.assert_allclose(vectors[0], job.space.initial)
+    values = [job.space.values(vector) for vector in vectors]
+    drawn = np.array([float(one["motor_constant"]) for one in values])
+    initial = job.space.parameters[job.space.names.index("motor_constant")].initial
+    ratio = drawn / initial
+    assert 1 / 3.01 < ratio.min() < 0.5
+    assert 2.0 < ratio.max() < 3.01
+    np.testing.assert_array_equal(vectors, starting_vectors(job))
+    other = job_with(updated, starts=50, spread=3.0, seed=1)
+    assert not np.array_equal(vectors[1:], starting_vectors(other)[1:])
+
+
+def test_starts_that_agree_are_believed(fitted, updated):
+    job = job_with(updated, starts=4)
+    agree = replace(fitted, outcomes=ends(1.0, 1.001, 7.0, 9.0))
+    assert module._doubt(job, agree) == ""
+    differ = replace(fitted, outcomes=ends(1.0, 1.3, 7.0, 9.0))
+    assert "no two of 4 starts" in module._doubt(job, differ)
+
+
+def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
+    job = job_with(updated)
+    lost = {"a": {"position": 50.0, "body_rate": 30.0}, "b": {"position": 40.0, "body_rate": 3.0}}
+    assert module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0))) == ""
+    lost["b"]["body_rate"] = 12.0
+    assert "2 of 2 flights" in module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0)))
+
+
+def ends(*losses):
+    nowhere = np.zeros(len(FREE))
+    return tuple(Outcome(nowhere, nowhere, loss, "random") for loss in losses)
+
+
+def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
+    job = SimpleNamespace(
+        settings=SimpleNamespace(
+            controller=SimpleNamespace(mixer=SimpleNamespace(saturation_feedback=True))
+        )
+    )
+    one = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
+    assert set(unmatched(one)) == {"c"}
+    (finding,) = noticed(job, 1.0, one)
+    assert finding.subject == "c"
+    every = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
+    (finding,) = noticed(job, 1.0, every)
+    assert finding.subject == "model"
+    assert "3 of 3 flights" in finding.text
+
+
+def test_time_left_falls_to_nothing():
+    legs = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
+    told = [left(legs, leg, 0, 10.0) for leg in range(1, len(legs) + 1)]
+    assert told == sorted(told, reverse=True)
+    assert told[-1] == 0.0
+    assert np.isnan(left(legs, 0, 0, 0.0))
