@@ -26,8 +26,9 @@ lint: $(READY)  ## style, types, and who may import whom
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-bench: $(READY)  ## reading speed beside plain rosbags; needs a quiet machine
-	$(BIN)/python -m benchmarks.reading
+bench: $(READY)  ## measure everything and write benchmarks/RESULTS.md; needs a quiet machine
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]' || true
+	$(BIN)/python -m benchmarks
 
 clean:
 	rm -rf $(VENV) runs

@@ -1,1 +1,1 @@
-"""What measures speed: each module prints a table, `python -m benchmarks` all of them."""
+"""What measures speed: each module hands back a table, `python -m benchmarks` writes them all."""

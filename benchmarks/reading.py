@@ -1,14 +1,11 @@
 """How quickly recordings are read, beside rosbags' own deserialisation of the same topics.
 
-``python -m benchmarks.reading [--repeat 8]``
-
 The circle that ships with the project is repeated until the recording is a few minutes long, as
 ROS 1 bag, SQLite and MCAP. Seconds of one processor, the best of three.
 """
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Callable
@@ -20,6 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from benchmarks.table import Section
 from tuner.flights.locate import choose_map, locate
 from tuner.flights.opening import open_recording
 from tuner.flights.recording import Request
@@ -99,19 +97,15 @@ def best(work: Callable[[Path, dict[str, Request]], int], path: Path) -> tuple[f
     return min(times), count
 
 
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--repeat", type=int, default=8)
-    repeat = parser.parse_args().repeat
+def measure(repeat: int = 8) -> Section:
+    """Read the lengthened circle in three formats."""
+    rows = []
     with tempfile.TemporaryDirectory() as scratch:
         bag = lengthen(Path(scratch) / "long.bag", repeat)
         paths = {"ROS 1 bag": bag}
         for storage in StoragePlugin:
             folder = to_ros2(bag, Path(scratch) / storage.name, storage)
             paths[f"ROS 2 {storage.name}"] = folder
-        print("| recording | MB | messages | rosbags s | tune s | times quicker |")
-        print("|---|---|---|---|---|---|")
         for name, path in paths.items():
             files = [path] if path.is_file() else list(path.iterdir())
             size = sum(file.stat().st_size for file in files) / 1e6
@@ -119,10 +113,20 @@ def main() -> None:
             quick, same = best(with_tuner, path)
             if count != same:
                 raise SystemExit(f"{name}: rosbags reads {count} messages, tune {same}")
-            print(
-                f"| {name} | {size:.0f} | {count} | {slow:.2f} | {quick:.2f} | {slow / quick:.0f} |"
+            rows.append(
+                [
+                    name,
+                    f"{size:.0f}",
+                    str(count),
+                    f"{slow:.2f}",
+                    f"{quick:.2f}",
+                    f"{slow / quick:.0f}",
+                ]
             )
-
-
-if __name__ == "__main__":
-    main()
+    return Section(
+        "Reading",
+        "The circle that ships with the project, repeated; processor seconds, the best of three, "
+        "beside rosbags' own deserialisation of the same topics.",
+        ["recording", "MB", "messages", "rosbags s", "tune s", "times quicker"],
+        rows,
+    )

@@ -50,6 +50,7 @@ def test_the_python_of_the_readme_calls_what_there_is():
         "load_flight",
         "fit",
         "compare",
+        "sensitivity",
         "simulate",
         "export",
     }

@@ -66,7 +66,7 @@ def over_devices(
     callable
         The same function, not to be used under jax's transformations; its leaves are numpy arrays.
     """
-    compiled = lru_cache(maxsize=8)(lambda count: jax.jit(_shared(function, count)))
+    compiled = lru_cache(maxsize=8)(lambda count: jax.jit(shared_among(function, count)))
 
     @wraps(function)
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
@@ -79,7 +79,14 @@ def over_devices(
     return shared_out
 
 
-def _shared(function: Callable[..., PyTree[Array]], count: int) -> Callable[..., PyTree[Array]]:
+def shared_among(
+    function: Callable[..., PyTree[Array]], count: int
+) -> Callable[..., PyTree[Array]]:
+    """Return a function of a batch, to be compiled, that so many devices share equally.
+
+    What it returns stays with the devices. ``function`` is as for `over_devices`; the size of the
+    batch must be a multiple of ``count``.
+    """
     if count == 1:
         return function
 

@@ -41,7 +41,7 @@ for size in (1, 2, 3, 7):
         got = over_devices(function)(batch, coefficients, horizon)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), got, want)
         assert isinstance(got, (dict, np.ndarray))
-text = jax.jit(tuner.parallel._shared(flight, 3)).lower(
+text = jax.jit(tuner.parallel.shared_among(flight, 3)).lower(
     {"start": jnp.ones(6), "push": jnp.ones((6, 6))}, coefficients, horizon
 ).compile().as_text()
 meeting = [word for word in ("all-reduce", "all-gather", "permute", "all-to-all") if word in text]

@@ -69,7 +69,8 @@ def print_run(folder: Path, result: RunResult) -> None:
     search = result.search
     screen.print(
         f"{search.evaluations} Jacobians in {search.wall_time:.0f} s, {search.message}; "
-        f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv)"
+        f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv, "
+        "sensitivity.csv)"
     )
 
 

@@ -97,6 +97,8 @@ class Acting(Part):
     ----------
     flight
         Its name.
+    windowed
+        Whether time counts from the start of each window of the flight, not from the mission's.
     time
         s, middles of equal stretches.
     change
@@ -106,6 +108,7 @@ class Acting(Part):
     """
 
     flight: str
+    windowed: bool = False
     time: list[float]
     change: dict[str, list[float]]
     span: dict[str, tuple[float, float]]

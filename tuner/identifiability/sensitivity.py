@@ -73,6 +73,8 @@ class Sensitivity:
         (K,) how many of the simulations with ±10 % crashed, over all flights.
     flights
         F names.
+    windowed
+        Whether flights were cut into windows, so that ``time`` counts from a window's start.
     time
         (F, B) s, middles of the stretches.
     acts
@@ -87,6 +89,7 @@ class Sensitivity:
     rmse_down: Array
     crashed: NDArray[np.int_]
     flights: tuple[str, ...]
+    windowed: bool
     time: Array
     acts: Array
 
@@ -155,6 +158,7 @@ def sensitivity(
         rmse_down=rmse[1 + count :],
         crashed=crashes[1 : 1 + count].sum(axis=1) + crashes[1 + count :].sum(axis=1),
         flights=tuple(flights),
+        windowed=objective.lanes.count > len(flights),
         time=time,
         acts=acts,
     )

@@ -149,6 +149,7 @@ def _acting(examination: Examination) -> list[Acting]:
     return [
         Acting(
             flight=flight,
+            windowed=sensitivity.windowed,
             time=sensitivity.time[row].round(3).tolist(),
             change={
                 name: sensitivity.acts[index, row].tolist()

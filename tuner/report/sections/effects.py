@@ -98,6 +98,7 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
 def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
     charts = []
     for acting in knowledge.acting:
+        start_of = "a window" if acting.windowed else "the mission"
         rows, texts = [], []
         for name in names:
             change = np.array(acting.change[name])
@@ -123,7 +124,7 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
                 key=f"{acting.flight}_acts",
                 title=f"{acting.flight}: when each coefficient acts",
                 panels=(Panel((heat,)),),
-                x_title="time since the mission's start [s]",
+                x_title=f"time since {start_of}'s start [s]",
                 height=130 + 20 * len(names),
             )
         )

@@ -1,0 +1,42 @@
+"""Seconds to compile, with nothing kept from earlier."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+from benchmarks.table import Bar, Section, seconds
+from benchmarks.timing import ROOT, Spread, environment
+
+REPEATS = 2
+
+
+def measure() -> Section:
+    """Compile in fresh processes."""
+    module = "benchmarks.contestants.compilation"
+    rows, compiled = [], {}
+    for what in ("forward", "jacobian", "gradient"):
+        pairs = []
+        for _ in range(REPEATS):
+            done = subprocess.run(
+                [sys.executable, "-m", module, what],
+                capture_output=True,
+                text=True,
+                check=True,
+                cwd=ROOT,
+                env=environment({}),
+            )
+            pairs.append([float(word) for word in done.stdout.split()])
+        traced, compiled[what] = (Spread.of([pair[i] for pair in pairs]) for i in (0, 1))
+        rows.append([what, seconds(traced), seconds(compiled[what])])
+    return Section(
+        "Compilation",
+        "Seconds in a fresh process with no cache: what jax traces in Python, then what XLA "
+        "compiles. The cache in the user's folder spares the second from the second run on.",
+        ["", "trace", "compile"],
+        rows,
+        [
+            Bar("cold compile, forward", compiled["forward"].median, 1, "at most", " s"),
+            Bar("cold compile, Jacobian", compiled["jacobian"].median, 3, "at most", " s"),
+        ],
+    )

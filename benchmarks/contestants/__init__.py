@@ -1,0 +1,1 @@
+"""Programs that take part in the comparison of throughput, each in a process of its own."""

@@ -1,0 +1,74 @@
+"""Forward, Jacobian and gradient of 64 flights: ``... contestants.derivatives jacobian``."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+
+from benchmarks.timing import answer
+from tuner import runtime
+
+runtime.configure()
+
+import jax  # noqa: E402 (after the set-up)
+import jax.numpy as jnp  # noqa: E402
+from jax import Array  # noqa: E402
+
+from benchmarks.case import COEFFICIENTS, factors, fly  # noqa: E402
+from sim_jax.rigid_body import Motion  # noqa: E402
+from tuner.parallel import in_pieces, piece_that_fits, shared_among  # noqa: E402
+
+FLIGHTS, SAMPLES = 64, 2000
+FORWARD, JACOBIAN, GRADIENT = "forward", "jacobian", "gradient"
+
+
+def jacobian_of(function: Callable[[Array], Motion], factor: Array) -> Motion:
+    """Return the logged motion's derivatives by 12 shared factors, (samples, 12, flights)."""
+
+    def push(direction: Array) -> Motion:
+        moved: Motion = jax.jvp(
+            lambda shared: function(factor * shared[:, None]),
+            (jnp.ones(COEFFICIENTS),),
+            (direction,),
+        )[1]
+        return moved
+
+    pushed: Motion = jax.vmap(push, out_axes=-2)(jnp.eye(COEFFICIENTS))
+    return pushed
+
+
+flight = partial(fly, samples=SAMPLES)
+jacobian = partial(jacobian_of, flight)
+
+
+def gradient(factor: Array) -> Array:
+    """Return the gradient of each flight's sum of squares by its own factors, (12, flights)."""
+
+    def loss(factor: Array) -> Array:
+        squares = [jnp.sum(leaf * leaf) for leaf in jax.tree.leaves(flight(factor))]
+        return sum(squares, jnp.zeros(()))
+
+    slope: Array = jax.grad(loss)(factor)
+    return slope
+
+
+def main(what: str) -> None:
+    columns = COEFFICIENTS if what == JACOBIAN else 1
+    # a quarter of what fits the cache going forward: reverse mode remembers more
+    lanes = piece_that_fits(8, columns) // (4 if what == GRADIENT else 1)
+    function = {FORWARD: flight, JACOBIAN: jacobian, GRADIENT: gradient}[what]
+    pieces = in_pieces(function, lanes)
+    factor = factors(FLIGHTS)
+    run = jax.jit(shared_among(pieces, len(jax.devices()))).lower(factor).compile()
+    memory = run.memory_analysis()
+    assert memory is not None
+    answer(
+        lambda: jax.block_until_ready(run(factor)),
+        1.0,
+        f"{memory.temp_size_in_bytes} {memory.output_size_in_bytes}",
+    )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

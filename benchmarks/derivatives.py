@@ -1,0 +1,73 @@
+"""Jacobian and gradient of 64 flights in units of one forward run of them, and their memory."""
+
+from __future__ import annotations
+
+import sys
+
+from benchmarks.contestants.derivatives import FLIGHTS, FORWARD, GRADIENT, JACOBIAN, SAMPLES
+from benchmarks.table import Bar, Section, figure, seconds
+from benchmarks.timing import Contestant, Spread, compete
+
+ROUNDS = 11
+STEPS = FLIGHTS * SAMPLES * 10
+
+
+def measure() -> Section:
+    """Run all three in turn."""
+    module = "benchmarks.contestants.derivatives"
+    found = {
+        one.name: one
+        for one in compete(
+            [
+                Contestant(what, (sys.executable, "-m", module, what), {})
+                for what in (FORWARD, JACOBIAN, GRADIENT)
+            ],
+            ROUNDS,
+        )
+    }
+    times = {name: _time(one.rate) for name, one in found.items()}
+    memory = {name: [float(word) for word in one.remark.split()] for name, one in found.items()}
+    base = times[FORWARD].median
+    rows = [
+        [
+            name,
+            seconds(times[name]),
+            figure(times[name].median / base),
+            figure(memory[name][0] / 1e6),
+            figure(memory[name][1] / 1e6),
+        ]
+        for name in found
+    ]
+    temporary, output = memory[JACOBIAN]
+    return Section(
+        "Derivatives of 64 flights",
+        f"{FLIGHTS} flights of {SAMPLES / 100:g} s at 1 kHz, 13 states logged at 100 Hz, float64, "
+        "all devices. The Jacobian is by 12 coefficients that all flights share, forward mode; the "
+        "gradient by 12 coefficients of each flight, reverse mode. Memory as XLA states it, a "
+        "device.",
+        ["", "s", "forward runs", "temporary MB", "output MB"],
+        rows,
+        [
+            Bar(
+                "Jacobian of 12 coefficients over 64 flights",
+                times[JACOBIAN].median / base,
+                14,
+                "at most",
+                " forward runs",
+            ),
+            Bar("its temporary memory, of its output", temporary / output, 0.1, "at most"),
+            Bar("reverse gradient", times[GRADIENT].median / base, 12, "at most", " forward runs"),
+            Bar(
+                "its temporary memory",
+                memory[GRADIENT][0] / (STEPS / 2),
+                20,
+                "at most",
+                " bytes a vehicle-step",
+            ),
+        ],
+    )
+
+
+def _time(rate: Spread | None) -> Spread:
+    assert rate is not None
+    return Spread(1 / rate.median, 1 / rate.high, 1 / rate.low)

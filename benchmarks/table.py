@@ -1,0 +1,84 @@
+"""What a benchmark hands back, and how the page of results is written."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from benchmarks.timing import Spread
+
+
+@dataclass(frozen=True)
+class Bar:
+    """What is asked for.
+
+    Attributes
+    ----------
+    what
+        In words.
+    measured
+        None where it could not be measured here.
+    limit
+        The number to meet.
+    sense
+        Whether more or less is better.
+    unit
+        After the numbers.
+    """
+
+    what: str
+    measured: float | None
+    limit: float
+    sense: Literal["at least", "at most"]
+    unit: str = ""
+
+    @property
+    def verdict(self) -> str:
+        if self.measured is None:
+            return "not measured"
+        good = (
+            self.measured >= self.limit if self.sense == "at least" else self.measured <= self.limit
+        )
+        return "met" if good else "missed"
+
+    def row(self) -> list[str]:
+        shown = "" if self.measured is None else f"{figure(self.measured)}{self.unit}"
+        return [self.what, shown, f"{self.sense} {figure(self.limit)}{self.unit}", self.verdict]
+
+
+@dataclass(frozen=True)
+class Section:
+    """One benchmark's part of the page."""
+
+    title: str
+    text: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    bars: Sequence[Bar] = field(default_factory=tuple)
+
+    def markdown(self) -> str:
+        return f"## {self.title}\n\n{self.text}\n\n{table(self.head, self.rows)}\n"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
+
+
+def figure(value: float) -> str:
+    """Return a number in three digits."""
+    if value == 0 or not 1e-3 <= abs(value) < 1e5:
+        return f"{value:.3g}"
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def millions(rate: Spread | None) -> str:
+    """Return a rate per second in millions, with its quartiles."""
+    if rate is None:
+        return "–"
+    return f"{figure(rate.median / 1e6)} ({figure(rate.low / 1e6)}–{figure(rate.high / 1e6)})"
+
+
+def seconds(time: Spread) -> str:
+    return f"{figure(time.median)} ({figure(time.low)}–{figure(time.high)})"
