@@ -22,8 +22,9 @@ from tuner.flights.flight import Array, Flight
 from tuner.model import model_of, schedule_of
 from tuner.objective.inlets import InletName
 from tuner.objective.lanes import CLOCKS, noise_of, window_lanes
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
 from tuner.objective.residuals import Trace
+from tuner.objective.terms import Point, Stage
 from tuner.objective.windows import windows_of
 from tuner.search.growing import FAR
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients import HABITS, Parameter, Space
-from tuner.objective.normal import Objective, Point
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point
 
 #: Extensions of the thrust curve that are no coefficients of most vehicles: only where they act.
 EXTENSIONS = ("input_offset", "quadratic")

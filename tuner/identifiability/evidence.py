@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.normal import Jacobian, Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Jacobian, Point, Stage
 from tuner.search.levenberg_marquardt import OFFSET_SD
 
 Array = NDArray[np.float64]

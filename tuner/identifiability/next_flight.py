@@ -30,7 +30,8 @@ from tuner.identifiability.examine import Examination
 from tuner.identifiability.proposals import Proposal, Proposals, in_words
 from tuner.identifiability.verdict import Verdict
 from tuner.objective.lanes import Lanes, Measured
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 from tuner.simulation.trajectory import published
 
 Array = NDArray[np.float64]

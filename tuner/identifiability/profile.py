@@ -17,7 +17,8 @@ from tuner.identifiability.covariance import WIDE
 from tuner.identifiability.every import with_space
 from tuner.identifiability.examine import Examination
 from tuner.identifiability.profiles import THRESHOLD, Profile
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 from tuner.search.levenberg_marquardt import advance, begin, on_host
 
 Array = NDArray[np.float64]

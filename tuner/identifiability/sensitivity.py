@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.batch import evaluate
-from tuner.objective.normal import Jacobian, Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Jacobian, Point, Stage
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from tuner.identifiability.knowledge import (
     numbers,
 )
 from tuner.identifiability.uncertainty import Uncertainty
-from tuner.objective.normal import Point
+from tuner.objective.terms import Point
 
 Array = NDArray[np.float64]
 

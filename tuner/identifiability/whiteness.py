@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.normal import Jacobian, Objective, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Jacobian, Stage
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from tuner.coefficients import Space
 from tuner.identifiability.global_indices import GlobalIndices, Index, Method
 from tuner.objective.batch import evaluate
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 
 Array = NDArray[np.float64]
 

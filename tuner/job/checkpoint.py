@@ -12,7 +12,7 @@ import numpy as np
 
 from tuner.errors import InputError
 from tuner.job.prepare import Job
-from tuner.objective.normal import Point
+from tuner.objective.terms import Point
 from tuner.search.fitted import Iteration
 from tuner.search.progress import Progress
 

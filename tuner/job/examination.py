@@ -29,7 +29,8 @@ from tuner.identifiability.telling import tell as told_of
 from tuner.identifiability.whole_range import whole_range
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
 from tuner.job.results import controller_flown, versions
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated

@@ -19,7 +19,7 @@ from tuner.identifiability.examine import Examination, examine
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
-from tuner.objective.normal import Point
+from tuner.objective.terms import Point
 from tuner.search.fitted import Fitted
 from tuner.search.progress import Free, Progress
 

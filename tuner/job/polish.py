@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.job.prepare import Job
-from tuner.objective.normal import Point
+from tuner.objective.terms import Point
 from tuner.search.fitted import Fitted
 from tuner.search.growing import grow
 from tuner.search.legs import plan

@@ -28,7 +28,7 @@ from tuner.identifiability import Uncertainty
 from tuner.identifiability.uncertainty import Estimate
 from tuner.job.prepare import Job, given_offset
 from tuner.objective.lanes import CLOCKS, OFFSETS
-from tuner.objective.normal import OFFSET_UNIT
+from tuner.objective.terms import OFFSET_UNIT
 from tuner.result import (
     BEST_FIT_FILE,
     SCHEMA_VERSION,

@@ -16,7 +16,8 @@ from tuner.job.noticed import noticed, offsets_found, unmatched
 from tuner.job.prepare import Job, given_offset
 from tuner.job.starts import starting_vectors
 from tuner.objective.lanes import CLOCKS, OFFSETS
-from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import OFFSET_UNIT, Point, Stage
 from tuner.search.fitted import Finding, Fitted, Outcome
 from tuner.search.growing import grow
 from tuner.search.legs import Leg, left, plan

@@ -14,7 +14,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.model import Model
-from tuner.objective.normal import Flier, LaneData, Objective, Point, Stage, robust
+from tuner.objective.normal import Flier, Objective, robust
+from tuner.objective.terms import LaneData, Point, Stage
 from tuner.parallel import over_devices
 
 CHUNK = 16

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.batch import CHUNK, evaluate
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 from tuner.search.fitted import Iteration
 from tuner.search.legs import Leg
 from tuner.search.progress import Free, Progress, point_of, stage_of, with_feedback

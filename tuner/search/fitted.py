@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 
 
 @dataclass(frozen=True)

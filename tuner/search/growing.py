@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.normal import OFFSET_UNIT, Objective, Point
+from tuner.objective.normal import Objective
+from tuner.objective.terms import OFFSET_UNIT, Point
 from tuner.search.evolution import evolve
 from tuner.search.fitted import Iteration
 from tuner.search.legs import Leg

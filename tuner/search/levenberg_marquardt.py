@@ -14,7 +14,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from tuner.coefficients import Space
-from tuner.objective.normal import LaneSums, Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import LaneSums, Point, Stage
 
 _Before: TypeAlias = tuple[Point, Any, LaneSums]
 """Best points, solver states and the sums at the points that these wanted to try."""

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.lanes import CLOCKS
-from tuner.objective.normal import OFFSET_UNIT, Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import OFFSET_UNIT, Point, Stage
 from tuner.search.fitted import Iteration
 from tuner.search.legs import Leg
 from tuner.search.levenberg_marquardt import Step, on_host

@@ -20,7 +20,8 @@ from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
 from tuner.config.shipped import find_config
 from tuner.model import model_of, schedule_of
 from tuner.objective.lanes import Lanes, Measured
-from tuner.objective.normal import Objective, Point, Stage
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point, Stage
 from tuner.search.fitted import Fitted
 
 NOISE = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 4.0}

@@ -8,7 +8,8 @@ import pytest
 
 from tests.tuner.identifiability import making
 from tuner.identifiability import uncertainty
-from tuner.objective.normal import Objective, Point
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point
 from tuner.search.levenberg_marquardt import advance, begin, on_host
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")

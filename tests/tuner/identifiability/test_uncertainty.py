@@ -9,7 +9,8 @@ import pytest
 from tests.tuner.identifiability import making
 from tuner.identifiability import Uncertainty, Verdict, uncertainty
 from tuner.identifiability.evidence import gather
-from tuner.objective.normal import Objective, Point
+from tuner.objective.normal import Objective
+from tuner.objective.terms import Point
 from tuner.search.levenberg_marquardt import total
 
 FREE = (

@@ -7,7 +7,7 @@ import pytest
 
 from tests.tuner.identifiability.making import problem, stage_of
 from tuner.objective.batch import CHUNK, evaluate
-from tuner.objective.normal import Point
+from tuner.objective.terms import Point
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.identifiability.making import problem, stage_of, truth, with_data
-from tuner.objective.normal import OFFSET_UNIT, Point
+from tuner.objective.terms import OFFSET_UNIT, Point
 from tuner.search.levenberg_marquardt import total
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
