@@ -19,7 +19,7 @@ FLIGHTS = [
     FOLDER / f"{name}.bag"
     for name in ("circle_3mps", "circle_4mps", "diagonal_3mps", "lemniscate_4mps")
 ]
-TUNE = (sys.executable, "-c", "from tuner.cli import main; main()")
+TUNE = (sys.executable, "-c", "import sys; from tuner.cli import main; sys.exit(main())")
 WARM, STARTS = 2, 5
 
 

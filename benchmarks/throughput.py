@@ -125,9 +125,9 @@ def measure() -> Section:
         "Throughput against the size of a batch",
         "Millions of vehicle-steps a second, median and quartiles of "
         f"{ROUNDS} runs in turn. For tune and the yardstick a step is one of 1 kHz physics with "
-        "rate control at 250 Hz, position control and a log of 13 states at 100 Hz; peers' steps hold "
-        "less, as said. The jax peers run with NPROC=1, MuJoCo and the yardstick with a thread a "
-        "core, tune with a device a core.",
+        "rate control at 250 Hz, position control and a log of 13 states at 100 Hz; those of peers "
+        "hold less, as said. The jax peers run with NPROC=1, MuJoCo and the yardstick with a "
+        "thread a core, tune with a device a core.",
         ["", *(f"batch {batch}" for batch in BATCHES), "settings"],
         rows,
         bars,

@@ -96,6 +96,24 @@ def test_help_loads_nothing_heavy():
     assert found.returncode == 0, found.stderr
 
 
+def test_inspect_needs_no_jax(tmp_path):
+    script = (
+        "import sys\nfrom tuner.cli import main\ncode = main(sys.argv[1:])\n"
+        "sys.exit('jax' in sys.modules or code)"
+    )
+    bag = ROOT / "reference_flights" / "circle_3mps.bag"
+    found = subprocess.run(
+        [sys.executable, "-c", script, "inspect", str(bag)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr
+    assert "circle" in found.stdout
+
+
 def test_simulate_writes_what_it_is_told(tmp_path, capsys):
     out = tmp_path / "c.csv"
     arguments = ["simulate", "--trajectory", "circle", "--duration", "4", "--out", str(out)]
