@@ -32,7 +32,7 @@ from tuner.identifiability import uncertainty  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
 from tuner.job.results import validate, vehicle_fitted  # noqa: E402
 from tuner.job.search import search  # noqa: E402
-from tuner.objective.normal import OFFSET_UNIT  # noqa: E402
+from tuner.objective.terms import OFFSET_UNIT  # noqa: E402
 from tuner.search.fitted import Fitted  # noqa: E402
 
 FOLDER = Path(__file__).parents[1] / "reference_flights"
