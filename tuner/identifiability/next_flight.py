@@ -133,7 +133,7 @@ def _ranked(
         targets=targets,
         all_known=not free,
         flights=rows,
-        sentences=in_words(rows, targets, all_known=not free),
+        sentences=in_words(rows, targets, fixed=tuple(examination.freed)),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +72,21 @@ class Proposals(Part):
     sentences: list[str]
 
 
-def in_words(rows: Sequence[Proposal], targets: Sequence[str], *, all_known: bool) -> list[str]:
-    """Return a sentence on each flight worth flying, and one on what none would tell."""
+def in_words(
+    rows: Sequence[Proposal], targets: Sequence[str], *, fixed: Collection[str] = ()
+) -> list[str]:
+    """Return a sentence on each flight worth flying, and one on what none would tell.
+
+    Parameters
+    ----------
+    rows
+        Flights.
+    targets
+        The coefficients that they are judged by.
+    fixed
+        Those among them that were not fitted.
+    """
+    labels = {name: f"{name} (fixed so far)" if name in fixed else name for name in targets}
     if not rows:
         return ["No flight that was tried stays in the air inside this arena."]
     by_flight: dict[str, list[tuple[float, str]]] = {}
@@ -82,10 +95,10 @@ def in_words(rows: Sequence[Proposal], targets: Sequence[str], *, all_known: boo
         best = min(rows, key=lambda row: row.shrinks[target])
         share = best.shrinks[target]
         if share > WORTH_FLYING:
-            idle.append(target)
+            idle.append(labels[target])
         else:
-            by_flight.setdefault(best.name, []).append((share, target))
-    said = ["Every fitted coefficient is well known already."] if all_known else []
+            by_flight.setdefault(best.name, []).append((share, labels[target]))
+    said = []
     for name, gains in sorted(by_flight.items(), key=lambda item: min(item[1])):
         does = listed([_does(share, target) for share, target in sorted(gains)])
         said.append(f"{name[0].upper()}{name[1:]} would {does}.")

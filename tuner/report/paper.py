@@ -87,9 +87,11 @@ def _draw(panel: Panel, place: Axes) -> None:
         else:
             _heat(mark, place)
     place.set_ylabel(panel.y_title)
-    if not any(isinstance(mark, Heat | Bars) for mark in panel.marks):
-        place.set_yscale(panel.y_scale if place.dataLim.y1 > 0 else "linear")
-    place.set_xscale(panel.x_scale if place.dataLim.x1 > 0 else "linear")
+    if not any(isinstance(mark, Heat) for mark in panel.marks):  # whose ticks it would take away
+        tabular = any(isinstance(mark, Bars) for mark in panel.marks)
+        if not tabular:
+            place.set_yscale(panel.y_scale if place.dataLim.y1 > 0 else "linear")
+        place.set_xscale(panel.x_scale if place.dataLim.x1 > 0 else "linear")
     if panel.equal:
         place.set_aspect("equal", adjustable="datalim")
     for value, text in panel.levels:

@@ -12,10 +12,10 @@ from tuner.objective.normal import Objective
 from tuner.objective.terms import Point
 from tuner.search.levenberg_marquardt import advance, begin, on_host
 
-FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
+FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
 REFITS = 50
 JUDGED = 5
-ITERATIONS = 4
+ITERATIONS = 3
 
 
 def refit(objective: Objective, start: Point) -> Point:

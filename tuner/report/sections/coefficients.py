@@ -40,7 +40,9 @@ class Row:
 def coefficients(contents: Contents) -> Section | None:
     """Return the table and how wide the intervals are."""
     if contents.run is not None:
-        rows = [_fitted(name, one) for name, one in contents.run.result.coefficients.items()]
+        known = {} if contents.knowledge is None else contents.knowledge.coefficients
+        results = contents.run.result.coefficients
+        rows = [_fitted(name, one, known.get(name)) for name, one in results.items()]
     elif contents.knowledge is not None:
         rows = [_known(name, one) for name, one in contents.knowledge.coefficients.items()]
     else:
@@ -50,12 +52,14 @@ def coefficients(contents: Contents) -> Section | None:
     return Section("coefficients", "Coefficients", values, charts)
 
 
-def _fitted(name: str, one: CoefficientResult) -> Row:
+def _fitted(name: str, one: CoefficientResult, known: Known | None) -> Row:
     verdict, colon, reason = one.note.partition(": ")
     if verdict not in VERDICTS:
         verdict, reason = "kept as given", one.note
     elif not colon:
         reason = ""
+    if not one.fitted and known is not None:
+        reason = f"were it fitted with the others: {known.verdict}: {known.reason}"
     return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (verdict, reason))
 
 
