@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tuner.model import Model
 from tuner.objective.normal import Flier, Objective, robust
 from tuner.objective.terms import LaneData, Point, Stage
-from tuner.parallel import over_devices
+from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 CHUNK = 16
 """Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
@@ -91,4 +91,4 @@ def _shared(flier: Flier) -> Callable[..., Batch]:
         found: Batch = jax.vmap(one)(vectors)
         return found
 
-    return over_devices(lanewise)
+    return over_devices(in_pieces(lanewise, max(1, piece_that_fits(8) // CHUNK)))
