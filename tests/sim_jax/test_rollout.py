@@ -10,7 +10,8 @@ from jax import Array
 
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
-from sim_jax.rollout import Rollout, Sample
+from sim_jax.plant import Sample
+from sim_jax.rollout import Rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
