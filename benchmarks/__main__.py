@@ -39,19 +39,16 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS])
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    began, where, sections = time.perf_counter(), machine(), []
-    for part in arguments.parts or PARTS:
-        sections.append(importlib.import_module(f"benchmarks.{part}").measure())
-        print(
-            sections[-1].markdown(),
-            *(" | ".join(bar.row()) for bar in sections[-1].bars),
-            sep="\n",
-            flush=True,
-        )
+    began, where, sections = time.perf_counter(), machine(), list[Section]()
     runtime.configure()
     target = arguments.out or (None if arguments.parts else RESULTS)
-    if target is not None:
-        target.write_text(page(sections, where, (time.perf_counter() - began) / 60))
+    for part in arguments.parts or PARTS:
+        section = importlib.import_module(f"benchmarks.{part}").measure()
+        sections.append(section)
+        bars = [" | ".join(bar.row()) for bar in section.bars]
+        print(section.markdown(), *bars, sep="\n", flush=True)
+        if target is not None:
+            target.write_text(page(sections, where, (time.perf_counter() - began) / 60))
 
 
 if __name__ == "__main__":

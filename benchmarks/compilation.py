@@ -24,7 +24,7 @@ def measure() -> Section:
                 text=True,
                 check=True,
                 cwd=ROOT,
-                env=environment({}),
+                env=environment({"JAX_ENABLE_COMPILATION_CACHE": "false"}),
             )
             pairs.append([float(word) for word in done.stdout.split()])
         traced, compiled[what] = (Spread.of([pair[i] for pair in pairs]) for i in (0, 1))
