@@ -194,10 +194,15 @@ def write_examination(
     fitted: Fitted,
     *,
     arena: Sequence[float] | None = None,
+    once_known: Callable[[], None] = lambda: None,
 ) -> tuple[Knowledge, Proposals | None]:
-    """Write what is known, and what to fly next in an arena, into a result folder."""
+    """Write what is known, and what to fly next in an arena, into a result folder.
+
+    ``once_known`` is called in between, for the second takes its time.
+    """
     knowledge = told_of(examination, job.space, fitted.point)
     write_files(knowledge, folder)
+    once_known()
     proposals = propose(job, examination, fitted.stage, arena)
     if proposals is not None:
         write_proposals(proposals, folder)

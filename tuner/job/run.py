@@ -106,6 +106,7 @@ def run(
     )
     from tuner.job.search import search  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
+    from tuner.report.aside import Aside  # noqa: PLC0415
 
     settings = settle(options)
     listener.settled(settings)
@@ -120,6 +121,7 @@ def run(
     except KeyboardInterrupt:
         listener.message(f"the best so far is in {folder}; go on with --out {folder} --resume")
         raise
+    aside = Aside()
     listener.message("telling how far each coefficient can be trusted")
     fitted, examination = with_the_untold_held(job, fitted, tell, listener.message)
     uncertainty = examination.uncertainty
@@ -135,8 +137,8 @@ def run(
     if cross_validated:
         listener.folds(cross_validate(job, fitted, folder, tell))
     listener.message("simulating what could be flown next")
-    write_examination(folder, job, examination, fitted)
-    render(folder)
+    write_examination(folder, job, examination, fitted, once_known=lambda: aside.begin(folder))
+    render(folder, drawn=aside.drawn)
     for line in export_as_asked(
         folder, settings.job.export, refly=refly, today=datetime.date.today()
     ):

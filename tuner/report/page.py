@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -22,7 +22,9 @@ from tuner.report.summary import summary
 REPORT_FILE = "report.html"
 
 
-def render(folder: str | Path, *, plots: bool = True) -> Path:
+def render(
+    folder: str | Path, *, plots: bool = True, drawn: Callable[[], Collection[str]] = frozenset
+) -> Path:
     """Write ``report.html`` of a result folder, and return its path.
 
     Parameters
@@ -31,6 +33,8 @@ def render(folder: str | Path, *, plots: bool = True) -> Path:
         Of a run, or of an examination without one.
     plots
         Whether to write the figures as ``plots/*.svg`` too.
+    drawn
+        Tells in the end which of these are there already.
 
     Raises
     ------
@@ -43,7 +47,8 @@ def render(folder: str | Path, *, plots: bool = True) -> Path:
     path = contents.folder / REPORT_FILE
     write_text(path, _page(contents, sections, charts))
     if plots:
-        write_plots(charts, contents.folder)
+        there = drawn()
+        write_plots([chart for chart in charts if chart.key not in there], contents.folder)
     return path
 
 

@@ -126,7 +126,7 @@ def run_leg(
             evaluations=progress.evaluations + 1,
         )
         tell(progress)
-        converged = _settled(progress.trail, np.asarray(step.accepted), leg.tolerance)
+        converged = _settled(progress.trail, np.asarray(step.accepted), leg)
     found = root_mean_squares(objective, step)
     scales = misfit(found) if leg.weighs else strays(found, leg.loosening)
     return replace(
@@ -152,19 +152,20 @@ def _offsets_that_matter(leg: Leg, progress: Progress) -> tuple[Point, NDArray[n
     return Point(points.coefficients, points.offsets * kept), kept
 
 
-def _settled(
-    trail: Sequence[NDArray[np.float64]], accepted: NDArray[np.bool_], tolerance: float
-) -> bool:
-    """Tell whether no start gains any more: not by its last step, nor by its last three tries."""
-    if len(trail) < 2:
-        return False
+def _settled(trail: Sequence[NDArray[np.float64]], accepted: NDArray[np.bool_], leg: Leg) -> bool:
+    """Tell whether every start is good enough for the next leg, or gains nothing any more.
+
+    That is, neither by its last step nor by its last three tries.
+    """
     last = trail[-1]
+    if len(trail) < 2:
+        return bool(np.all(last <= leg.enough))
 
     def still(before: NDArray[np.float64]) -> NDArray[np.bool_]:
-        return np.asarray(before - last <= tolerance * np.abs(last))
+        return np.asarray(before - last <= leg.tolerance * np.abs(last))
 
     stuck = still(trail[-4]) if len(trail) > 3 else np.zeros(len(last), bool)
-    return bool(np.all((accepted & still(trail[-2])) | stuck))
+    return bool(np.all((accepted & still(trail[-2])) | stuck | (last <= leg.enough)))
 
 
 def _starts(step: Step, before: NDArray[np.float64] | None) -> NDArray[np.float64] | None:

@@ -14,6 +14,8 @@ WINDOWS = ((0.3, 20.0, False), (0.6, 5.0, True))
 """Share of a window, loosening, and whether offsets are free, before the windows are whole."""
 GENTLE = 1.0
 """s of horizon below which a Jacobian costs so little that a leg may take its time."""
+ENOUGH = 0.01
+"""Loss at which such a leg has done its part: the next sees further."""
 OFFSETS_FROM = 5.0
 """s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
 EVOLVED = (0.8, 3.0)
@@ -23,7 +25,7 @@ GENERATIONS = 60
 WHOLE = "whole length"
 USUAL = 5
 """Steps that a leg takes, more or less."""
-PAUSE = 400
+PAUSE = 4000
 """What a step costs beside its simulation, in samples of it."""
 
 
@@ -55,6 +57,8 @@ class Leg:
     solver
         ``gradient`` moves everything down the slope, ``offsets`` the flights' offsets alone, and
         ``cma`` the coefficients alone by CMA-ES.
+    enough
+        Loss, in loosened standard deviations, below which the next leg may as well begin.
     """
 
     name: str
@@ -67,6 +71,7 @@ class Leg:
     weighs: bool
     prunes: bool
     solver: Literal["gradient", "offsets", "cma"] = "gradient"
+    enough: float = 0.0
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Leg, ...]:
@@ -86,6 +91,7 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     tolerance=0.005 if seconds < GENTLE else 0.02,
                     weighs=False,
                     prunes=False,
+                    enough=ENOUGH if seconds < GENTLE else 0.0,
                 )
             )
     return (*legs, *_whole_legs(samples, robust=robust, steps=steps))
