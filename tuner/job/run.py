@@ -115,15 +115,15 @@ def run(
     findings = check(job)
     _refuse_failures(findings, listener, force=force)
     folder.mkdir(parents=True, exist_ok=True)
-    tell = _teller(folder, listener)
+    keep = _keeper(folder, listener)
     try:
-        fitted = search(job, folder, resume=resume, tell=tell, findings=findings)
+        fitted = search(job, folder, resume=resume, tell=keep, findings=findings)
     except KeyboardInterrupt:
         listener.message(f"the best so far is in {folder}; go on with --out {folder} --resume")
         raise
     aside = Aside()
     listener.message("telling how far each coefficient can be trusted")
-    fitted, examination = with_the_untold_held(job, fitted, tell, listener.message)
+    fitted, examination = with_the_untold_held(job, fitted, keep, listener.message)
     uncertainty = examination.uncertainty
     vehicle = vehicle_fitted(job, fitted)
     listener.message("flying every flight with the initial and the fitted coefficients")
@@ -135,7 +135,7 @@ def run(
     write_laps(folder, *errors)
     write_search(folder, fitted)
     if cross_validated:
-        listener.folds(cross_validate(job, fitted, folder, tell))
+        listener.folds(cross_validate(job, fitted, folder, _teller(listener)))
     listener.message("simulating what could be flown next")
     write_examination(folder, job, examination, fitted, once_known=lambda: aside.begin(folder))
     render(folder, drawn=aside.drawn)
@@ -155,20 +155,31 @@ def _refuse_failures(findings: Sequence[Finding], listener: Listener, *, force: 
         raise InputError(first.subject, first.text, f"{first.remedy}, or use --force")
 
 
-def _teller(folder: Path, listener: Listener) -> Callable[[Job, Progress], None]:
-    """Return what keeps the best set so far on disk, and tells the listener."""
-    from tuner.job.search import parameters_of  # noqa: PLC0415
+def _teller(listener: Listener) -> Callable[[Job, Progress], None]:
+    """Return what tells the listener of an iteration."""
 
-    def tell(job: Job, progress: Progress) -> None:
+    def tell(_: Job, progress: Progress) -> None:
         last = progress.iterations[-1]
-        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
-            best = with_values(job.settings.vehicle, parameters_of(job, progress))
-            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
         listener.iteration(
             last.stage, last.number, last.horizon, last.loss, last.position_rmse, progress.left
         )
 
     return tell
+
+
+def _keeper(folder: Path, listener: Listener) -> Callable[[Job, Progress], None]:
+    """Return what keeps the best set so far on disk, and tells the listener."""
+    from tuner.job.search import parameters_of  # noqa: PLC0415
+
+    tell = _teller(listener)
+
+    def keep(job: Job, progress: Progress) -> None:
+        with suppress(ConfigError):  # on its way a search may cross what no rigid body can have
+            best = with_values(job.settings.vehicle, parameters_of(job, progress))
+            write_vehicle(best, folder / BEST_FIT_FILE, header="Best so far of an unfinished run.")
+        tell(job, progress)
+
+    return keep
 
 
 def folder_for(out: Path | None, *, resume: bool = False) -> Path:

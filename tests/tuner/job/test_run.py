@@ -115,6 +115,20 @@ def short_job():
 
 
 @pytest.mark.slow
+def test_each_flight_is_foretold_by_the_others_and_the_fit_stays(tmp_path):
+    bags = [str(FLIGHTS / f"{name}.bag") for name in ("yaw_spin_3rps", "circle_3mps")]
+    folder, result = run(Options(bags, **SHORT), out=tmp_path / "run", cross_validated=True)
+    rows = [line.split(",") for line in (folder / "cross_validation.csv").read_text().splitlines()]
+    assert [row[0] for row in rows] == ["left_out", "yaw_spin_3rps", "circle_3mps", "spread"]
+    column = rows[0].index("moment_constant")
+    values = [float(row[column]) for row in rows[1:3]]
+    assert values[0] != values[1]
+    assert float(rows[3][column]) == pytest.approx(np.std(values, ddof=1))
+    written = values_of(read_vehicle(folder / "best_fit.yaml"))
+    assert written["moment_constant"] == result.coefficients["moment_constant"].best
+
+
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
     _, whole = run(short_job(), out=tmp_path / "whole")
     told = []
