@@ -27,6 +27,7 @@ from tuner.flights.flight import Flight
 from tuner.identifiability import Uncertainty
 from tuner.identifiability.uncertainty import Estimate
 from tuner.job.prepare import Job, given_offset
+from tuner.objective.freedom import STATES
 from tuner.objective.lanes import CLOCKS, OFFSETS
 from tuner.objective.terms import OFFSET_UNIT
 from tuner.result import (
@@ -105,6 +106,21 @@ def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
     }
 
 
+def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
+    """Return what windows' free starts were moved by, root mean square; empty for whole flights.
+
+    Name of `STATES` -> in its unit there: how much was given to nuisances, not to coefficients.
+    """
+    freedom, states = fitted.objective.lanes.freedom, fitted.stage.states
+    if freedom is None or states is None:
+        return {}
+    moved, found, first = np.asarray(states) * np.asarray(freedom), dict[str, JsonValue](), 0
+    for name, (count, _) in STATES.items():
+        found[name] = float(np.sqrt(np.mean(moved[first : first + count] ** 2)))
+        first += count
+    return found
+
+
 def validate(
     job: Job, fitted: Fitted, vehicle: VehicleFile
 ) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
@@ -141,6 +157,7 @@ def result_of(
             "noise": dict(fitted.noise),
             "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
             "offsets": offsets_by_flight(job, fitted),
+            "window_starts": starts_moved(fitted),
             "findings": [vars(finding) for finding in fitted.findings],
             "starts": [
                 {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes
