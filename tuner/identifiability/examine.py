@@ -64,7 +64,7 @@ def examine(
     flights
         Names of the fitted flights in the order of the objective; ``fitted.scales``' by default.
     clocks
-        (clocks, F) which clock offsets were fitted; by default those that are not exactly zero.
+        (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
     names = tuple(fitted.scales) if flights is None else tuple(flights)
     every = every_coefficient(fitted.objective, fitted.point)

@@ -27,6 +27,7 @@ from tuner.identifiability.profiles import write_profiles
 from tuner.identifiability.proposals import Proposals, write_proposals
 from tuner.identifiability.telling import tell as told_of
 from tuner.identifiability.whole_range import whole_range
+from tuner.job.noticed import UNMATCHED
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
 from tuner.job.results import controller_flown, versions
 from tuner.objective.normal import Objective
@@ -35,17 +36,14 @@ from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
 from tuner.search.fitted import Finding, Fitted
+from tuner.search.growing import FEEDBACK_GAIN
 from tuner.search.legs import WHOLE, schedule_of
 from tuner.search.progress import beginning, stage_of, with_feedback
 
-FEEDBACK_GAIN = 1.2
-"""Factor on the squares by which the other saturation feedback must meet the flights better."""
 ROOM = 1.0
 """m added to what the recorded flights took, to make an arena of it."""
 SHORTEST = 20.0
 """s: the publisher takes ten to wind up."""
-UNTRUSTED = 10.0
-"""Residuals this many times the noise are no place from which to judge a coefficient."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +292,7 @@ def _findings(
         )
     for index, name in enumerate(names):
         worst = max(scale, key=lambda channel: scale[channel][index])
-        if scale[worst][index] > UNTRUSTED:
+        if scale[worst][index] > UNMATCHED:
             yield Finding(
                 "warning",
                 name,

@@ -10,6 +10,7 @@ import numpy as np
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients import Space, space_of
 from tuner.comparison.compare import flights_of
+from tuner.comparison.errors import limits_of
 from tuner.comparison.layout import said_inlet
 from tuner.config import Settings
 from tuner.errors import RecordingError
@@ -26,8 +27,6 @@ SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
 
 CLIPPED = 0.005
 """A recorded command below this is a rotor clipped low."""
-CLEARANCE = 0.3
-"""m: a recording that comes closer to the ground than this does not end there."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +125,7 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
         windows = problem(lanes, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE)
     if closed:
         whole = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
-        objective = problem(whole, longest, limits_for(fitted))
+        objective = problem(whole, longest, limits_of(fitted))
         return Job(settings, fitted, held_out, noise, space, inlets, objective, windows)
     assert windows is not None
     return Job(settings, fitted, held_out, noise, space, inlets, windows)
@@ -153,12 +152,6 @@ def _shifted(flight: Flight, late: float) -> Flight:
         for name, one in flight.series.items()
     }
     return replace(flight, series=series)
-
-
-def limits_for(flights: Sequence[Flight]) -> Limits:
-    """Return the simulator's limits; a recording near the ground has no floor to crash into."""
-    lowest = min(float(np.nanmin(flight.signals["position"][:, 2])) for flight in flights)
-    return Limits() if lowest > Limits().floor + CLEARANCE else AIRBORNE
 
 
 def _weights(

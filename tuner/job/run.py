@@ -6,7 +6,7 @@ import datetime
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -97,6 +97,7 @@ def run(
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
     from tuner.job.examination import write_examination  # noqa: PLC0415
     from tuner.job.hold import with_the_untold_held  # noqa: PLC0415
+    from tuner.job.noticed import surer_than_steps  # noqa: PLC0415
     from tuner.job.prepare import prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
         result_of,
@@ -125,6 +126,7 @@ def run(
     listener.message("telling how far each coefficient can be trusted")
     fitted, examination = with_the_untold_held(job, fitted, keep, listener.message)
     uncertainty = examination.uncertainty
+    fitted = replace(fitted, findings=(*fitted.findings, *surer_than_steps(uncertainty)))
     vehicle = vehicle_fitted(job, fitted)
     listener.message("flying every flight with the initial and the fitted coefficients")
     errors = validate(job, fitted, vehicle)
@@ -148,7 +150,8 @@ def run(
 
 def _refuse_failures(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:
     for finding in findings:
-        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
+        remedy = f"; {finding.remedy}" if finding.remedy else ""
+        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}{remedy}")
     failures = [finding for finding in findings if finding.kind == "failure"]
     if failures and not force:
         first = failures[0]

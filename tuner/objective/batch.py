@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.model import Model
-from tuner.objective.normal import Flier, Objective, robust
+from tuner.objective.normal import Flier, Objective, robust_loss
 from tuner.objective.terms import LaneData, Point, Stage
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -83,10 +83,9 @@ def _shared(flier: Flier) -> Callable[..., Batch]:
     ) -> Batch:
         def one(vector: Array) -> Batch:
             trace, errors = flier.compared(data, model, vector, horizon)
-            scaled = [error / data.scale[name] for name, error in errors.items()]
-            loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled), jnp.zeros(()))
+            scaled = {name: error / data.scale[name] for name, error in errors.items()}
             squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
-            return Batch(0.5 * loss, squares, trace.crash_time)
+            return Batch(robust_loss(scaled, huber), squares, trace.crash_time)
 
         found: Batch = jax.vmap(one)(vectors)
         return found

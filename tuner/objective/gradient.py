@@ -19,7 +19,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.model import Model
-from tuner.objective.normal import Flier, Objective, robust
+from tuner.objective.normal import Flier, Objective, robust_loss
 from tuner.objective.terms import LaneData, Point, Stage
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -75,8 +75,8 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
     ) -> Gradients:
         def loss(vector: Array) -> Array:
             errors = flier.compared(data, model, vector, horizon, whole=True)[1]
-            scaled = [error / data.scale[name] for name, error in errors.items()]
-            return 0.5 * sum((jnp.sum(robust(e, huber)) for e in scaled), jnp.zeros(()))
+            scaled = {name: error / data.scale[name] for name, error in errors.items()}
+            return jnp.sum(robust_loss(scaled, huber))
 
         values, slopes = jax.vmap(jax.value_and_grad(loss), in_axes=-1, out_axes=-1)(vectors)
         return Gradients(values, slopes)

@@ -237,8 +237,7 @@ class Flier:
         rate = float(self.schedule.log_rate)
         counts = {name: _count(data.lanes, name, rate, horizon) for name in errors}
         scaled = {name: e / data.scale[name] for name, e in errors.items()}
-        loss = sum((jnp.sum(robust(e, huber), axis=(0, 1)) for e in scaled.values()), jnp.zeros(()))
-        loss = 0.5 * loss
+        loss = robust_loss(scaled, huber)
         lanes = jnp.shape(data.offsets)[-1]
         size = len(coefficients) + len(OFFSETS)
         gradient, hessian, states = jnp.zeros((size, lanes)), jnp.zeros((size, size, lanes)), None
@@ -327,6 +326,12 @@ def _normal(
         gradient = gradient + jnp.einsum("pnkf,nkf->pf", weighted, error)
         hessian = hessian + jnp.einsum("pnkf,qnkf->pqf", weighted, column)
     return gradient, hessian
+
+
+def robust_loss(scaled: dict[str, Array], huber: Array) -> Array:
+    """Return half the robust sum of squares (F,) of channel -> (n, k, F) scaled residuals."""
+    sums = (jnp.sum(robust(error, huber), axis=(0, 1)) for error in scaled.values())
+    return 0.5 * sum(sums, jnp.zeros(()))
 
 
 def robust(error: Array, limit: Array) -> Array:

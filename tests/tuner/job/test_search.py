@@ -11,7 +11,7 @@ from tuner.coefficients import space_of
 from tuner.config import JobFile
 from tuner.config.job import Search
 from tuner.job import search as module
-from tuner.job.noticed import noticed, unmatched
+from tuner.job.noticed import noticed, surer_than_steps, unmatched
 from tuner.job.starts import starting_vectors
 from tuner.search.fitted import Outcome
 from tuner.search.legs import left, plan
@@ -86,6 +86,22 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
     (finding,) = noticed(job, 1.0, every)
     assert finding.subject == "model"
     assert "3 of 3 flights" in finding.text
+
+
+def test_a_lag_told_more_finely_than_steps_allow_is_said():
+    told = {
+        name: SimpleNamespace(std_error=error)
+        for name, error in {
+            "time_constant_up": 2e-5,
+            "time_constant_down": 5e-4,
+            "motor_constant": 1e-9,
+        }.items()
+    }
+    (finding,) = surer_than_steps(SimpleNamespace(estimates=told))
+    assert finding.subject == "time_constant_up"
+    assert "0.1 ms" in finding.text
+    told["time_constant_up"] = SimpleNamespace(std_error=2e-4)
+    assert surer_than_steps(SimpleNamespace(estimates=told)) == ()
 
 
 def test_time_left_falls_to_nothing():
