@@ -31,7 +31,7 @@ from sim_jax.inlet import (
 )
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
-from sim_jax.rotation import Matrix3, Quaternion
+from sim_jax.rotation import Quaternion
 from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switched, unpacked
@@ -132,7 +132,12 @@ class Plant(eqx.Module):
         )
         flying = ~jnp.isfinite(state.crash_time)
         command = mixer.mix(controller.mixer, torque, state.setpoints.thrust, counts=flying)
-        return replaced(state, gyro=gyro, integral=integral, command=command)
+        return self.tell(replaced(state, gyro=gyro, integral=integral), command)
+
+    def tell(self, state: State, command: PerRotor) -> State:
+        """Return a state in which the motors have been given commands 0..1."""
+        a, b, c, d = (reference_speed(self.vehicle.motor, one) for one in command)
+        return replaced(state, command=command, asked=like((a, b, c, d), state.asked))
 
     def mixed(self, result: Callable[[Plant], T]) -> T:
         """Return a result with each part's inlet, every vehicle's from its own."""
@@ -168,7 +173,7 @@ class Plant(eqx.Module):
             state = replaced(state, setpoints=self.setpoints(state, step))
         if isinstance(self.inlet, ActuatorInlet):
             command = like(row_of(self.inlet.command, step), state.command)
-            return replaced(state, command=command)
+            return self.tell(state, command)
         if isinstance(self.inlet, RotorSpeedInlet):
             return state
         if self.schedule.rate_control_rate == self.schedule.physics_rate:
@@ -186,19 +191,18 @@ class Plant(eqx.Module):
             later = like(row_of(self.inlet.speed, step + 1), state.rotor_speed)
             a, b, c, d = (0.5 * (old + new) for old, new in zip(now, later, strict=True))
             return later, (a, b, c, d)
-        motor = self.vehicle.motor
-        if isinstance(self.lag, SwitchedLag) and state.commands is not None:
+        if isinstance(self.lag, SwitchedLag) and state.asked_before is not None:
             age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
-            before, after = switched(state.commands, step, age)
+            before, after = switched(state.asked_before, step, age)
             moves = [
-                self.lag.advance(speed, reference_speed(motor, old), reference_speed(motor, new))
+                self.lag.advance(speed, old, new)
                 for speed, old, new in zip(state.rotor_speed, before, after, strict=True)
             ]
         else:
             assert isinstance(self.lag, Lag)
             moves = [
-                self.lag.advance(speed, reference_speed(motor, command))
-                for speed, command in zip(state.rotor_speed, state.command, strict=True)
+                self.lag.advance(speed, asked)
+                for speed, asked in zip(state.rotor_speed, state.asked, strict=True)
             ]
         speeds = (moves[0][0], moves[1][0], moves[2][0], moves[3][0])
         mean = (moves[0][1], moves[1][1], moves[2][1], moves[3][1])
@@ -208,14 +212,14 @@ class Plant(eqx.Module):
         """Advance rotors and body by one step."""
         speeds, acting = self.spin_up(state, step)
 
-        def wrench_at(rotation: Matrix3, velocity: Vec3, body_rate: Vec3) -> Wrench:
+        def wrench_at(attitude: Quaternion, velocity: Vec3, body_rate: Vec3) -> Wrench:
             return vehicle_wrench(
                 self.vehicle.aerodynamics,
                 self.vehicle.rotors,
                 speeds=acting,
-                air_velocity=rotation.to_body(velocity),
+                air_velocity=attitude.to_body(velocity),
                 body_rate=body_rate,
-                world_up=Vec3(rotation.x_axis.z, rotation.y_axis.z, rotation.z_axis.z),
+                world_up=attitude.world_up(),
             )
 
         advance = _INTEGRATORS[self.schedule.integrator]
@@ -227,9 +231,9 @@ class Plant(eqx.Module):
     def step(self, state: State, step: Int[Array, ""]) -> State:
         """Advance by one physics step, rate control before it; remember what is seen later."""
         state = self.command(state, step)
-        if state.commands is not None:
-            commands = push(state.commands, jnp.stack(state.command), step)
-            state = replaced(state, commands=commands)
+        if state.asked_before is not None:
+            asked_before = push(state.asked_before, jnp.stack(state.asked), step)
+            state = replaced(state, asked_before=asked_before)
         state = self.physics(state, step)
         if state.estimates is not None:
             estimates = push(state.estimates, packed(state.motion), step + 1)
@@ -279,7 +283,7 @@ class Plant(eqx.Module):
 
 def _flight(state: State) -> dict[str, PyTree[Array]]:
     """Return what stays as it is once a vehicle has crashed."""
-    names = ("motion", "rotor_speed", "integral", "gyro", "command")
+    names = ("motion", "rotor_speed", "integral", "gyro", "command", "asked")
     return {name: getattr(state, name) for name in names}
 
 

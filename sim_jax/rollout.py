@@ -18,7 +18,7 @@ from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter
 from sim_jax.state import Start, State, first_state
-from sim_jax.trees import forgetful
+from sim_jax.trees import following, forgetful, replaced
 from sim_jax.vehicle import Vehicle
 
 
@@ -115,7 +115,9 @@ def rollout(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
-    state = first_state(start, schedule, plant.gyro, shape)
+    causes = vehicle, controller
+    first = first_state(start, vehicle.motor, schedule, plant.gyro, shape)
+    state = replaced(following(first, causes), crash_time=first.crash_time)
 
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
         return plant.sample(state, number)
@@ -134,5 +136,6 @@ def rollout(
 
     row = jax.eval_shape(sample, state, jnp.asarray(0))[1]
     empty = jax.tree.map(lambda leaf: jnp.zeros((samples, *leaf.shape), leaf.dtype), row)
-    state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, (state, empty))
+    begin = state, following(empty, causes)
+    state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, begin)
     return Rollout(log, state.crash_time)

@@ -85,6 +85,27 @@ class Quaternion(eqx.Module):
             self.w + turn.w, self.x + turn.x, self.y + turn.y, self.z + turn.z
         ).normalized()
 
+    def to_world(self, body: Vec3) -> Vec3:
+        """Turn a body vector into world coordinates: q ⊗ (0, v) ⊗ q⁻¹ as v + w t + u × t.
+
+        u is the vector part and t = 2 u × v: the same work as through a matrix, in fewer pieces.
+        """
+        axis = Vec3(self.x, self.y, self.z)
+        twice = axis.cross(body) * 2.0
+        return body + twice * self.w + axis.cross(twice)
+
+    def to_body(self, world: Vec3) -> Vec3:
+        """Turn a world vector into body coordinates: q⁻¹ ⊗ (0, v) ⊗ q."""
+        return self.conjugate().to_world(world)
+
+    def world_up(self) -> Vec3:
+        """Return the world's z axis in body coordinates."""
+        return Vec3(
+            2.0 * (self.x * self.z - self.w * self.y),
+            2.0 * (self.y * self.z + self.w * self.x),
+            1.0 - 2.0 * (self.x * self.x + self.y * self.y),
+        )
+
     def matrix(self) -> Matrix3:
         """Return the rotation matrix R with v_world = R v_body."""
         x2, y2, z2 = self.x + self.x, self.y + self.y, self.z + self.z
@@ -144,34 +165,3 @@ class Quaternion(eqx.Module):
         """Return the rotation that does nothing, in the shape and precision of a scalar."""
         zero = jnp.zeros_like(like)
         return Quaternion(jnp.ones_like(like), zero, zero, zero)
-
-    @staticmethod
-    def from_matrix(matrix: Matrix3) -> Quaternion:
-        """Return the quaternion of a rotation matrix, by its largest diagonal combination.
-
-        The four branches of the usual algorithm, chosen by selection so that a batch can take
-        different ones; the divisor is never small.
-        """
-        x, y, z = matrix.x_axis, matrix.y_axis, matrix.z_axis
-        by_w = x.x + y.y + z.z > 0
-        by_x = x.x > jnp.maximum(y.y, z.z)
-        by_y = y.y > z.z
-
-        def choose(w: Scalar, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
-            return jnp.where(by_w, w, jnp.where(by_x, x, jnp.where(by_y, y, z)))
-
-        square = choose(
-            1.0 + x.x + y.y + z.z,
-            1.0 + x.x - y.y - z.z,
-            1.0 - x.x + y.y - z.z,
-            1.0 - x.x - y.y + z.z,
-        )
-        about_x, about_y, about_z = y.z - z.y, z.x - x.z, x.y - y.x
-        plus_xy, plus_xz, plus_yz = y.x + x.y, z.x + x.z, z.y + y.z
-        half = 0.5 / jnp.sqrt(square)
-        return Quaternion(
-            choose(square, about_x, about_y, about_z) * half,
-            choose(about_x, square, plus_xy, plus_xz) * half,
-            choose(about_y, plus_xy, square, plus_yz) * half,
-            choose(about_z, plus_xz, plus_yz, square) * half,
-        )

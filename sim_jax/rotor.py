@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 
-from sim_jax.numeric import Scalar, saturate
+from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Rotor
 
@@ -17,50 +17,6 @@ class Wrench(eqx.Module):
 
     force: Vec3
     moment: Vec3
-
-
-def rotor_wrench(
-    aerodynamics: Aerodynamics,
-    *,
-    spin: int,
-    speed: Scalar,
-    air_velocity: Vec3,
-    world_up: Vec3 | None = None,
-) -> Wrench:
-    """Return force and moment of one rotor at its own centre.
-
-    Parameters
-    ----------
-    aerodynamics
-        The rotor's coefficients.
-    spin
-        +1 counter-clockwise, -1 clockwise.
-    speed
-        Ω in rad/s.
-    air_velocity
-        Velocity of the rotor centre through the air in m/s, body axes.
-    world_up
-        World z in body axes; needed where the reaction torque acts about it.
-
-    Returns
-    -------
-    Wrench
-        Thrust motor_constant·Ω²·clip(1 - |v∥|/max_relative_airspeed, 0, 1) along body z, rotor drag
-        -Ω·rotor_drag_coefficient·v⊥, drag torque -spin·moment_constant·motor_constant·Ω², rolling
-        moment -spin·Ω·rolling_moment_coefficient·v⊥.
-    """
-    static_thrust = aerodynamics.motor_constant * (speed * speed)
-    axial = jnp.where(air_velocity.z < 0, -air_velocity.z, air_velocity.z)
-    remaining = saturate(1.0 - axial / aerodynamics.max_relative_airspeed, 0.0, 1.0)
-    drag = -aerodynamics.rotor_drag_coefficient * speed
-    rolling = -spin * aerodynamics.rolling_moment_coefficient * speed
-    torque = -spin * aerodynamics.moment_constant * static_thrust
-    moment = Vec3(rolling * air_velocity.x, rolling * air_velocity.y, jnp.zeros_like(torque))
-    axis = Vec3(torque * 0.0, torque * 0.0, torque) if world_up is None else world_up * torque
-    return Wrench(
-        force=Vec3(drag * air_velocity.x, drag * air_velocity.y, static_thrust * remaining),
-        moment=moment + axis,
-    )
 
 
 def vehicle_wrench(
@@ -73,6 +29,12 @@ def vehicle_wrench(
     world_up: Vec3,
 ) -> Wrench:
     """Sum the rotors' forces and moments about the centre of mass, in body axes.
+
+    Each rotor at r, turning with Ω, moves through the air with v = air_velocity + ω × r. It gives
+    thrust motor_constant·Ω²·clip(1 - |v∥|/max_relative_airspeed, 0, 1) along body z, rotor drag
+    -rotor_drag_coefficient·Ω·v⊥, drag torque -spin·moment_constant·motor_constant·Ω² and rolling
+    moment -rolling_moment_coefficient·spin·Ω·v⊥. The coefficients are the same for all, so that
+    they multiply sums over rotors.
 
     Parameters
     ----------
@@ -89,17 +51,42 @@ def vehicle_wrench(
     world_up
         World z in body axes.
     """
-    about = world_up if aerodynamics.reaction_torque == "world" else None
-    zero = jnp.zeros_like(air_velocity.x)
-    force = moment = Vec3(zero, zero, zero)
-    for rotor, speed in zip(rotors, speeds, strict=True):
-        one = rotor_wrench(
-            aerodynamics,
-            spin=rotor.spin,
-            speed=speed,
-            air_velocity=air_velocity + body_rate.cross(rotor.position),
-            world_up=about,
-        )
-        force = force + one.force
-        moment = moment + one.moment + rotor.position.cross(one.force)
-    return Wrench(force, moment)
+    at = [rotor.position for rotor in rotors]
+    x, y, z = [r.x for r in at], [r.y for r in at], [r.z for r in at]
+    spin = [rotor.spin for rotor in rotors]
+    through = [air_velocity + body_rate.cross(r) for r in at]
+    along_x = [speed * v.x for speed, v in zip(speeds, through, strict=True)]
+    along_y = [speed * v.y for speed, v in zip(speeds, through, strict=True)]
+    square = [speed * speed for speed in speeds]
+    lift = [s * _remaining(aerodynamics, v.z) for s, v in zip(square, through, strict=True)]
+
+    thrust, drag = aerodynamics.motor_constant, aerodynamics.rotor_drag_coefficient
+    rolling = aerodynamics.rolling_moment_coefficient
+    torque = -thrust * aerodynamics.moment_constant * _sum(square, spin)
+    force = Vec3(-drag * _sum(along_x), -drag * _sum(along_y), thrust * _sum(lift))
+    moment = Vec3(
+        thrust * _sum(lift, y) + drag * _sum(along_y, z) - rolling * _sum(along_x, spin),
+        -thrust * _sum(lift, x) - drag * _sum(along_x, z) - rolling * _sum(along_y, spin),
+        drag * (_sum(along_x, y) - _sum(along_y, x)),
+    )
+    if aerodynamics.reaction_torque == "world":
+        return Wrench(force, moment + world_up * torque)
+    return Wrench(force, Vec3(moment.x, moment.y, moment.z + torque))
+
+
+def _remaining(aerodynamics: Aerodynamics, axial: Scalar) -> Scalar:
+    """Return the share of a rotor's static thrust that is left at an axial air speed in m/s."""
+    lost = jnp.abs(axial) * (1.0 / aerodynamics.max_relative_airspeed)
+    return jnp.where(lost < 1.0, 1.0 - lost, 0.0)
+
+
+def _sum(values: Sequence[Scalar], weights: Sequence[Scalar | int] | None = None) -> Scalar:
+    """Return the sum over rotors, weighted by where they sit or which way they turn."""
+    first, *others = (
+        values
+        if weights is None
+        else [weight * value for weight, value in zip(weights, values, strict=True)]
+    )
+    for other in others:
+        first = first + other
+    return first

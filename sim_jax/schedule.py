@@ -6,7 +6,8 @@ from math import lcm
 from typing import Literal
 
 import equinox as eqx
-from jax import Array
+import jax.numpy as jnp
+from jax import Array, lax
 from jaxtyping import Bool, Int
 
 
@@ -66,13 +67,18 @@ class Schedule(eqx.Module):
 
     def control_tick(self, step: Int[Array, ""]) -> Int[Array, ""]:
         """Return the number of the position controller's tick that is current at a physics step."""
-        return (step * self.position_control_rate) // self.physics_rate
+        steps = jnp.asarray(self.physics_rate, step.dtype)
+        return lax.div(step * self.position_control_rate, steps)
 
     def control_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
         """Tell whether the position controller runs at a physics step."""
-        return self.control_tick(step) > self.control_tick(step - 1)
+        return _begins(step, self.position_control_rate, self.physics_rate)
 
     def rate_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
         """Tell whether the rate controller runs at a physics step."""
-        ticks = self.rate_control_rate
-        return (step * ticks) // self.physics_rate > ((step - 1) * ticks) // self.physics_rate
+        return _begins(step, self.rate_control_rate, self.physics_rate)
+
+
+def _begins(step: Int[Array, ""], rate: int, of: int) -> Bool[Array, ""]:
+    """Tell whether ⌊step·rate/of⌋ is greater than it was at the last step."""
+    return lax.rem(step * rate, jnp.asarray(of, step.dtype)) < rate

@@ -27,8 +27,13 @@ def push(
     step: Int[Array, ""],
 ) -> Float[Array, "length rows *batch"]:
     """Write the newest values of a delay line at physics step number ``step``."""
-    written: Array = lax.dynamic_update_index_in_dim(history, values, step % history.shape[0], 0)
+    written: Array = lax.dynamic_update_index_in_dim(history, values, _place(step, history), 0)
     return written
+
+
+def _place(step: Int[Array, "*steps"], history: Array) -> Int[Array, "*steps"]:
+    """Return which slot belongs to a step; steps must not be negative, which spares checks."""
+    return lax.rem(step, jnp.full_like(step, history.shape[0]))
 
 
 def _slot(
@@ -41,10 +46,10 @@ def _slot(
     length = history.shape[0]
     back = jnp.clip(lax.stop_gradient(back), 0, length - 1)
     if jnp.ndim(back) == 0:
-        index = (step - back.astype(step.dtype)) % length
+        index = _place(step + length - back.astype(step.dtype), history)
         shared: Array = lax.dynamic_index_in_dim(history, index, 0, keepdims=False)
         return shared
-    ages = (step - jnp.arange(length)) % length
+    ages = _place(step + length - jnp.arange(length), history)
     ages = ages.reshape((length,) + (1,) * jnp.ndim(back))
     return jnp.sum(jnp.where(ages == back, 1.0, 0.0)[:, None] * history, axis=0)
 

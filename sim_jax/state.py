@@ -9,13 +9,14 @@ from jax import Array
 from jaxtyping import Float
 
 from sim_jax.control.mixer import PerRotor
+from sim_jax.motor import reference_speed
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, GyroMemory, history_length, past_of
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Vehicle
+from sim_jax.vehicle import Motor, Vehicle
 
 
 class Start(eqx.Module):
@@ -48,8 +49,10 @@ class State(eqx.Module):
     integral: Vec3
     gyro: GyroMemory
     command: PerRotor
+    asked: PerRotor
+    """rad/s that the command asks for."""
     estimates: Float[Array, "estimate_history 10 *batch"] | None
-    commands: Float[Array, "command_history 4 *batch"] | None
+    asked_before: Float[Array, "asked_history 4 *batch"] | None
     crash_time: Scalar
     """s, infinite while flying."""
 
@@ -69,12 +72,15 @@ def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Star
 
 
 def first_state(
-    start: Start, schedule: Schedule, gyro: GyroFilter, shape: tuple[int, ...]
+    start: Start, motor: Motor, schedule: Schedule, gyro: GyroFilter, shape: tuple[int, ...]
 ) -> State:
     """Return the state at time 0, every leaf in the full shape of the batch."""
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), start)
-    estimates = commands = None
+    speeds = (reference_speed(motor, command) for command in start.command)
+    a, b, c, d = (jnp.broadcast_to(speed, shape).astype(dtype) for speed in speeds)
+    asked = a, b, c, d
+    estimates = asked_before = None
     if schedule.longest_estimate_latency > 0:
         hold = 0.0 if schedule.pose_rate is None else 1.0 / schedule.pose_rate
         length = history_length(schedule.longest_estimate_latency + hold, schedule.step)
@@ -83,7 +89,7 @@ def first_state(
         raise ValueError("pose_rate needs a delay line: set longest_estimate_latency")
     if schedule.longest_actuator_latency > 0:
         length = history_length(schedule.longest_actuator_latency, schedule.step)
-        commands = jnp.broadcast_to(jnp.stack(start.command), (length, 4, *shape))
+        asked_before = jnp.broadcast_to(jnp.stack(asked), (length, 4, *shape))
     memory = GyroMemory.settled(gyro, start.motion.body_rate)
     thrust = sum(start.command[1:], start.command[0]) * 0.25
     return State(
@@ -93,7 +99,8 @@ def first_state(
         integral=start.rate_integral,
         gyro=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), memory),
         command=start.command,
+        asked=asked,
         estimates=estimates,
-        commands=commands,
+        asked_before=asked_before,
         crash_time=jnp.full(shape, jnp.inf, dtype),
     )

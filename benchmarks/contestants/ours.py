@@ -15,7 +15,7 @@ runtime.configure()
 import jax  # noqa: E402 (after the set-up)
 
 from benchmarks.case import STEPS, factors, fly  # noqa: E402
-from tuner.parallel import in_pieces, over_devices, piece_that_fits  # noqa: E402
+from tuner.parallel import in_pieces, piece_that_fits, shared_among  # noqa: E402
 
 WORK = 8_000_000
 """vehicle-steps a run, at least a tenth of a second."""
@@ -29,8 +29,11 @@ def main(precision: str, vehicles: int) -> None:
         answer(lambda: jax.block_until_ready(alone(factor)), samples * STEPS, runtime.describe())
         return
     lanes = piece_that_fits(np.dtype(precision).itemsize)
-    batch, factor = over_devices(in_pieces(flight, lanes)), np.asarray(factors(vehicles))
-    answer(lambda: batch(factor), vehicles * samples * STEPS, runtime.describe())
+    batch = jax.jit(shared_among(in_pieces(flight, lanes), len(jax.devices())))
+    factor = np.asarray(factors(vehicles))
+    answer(
+        lambda: jax.block_until_ready(batch(factor)), vehicles * samples * STEPS, runtime.describe()
+    )
 
 
 if __name__ == "__main__":

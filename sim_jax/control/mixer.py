@@ -93,21 +93,23 @@ def _quantised(command: Scalar) -> Scalar:
     return command + jax.lax.stop_gradient((pulse - 1000.0) * 1e-3 - command)
 
 
-def _outside(outputs: PerRotor) -> Flag:
-    flags = [(out < 0.0) | (out > 1.0) for out in outputs]
-    return flags[0] | flags[1] | flags[2] | flags[3]
+def _outside(middle: Scalar, reach: Scalar) -> Flag:
+    """Tell whether outputs this far either side of a middle leave 0..1."""
+    return (middle < reach) | (middle + reach > 1.0)
 
 
 def _desaturated_where_needed(
     airmode: int, torque: Vec3, thrust: Scalar, counts: Flag | bool
 ) -> PerRotor:
     """Mix; desaturation, which is most of the work, is left out while no vehicle saturates."""
-    level = _sum(torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, jnp.zeros_like(thrust), thrust)
-    plain = _sum(torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z, thrust)
+    roll, pitch, yaw = torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z
+    ahead, across = jnp.abs(pitch - roll), jnp.abs(pitch + roll)
+    without_yaw = _outside(thrust, larger(ahead, across))
+    saturates = without_yaw | _outside(thrust + yaw, ahead) | _outside(thrust - yaw, across)
     mixed: PerRotor = jax.lax.cond(
-        anyone((_outside(level) | _outside(plain)) & counts),
+        anyone(saturates & counts),
         lambda: _outputs(airmode, torque, thrust),
-        lambda: plain,
+        lambda: _sum(roll, pitch, yaw, thrust),
     )
     return mixed
 

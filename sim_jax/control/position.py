@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 
 from sim_jax.control.gains import AttitudeGains, PositionGains
-from sim_jax.numeric import Scalar, safe_divide, saturate
+from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.vector import Vec3
 
@@ -34,8 +36,8 @@ def _unit(vector: Vec3, otherwise: Vec3) -> Vec3:
     )
 
 
-def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
-    """Return the attitude whose z axis lies along an acceleration and whose x axis is near heading.
+def axes_from_acceleration(acceleration: Vec3, heading: Vec3) -> Matrix3:
+    """Return body axes of which z lies along an acceleration and x is near the heading.
 
     Parameters
     ----------
@@ -49,8 +51,50 @@ def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
     """
     z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
     y_axis = _unit(z_axis.cross(heading), Vec3(-heading.y, heading.x, heading.z))
-    x_axis = y_axis.cross(z_axis)
-    return Quaternion.from_matrix(Matrix3(x_axis, y_axis, z_axis))
+    return Matrix3(y_axis.cross(z_axis), y_axis, z_axis)
+
+
+def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
+    """Return the attitude of `axes_from_acceleration`, up to the sign of all four numbers.
+
+    A turn to the heading, then a roll about x and a pitch about y that bring z where it belongs:
+    the product of three half turns, for a fifth of what taking it from a matrix costs.
+    """
+    z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
+    ahead = heading.x * z_axis.x + heading.y * z_axis.y
+    left = heading.x * z_axis.y - heading.y * z_axis.x
+    level = safe_sqrt(left * left + z_axis.z * z_axis.z)
+    rolls = level > 0
+    scale = 1.0 / jnp.where(rolls, level, 1.0)
+    cosine = jnp.where(rolls, z_axis.z * scale, 1.0)
+    roll = _half_angle(cosine, -left * scale)
+    pitch = _half_angle(level, ahead)
+    yaw = _half_angle(heading.x, heading.y)
+    tilt = Quaternion(
+        roll.cosine * pitch.cosine,
+        roll.sine * pitch.cosine,
+        roll.cosine * pitch.sine,
+        roll.sine * pitch.sine,
+    )
+    return Quaternion(
+        yaw.cosine * tilt.w - yaw.sine * tilt.z,
+        yaw.cosine * tilt.x - yaw.sine * tilt.y,
+        yaw.cosine * tilt.y + yaw.sine * tilt.x,
+        yaw.cosine * tilt.z + yaw.sine * tilt.w,
+    )
+
+
+class _Angle(NamedTuple):
+    cosine: Scalar
+    sine: Scalar
+
+
+def _half_angle(cosine: Scalar, sine: Scalar) -> _Angle:
+    """Halve an angle, up to half a turn: the larger number by a root, the other by division."""
+    ahead = cosine >= 0
+    larger = jnp.sqrt(0.5 + 0.5 * jnp.where(ahead, cosine, -cosine))
+    other = 0.5 * sine / larger
+    return _Angle(jnp.where(ahead, larger, other), jnp.where(ahead, other, larger))
 
 
 def feedback_acceleration(
@@ -99,7 +143,7 @@ def wanted_acceleration(
         World vector (cos ψ, sin ψ, 0), which turns the axes of the reference's drag.
     """
     up = Vec3.upward(position.z, CONTROLLER_GRAVITY)
-    along_reference = attitude_from_acceleration(reference.acceleration + up, heading).matrix()
+    along_reference = axes_from_acceleration(reference.acceleration + up, heading)
     drag = along_reference.to_world(
         gains.reference_drag.scaled_by(along_reference.to_body(reference.velocity))
     )

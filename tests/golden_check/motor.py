@@ -8,9 +8,9 @@ from jax import Array
 
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rotation import Matrix3
-from sim_jax.rotor import Wrench, rotor_wrench
+from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Aerodynamics, Motor
+from sim_jax.vehicle import Aerodynamics, Motor, Rotor
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 EXACT = 1e-12
@@ -76,15 +76,18 @@ def _motor_model(table: Table) -> list[Deviation]:
             "rotor_drag_coefficient",
             "rolling_moment_coefficient",
         )
-        aerodynamics = Aerodynamics(*(coefficients.get(name, zero) for name in names))
-        return rotor_wrench(
+        axis = "world" if table.frame["variant"].iloc[0] == "hg" else "body"
+        aerodynamics = Aerodynamics(
+            *(coefficients.get(name, zero) for name in names), reaction_torque=axis
+        )
+        centre = Vec3.zeros(zero)
+        return vehicle_wrench(
             aerodynamics,
-            spin=spin,
-            speed=jnp.abs(speed),
+            [Rotor(centre, spin)],
+            speeds=[jnp.abs(speed)],
             air_velocity=air,
-            world_up=Vec3(axes.x_axis.z, axes.y_axis.z, axes.z_axis.z)
-            if table.frame["variant"].iloc[0] == "hg"
-            else None,
+            body_rate=centre,
+            world_up=Vec3(axes.x_axis.z, axes.y_axis.z, axes.z_axis.z),
         )
 
     drag = {"rotor_drag_coefficient": table.column("rotor_drag")}

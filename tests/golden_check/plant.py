@@ -11,7 +11,7 @@ from sim_jax.control.gains import Filters, MixerSettings
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
 from sim_jax.rollout import rollout
-from sim_jax.rotation import Matrix3
+from sim_jax.rotation import Quaternion
 from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
@@ -43,15 +43,15 @@ def _vehicle(table: Table) -> Vehicle:
 
 
 def _wrench_of(
-    vehicle: Vehicle, speeds: tuple[jax.Array, ...], rotation: Matrix3, velocity: Vec3, rate: Vec3
+    vehicle: Vehicle, speeds: tuple[jax.Array, ...], at: Quaternion, velocity: Vec3, rate: Vec3
 ) -> Wrench:
     return vehicle_wrench(
         vehicle.aerodynamics,
         vehicle.rotors,
         speeds=speeds,
-        air_velocity=rotation.to_body(velocity),
+        air_velocity=at.to_body(velocity),
         body_rate=rate,
-        world_up=Vec3(rotation.x_axis.z, rotation.y_axis.z, rotation.z_axis.z),
+        world_up=at.world_up(),
     )
 
 
@@ -62,17 +62,16 @@ def wrench(table: Table) -> list[Deviation]:
 def _wrench(table: Table) -> list[Deviation]:
     vehicle = _vehicle(table)
     attitude, body_rate = table.quaternion("q"), table.vector("w")
-    rotation = attitude.matrix()
-    acting = _wrench_of(vehicle, table.four("Om"), rotation, table.vector("v"), body_rate)
-    fall = acceleration(vehicle.body, rotation, acting.force, gravity=GOLDEN_GRAVITY)
+    acting = _wrench_of(vehicle, table.four("Om"), attitude, table.vector("v"), body_rate)
+    fall = acceleration(vehicle.body, attitude, acting.force, gravity=GOLDEN_GRAVITY)
     now = jnp.zeros(len(table))
     turning = jax.jvp(
         lambda time: attitude.advanced(attitude, body_rate, time), (now,), (jnp.ones_like(now),)
     )[1]
     rolling = angular_acceleration(vehicle.body, body_rate, acting.moment)
     return [
-        deviation("force", rotation.to_world(acting.force), table.vector("F"), WRENCH),
-        deviation("moment", rotation.to_world(acting.moment), table.vector("tau"), WRENCH),
+        deviation("force", attitude.to_world(acting.force), table.vector("F"), WRENCH),
+        deviation("moment", attitude.to_world(acting.moment), table.vector("tau"), WRENCH),
         deviation("acceleration", fall, table.vector("dv"), WRENCH),
         deviation("attitude derivative", turning, table.quaternion("dq"), WRENCH),
         deviation("angular acceleration", rolling, table.vector("dw"), WRENCH),

@@ -16,11 +16,12 @@ from sim_jax.control.gains import Filters, MixerSettings, PositionGains
 from sim_jax.control.position import ReferencePoint
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, step_midpoint, step_semi_implicit
-from sim_jax.rotation import Matrix3, Quaternion
-from sim_jax.rotor import Wrench, rotor_wrench, vehicle_wrench
+from sim_jax.rotation import Quaternion
+from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
 from sim_jax.trajectory import Shape, publish
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import Rotor
 from tests.sim_jax.derivatives import Differences, assert_derivatives
 from tests.sim_jax.support import controller, hover, quaternion, vec, vehicle
 
@@ -247,7 +248,14 @@ def test_lag_at_rest_rising_and_falling() -> None:
 def blown(speed: Array, air: Vec3, *coefficients: Array) -> Wrench:
     names = lambda a: (a.motor_constant, a.moment_constant, a.rotor_drag_coefficient)  # noqa: E731
     aerodynamics = eqx.tree_at(names, CRAFT.aerodynamics, coefficients)
-    return rotor_wrench(aerodynamics, spin=-1, speed=speed, air_velocity=air)
+    return vehicle_wrench(
+        aerodynamics,
+        [Rotor(STILL, -1)],
+        speeds=[speed],
+        air_velocity=air,
+        body_rate=STILL,
+        world_up=LEVEL.world_up(),
+    )
 
 
 COEFFICIENTS = (jnp.asarray(1.45e-5), jnp.asarray(0.033), jnp.asarray(1.45e-4))
@@ -278,14 +286,14 @@ def test_body_at_rest_and_tumbling(advance: Callable[..., Motion]) -> None:
     speeds = hover(CRAFT, STILL).rotor_speed
 
     def moved(motion: Motion) -> Motion:
-        def wrench_at(rotation: Matrix3, velocity: Vec3, body_rate: Vec3) -> Wrench:
+        def wrench_at(attitude: Quaternion, velocity: Vec3, body_rate: Vec3) -> Wrench:
             return vehicle_wrench(
                 CRAFT.aerodynamics,
                 CRAFT.rotors,
                 speeds=speeds,
-                air_velocity=rotation.to_body(velocity),
+                air_velocity=attitude.to_body(velocity),
                 body_rate=body_rate,
-                world_up=Vec3(rotation.x_axis.z, rotation.y_axis.z, rotation.z_axis.z),
+                world_up=attitude.world_up(),
             )
 
         return advance(CRAFT.body, motion, wrench_at, 0.0025)

@@ -9,7 +9,7 @@ import pytest
 
 from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
-from sim_jax.rotation import Matrix3
+from sim_jax.rotation import Quaternion
 from sim_jax.rotor import Wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
@@ -23,7 +23,7 @@ TUMBLING = Motion(
 )
 
 
-def nothing(_rotation: Matrix3, velocity: Vec3, _body_rate: Vec3) -> Wrench:
+def nothing(_attitude: Quaternion, velocity: Vec3, _body_rate: Vec3) -> Wrench:
     zero = Vec3.zeros(velocity.x)
     return Wrench(zero, zero)
 
@@ -103,7 +103,7 @@ def test_order_of_each_step_under_a_moment(advance: Step, order: int) -> None:
     """A moment about a principal axis and thrust: what the midpoint step is made for."""
     still = Motion(vec(0, 0, 0), vec(1, 0, 0), quaternion(1, 0, 0, 0), vec(0.0, 0.5, 0.0))
 
-    def push(_rotation: Matrix3, _velocity: Vec3, _body_rate: Vec3) -> Wrench:
+    def push(_attitude: Quaternion, _velocity: Vec3, _body_rate: Vec3) -> Wrench:
         return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
 
     def at(step: Step, count: int) -> Motion:
