@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, nn
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from tuner.config import COEFFICIENTS, JobFile, VehicleFile, values_of
@@ -107,23 +109,70 @@ class Parameter:
         return float(np.log(value)) if self.scale == "log" else value
 
 
-class Space:
-    """The free coefficients and the map between them and an unbounded vector.
+class Coordinates(eqx.Module):
+    """The map from the search's z to numbers, itself in numbers: one program serves every space.
 
     The scaled coordinate x (logarithm or number) of each parameter lies between its bounds by a
-    logistic map of the search's z, so that no step can leave them.
+    logistic map of z, so that no step can leave them.
+
+    Attributes
+    ----------
+    lower, width
+        (K,) lower bound and the bounds' distance, scaled.
+    stretch
+        (K,) of the logistic map.
+    is_log
+        (K,) whose scaled coordinate is the logarithm.
+    prior_mean, prior_sd
+        (K,) scaled.
     """
+
+    lower: Float[Array, " K"]
+    width: Float[Array, " K"]
+    stretch: Float[Array, " K"]
+    is_log: Bool[Array, " K"]
+    prior_mean: Float[Array, " K"]
+    prior_sd: Float[Array, " K"]
+
+    def __len__(self) -> int:
+        return int(self.lower.shape[0])
+
+    def scaled(self, vector: Array) -> Array:
+        """Return the scaled coordinates (K,) of a search vector; traceable."""
+        scaled: Array = self.lower + self.width * nn.sigmoid(vector / self.stretch)
+        return scaled
+
+    def numbers(self, vector: Array) -> Array:
+        """Return the parameters' values (K,); traceable."""
+        scaled = self.scaled(vector)
+        return jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, scaled, 0.0)), scaled)
+
+
+class Space:
+    """The free coefficients and the map between them and an unbounded vector."""
 
     def __init__(self, parameters: Sequence[Parameter], fixed: Mapping[str, float]) -> None:
         self.parameters = tuple(parameters)
         self.fixed = dict(fixed)
         self.names = tuple(parameter.name for parameter in self.parameters)
-        self._lower = np.array([p.scaled(p.lower) for p in self.parameters])
-        self._range = np.array([p.scaled(p.upper) for p in self.parameters]) - self._lower
-        self._stretch = self._range / 4.0 / np.array([p.unit_step for p in self.parameters])
-        self._is_log = np.array([p.scale == "log" for p in self.parameters])
+        self.lower = np.array([p.scaled(p.lower) for p in self.parameters])
+        self.width = np.array([p.scaled(p.upper) for p in self.parameters]) - self.lower
+        self.stretch = self.width / 4.0 / np.array([p.unit_step for p in self.parameters])
+        self.is_log = np.array([p.scale == "log" for p in self.parameters], bool)
         self.prior_mean = np.array([p.prior_mean for p in self.parameters])
         self.prior_sd = np.array([p.prior_sd for p in self.parameters])
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """What compiled functions need of it."""
+        return Coordinates(
+            lower=jnp.asarray(self.lower),
+            width=jnp.asarray(self.width),
+            stretch=jnp.asarray(self.stretch),
+            is_log=jnp.asarray(self.is_log),
+            prior_mean=jnp.asarray(self.prior_mean),
+            prior_sd=jnp.asarray(self.prior_sd),
+        )
 
     def __len__(self) -> int:
         return len(self.parameters)
@@ -136,45 +185,38 @@ class Space:
     def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
         scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
-        return self.at_share((scaled - self._lower) / self._range)
+        return self.at_share((scaled - self.lower) / self.width)
 
     def scaled(self, vector: Array) -> Array:
         """Return the scaled coordinates (K,) of a search vector; traceable."""
-        scaled: Array = self._lower + self._range * nn.sigmoid(vector / self._stretch)
-        return scaled
+        return self.coordinates.scaled(vector)
 
     def values(self, vector: Array) -> dict[str, Array]:
         """Return every free coefficient's value, tied ones too; traceable."""
-        scaled = self.scaled(vector)
-        numbers = jnp.where(self._is_log, jnp.exp(jnp.where(self._is_log, scaled, 0.0)), scaled)
+        numbers = self.coordinates.numbers(vector)
         return {
             name: numbers[index] * ratio
             for index, parameter in enumerate(self.parameters)
             for name, ratio in parameter.ratios.items()
         }
 
-    @property
-    def width(self) -> NDArray[np.float64]:
-        """The bounds' distance (K,) in the scaled coordinate."""
-        return np.asarray(self._range)
-
     def share(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
-        return np.asarray(1.0 / (1.0 + np.exp(-vector / self._stretch)))
+        return np.asarray(1.0 / (1.0 + np.exp(-vector / self.stretch)))
 
     def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the search vector (K,) that lies so far between the bounds, just inside them."""
         inside = np.clip(share, 1e-6, 1 - 1e-6)
-        return np.asarray(np.log(inside / (1 - inside)) * self._stretch)
+        return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
 
     def from_scaled(self, index: int, scaled: float) -> float:
         """Return a parameter's value from its scaled coordinate."""
-        return float(np.exp(scaled)) if self._is_log[index] else float(scaled)
+        return float(np.exp(scaled)) if self.is_log[index] else float(scaled)
 
     def slope(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
         share = self.share(vector)
-        return np.asarray(self._range * share * (1 - share) / self._stretch)
+        return np.asarray(self.width * share * (1 - share) / self.stretch)
 
 
 def space_of(vehicle: VehicleFile, job: JobFile) -> Space:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -57,6 +58,23 @@ _PLACES: Mapping[str, tuple[str, ...]] = {
 }
 
 
+def coefficients_in(model: Model) -> dict[str, Scalar]:
+    """Return every coefficient that a model has; one that is left out, as a filter may be, is not.
+
+    The order is always the same.
+    """
+    found = {name: _leaf(model, name) for name in _PLACES}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _leaf(model: Model, name: str) -> Scalar | None:
+    node: Any = model
+    for part in _PLACES[name]:
+        node = getattr(node, part)
+    leaf: Scalar | None = node
+    return leaf
+
+
 def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     """Return the model with coefficients replaced; values broadcast over the batch.
 
@@ -66,18 +84,11 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
         A name is no coefficient's.
     """
     names = list(values)
-
-    def leaves(tree: Model) -> list[object]:
-        found: list[object] = []
-        for name in names:
-            node: object = tree
-            for part in _PLACES[name]:
-                node = getattr(node, part)
-            found.append(node)
-        return found
-
     changed: Model = eqx.tree_at(
-        leaves, model, [values[name] for name in names], is_leaf=lambda leaf: leaf is None
+        lambda tree: [_leaf(tree, name) for name in names],
+        model,
+        [values[name] for name in names],
+        is_leaf=lambda leaf: leaf is None,
     )
     return changed
 

@@ -120,7 +120,7 @@ class WindowComparison:
     def _flown(self, objective: Objective, point: Point, states: Array) -> Trace:
         horizon = jnp.asarray(self._samples)
         trace: Trace = eqx.filter_jit(objective.flier.fly)(
-            objective.model, self._lanes, point.coefficients, horizon, jnp.asarray(states)
+            objective.tunable, self._lanes, point.coefficients, horizon, jnp.asarray(states)
         )
         return trace
 

@@ -37,6 +37,15 @@ class Every:
     fixed: tuple[str, ...]
     own: Space
 
+    @property
+    def columns(self) -> int:
+        """How many parameters to differentiate by at a time: as the search did, if it had many.
+
+        What was compiled for the search then serves again.
+        """
+        few, all_of_them = len(self.own), len(self.objective.space)
+        return few if 2 * few >= all_of_them else all_of_them
+
     def only(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
         """Return the space of some parameters, and where they lie in the whole one."""
         space = self.objective.space

@@ -69,7 +69,7 @@ def examine(
     names = tuple(fitted.scales) if flights is None else tuple(flights)
     every = every_coefficient(fitted.objective, fitted.point)
     objective, point, stage = every.objective, every.point, fitted.stage
-    jacobian = objective.jacobian(point, stage)
+    jacobian = objective.jacobian(point, stage, columns=every.columns)
     evidence = summed(objective, point, stage, jacobian, clocks=clocks)
     reference = references(objective.space, np.asarray(point.coefficients))
     return Examination(

@@ -13,9 +13,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from tuner.model import Model
 from tuner.objective.normal import Flier, Objective, robust_loss
 from tuner.objective.terms import LaneData, Point, Stage
+from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 CHUNK = 16
@@ -61,7 +61,7 @@ def evaluate(
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
         found = flown(
             objective.data(point.offsets, stage),
-            objective.model,
+            objective.tunable,
             padded,
             np.asarray(stage.horizon),
             np.asarray(stage.huber),
@@ -79,7 +79,7 @@ def _first(batch: Batch, count: int) -> Batch:
 @lru_cache(maxsize=16)
 def _shared(flier: Flier) -> Callable[..., Batch]:
     def lanewise(
-        data: LaneData, model: Model, vectors: Array, horizon: Array, huber: Array
+        data: LaneData, model: Tunable, vectors: Array, horizon: Array, huber: Array
     ) -> Batch:
         def one(vector: Array) -> Batch:
             trace, errors = flier.compared(data, model, vector, horizon)

@@ -18,9 +18,9 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from tuner.model import Model
 from tuner.objective.normal import Flier, Objective, robust_loss
 from tuner.objective.terms import LaneData, Point, Stage
+from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 _REMEMBERED = 50
@@ -61,7 +61,7 @@ def gradients(
     found: Gradients = _shared(objective.flier)(
         np.asarray(vectors).T,
         objective.data(point.offsets, stage),
-        objective.model,
+        objective.tunable,
         np.asarray(stage.horizon),
         np.asarray(stage.huber),
     )
@@ -71,7 +71,7 @@ def gradients(
 @lru_cache(maxsize=16)
 def _shared(flier: Flier) -> Callable[..., Gradients]:
     def some(
-        vectors: Array, data: LaneData, model: Model, horizon: Array, huber: Array
+        vectors: Array, data: LaneData, model: Tunable, horizon: Array, huber: Array
     ) -> Gradients:
         def loss(vector: Array) -> Array:
             errors = flier.compared(data, model, vector, horizon, whole=True)[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any
@@ -22,6 +22,7 @@ from tuner.objective.freedom import eliminated
 from tuner.objective.lanes import OFFSETS, Lanes
 from tuner.objective.residuals import Trace, fly, residuals
 from tuner.objective.terms import OFFSET_UNIT, Jacobian, LaneData, LaneSums, Point, Stage
+from tuner.objective.tunable import Tunable, tunable_of
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 MEMORY = 2**30
@@ -64,11 +65,16 @@ class Objective(eqx.Module):
     @property
     def flier(self) -> Flier:
         """The static half, by which compiled functions are kept."""
-        return Flier(self.space, self.schedule, self.samples, self.limits, self.memory)
+        return Flier(self.schedule, self.samples, self.limits, self.memory)
+
+    @property
+    def tunable(self) -> Tunable:
+        """The model and what moves it."""
+        return tunable_of(self.model, self.space)
 
     def simulate(self, coefficients: Float[Array, " K"], horizon: Int[Array, ""]) -> Trace:
         """Fly every lane with a search vector."""
-        return self.flier.fly(self.model, self.lanes, coefficients, horizon)
+        return self.flier.fly(self.tunable, self.lanes, coefficients, horizon)
 
     def sums(self, point: Point, stage: Stage, *, derivatives: bool = True) -> LaneSums:
         """Return every lane's contribution at a point, computed on all devices."""
@@ -82,22 +88,30 @@ class Objective(eqx.Module):
         """Return every lane's contribution at S points; all leaves have S first."""
         found: LaneSums = _shared_sums(self.flier, derivatives)(
             self.data(points.offsets, stage),
-            self.model,
+            self.tunable,
             np.asarray(points.coefficients),
             np.asarray(stage.horizon),
             np.asarray(stage.huber),
         )
         return found
 
-    def jacobian(self, point: Point, stage: Stage) -> Jacobian:
-        """Return every residual's derivatives, computed on all devices."""
-        found: Jacobian = _shared_jacobian(self.flier)(
-            self.data(point.offsets, stage),
-            self.model,
-            np.asarray(point.coefficients),
-            np.asarray(stage.horizon),
-        )
-        return found
+    def jacobian(self, point: Point, stage: Stage, *, columns: int | None = None) -> Jacobian:
+        """Return every residual's derivatives, computed on all devices.
+
+        They are computed for ``columns`` parameters at a time, or all of them.
+        """
+        vector, data = np.asarray(point.coefficients), self.data(point.offsets, stage)
+        model = with_coefficients(self.model, self.space.values(jnp.asarray(vector)))
+        count = len(self.space) if columns is None else columns
+        parts = []
+        for first in range(0, len(vector), count):
+            some = Space(self.space.parameters[first : first + count], {})
+            moved = np.pad(vector[first : first + count], (0, count - len(some)))
+            found = _shared_jacobian(self.flier)(
+                data, tunable_of(model, some, count=count), moved, np.asarray(stage.horizon)
+            )
+            parts.append((len(some), found))
+        return _beside(count, parts)
 
     def data(self, offsets: Array, stage: Stage) -> LaneData:
         """Return what each device needs of its own lanes; offsets are (\\*starts, offsets, N)."""
@@ -115,10 +129,22 @@ class Objective(eqx.Module):
         return own
 
 
+def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
+    """Return as one the Jacobians by some parameters each, all followed by what flights own."""
+    first = parts[0][1]
+    if len(parts) == 1:
+        return first
+    columns: dict[str, Any] = {
+        name: np.concatenate([part.columns[name][:own] for own, part in parts] + [column[count:]])
+        for name, column in first.columns.items()
+    }
+    return Jacobian(first.residuals, columns, first.crash_time)
+
+
 @lru_cache(maxsize=16)
 def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
     def lanewise(data: LaneData, *rest: Any) -> Jacobian:
-        pieces = in_pieces(flier.jacobian, flier.lanes_at_once(data, derivatives=True))
+        pieces = in_pieces(flier.jacobian, flier.lanes_at_once(data, len(rest[0].coordinates)))
         found: Jacobian = pieces(data, *rest)
         return found
 
@@ -129,7 +155,7 @@ def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
 def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
     """Return the sums over all devices for S points, compiled once however often used."""
 
-    def some(data: LaneData, model: Model, coefficients: Array, *rest: Any) -> LaneSums:
+    def some(data: LaneData, model: Tunable, coefficients: Array, *rest: Any) -> LaneSums:
         def at(point: tuple[Array, Array]) -> LaneSums:
             vector, offsets = point
             own = eqx.tree_at(lambda d: d.offsets, data, offsets)
@@ -140,8 +166,8 @@ def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
         return found
 
     def lanewise(data: LaneData, *rest: Any) -> LaneSums:
-        wanted = derivatives or data.states is not None
-        pieces = in_pieces(some, flier.lanes_at_once(data, derivatives=wanted))
+        moving = len(rest[0].coordinates) if derivatives or data.states is not None else 0
+        pieces = in_pieces(some, flier.lanes_at_once(data, moving))
         found: LaneSums = pieces(data, *rest)
         return found
 
@@ -152,16 +178,18 @@ def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
 class Flier:
     """The static half of an objective: its methods are functions of arrays alone."""
 
-    space: Space
     schedule: Schedule
     samples: int
     limits: Limits
     memory: int = MEMORY
 
-    def lanes_at_once(self, data: LaneData, *, derivatives: bool) -> int:
-        """Return how many lanes a device flies at a time: what fits its cache and the memory."""
+    def lanes_at_once(self, data: LaneData, moving: int) -> int:
+        """Return how many lanes a device flies at a time: what fits its cache and the memory.
+
+        ``moving`` is how many parameters it differentiates by; zero if it does not.
+        """
         starts = 0 if data.states is None else len(data.states)
-        columns = len(self.space) + starts if derivatives else 1
+        columns = moving + starts if moving else 1
         recorded = sum(m.values.shape[0] * m.values.shape[1] for m in data.lanes.measured.values())
         logged = self.samples * sum(m.values.shape[1] for m in data.lanes.measured.values())
         # the flown derivatives twice, those of the residuals as such and weighted
@@ -171,7 +199,7 @@ class Flier:
 
     def fly(
         self,
-        model: Model,
+        model: Tunable,
         lanes: Lanes,
         coefficients: Array,
         horizon: Array | None,
@@ -179,7 +207,7 @@ class Flier:
     ) -> Trace:
         """Simulate some lanes with a search vector (K,) up to a horizon in samples, or whole."""
         return fly(
-            with_coefficients(model, self.space.values(coefficients)),
+            model.at(coefficients),
             lanes,
             self.schedule,
             samples=self.samples,
@@ -191,7 +219,7 @@ class Flier:
     def compared(
         self,
         data: LaneData,
-        model: Model,
+        model: Tunable,
         coefficients: Array,
         horizon: Array,
         *,
@@ -220,7 +248,7 @@ class Flier:
     def sums(
         self,
         data: LaneData,
-        model: Model,
+        model: Tunable,
         coefficients: Array,
         horizon: Array,
         huber: Array,
@@ -252,7 +280,7 @@ class Flier:
         return LaneSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
 
     def jacobian(
-        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
+        self, data: LaneData, model: Tunable, coefficients: Array, horizon: Array
     ) -> Jacobian:
         """Return every residual of some lanes and its derivatives."""
         trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
@@ -260,7 +288,7 @@ class Flier:
 
     @partial(jax.jit, static_argnums=0)
     def _with_columns(
-        self, data: LaneData, model: Model, coefficients: Array, horizon: Array
+        self, data: LaneData, model: Tunable, coefficients: Array, horizon: Array
     ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
         """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 

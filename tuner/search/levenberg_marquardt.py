@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from tuner.coefficients import Space
+from tuner.coefficients import Coordinates, Space
 from tuner.objective.normal import Objective
 from tuner.objective.terms import LaneSums, Point, Stage
 
@@ -48,7 +48,11 @@ class Step(eqx.Module):
 
 
 def total(
-    space: Space, flight: ArrayLike, point: Point, stage: Stage, sums: LaneSums
+    space: Space | Coordinates,
+    flight: ArrayLike,
+    point: Point,
+    stage: Stage,
+    sums: LaneSums,
 ) -> tuple[Array, Array, Array]:
     """Return loss, gradient (P,) and Hessian (P, P) over all lanes, priors included.
 
@@ -163,7 +167,9 @@ def _begin(packed: Array, free: ArrayLike) -> Any:
 
 
 @eqx.filter_jit
-def _step(space: Space, flight: ArrayLike, before: _Before, stage: Stage, free: ArrayLike) -> Step:
+def _step(
+    space: Coordinates, flight: ArrayLike, before: _Before, stage: Stage, free: ArrayLike
+) -> Step:
     def one(point: Point, solver: Any, sums: LaneSums) -> Step:
         tried = _unpack(solver.y_eval, point)
         fn = _square_problem(*total(space, flight, tried, stage, sums), free)
@@ -212,7 +218,7 @@ def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -
     """
     tried = jax.vmap(_unpack)(jnp.asarray(before.solver.y_eval), before.point)
     after = _step(
-        objective.space,
+        objective.space.coordinates,
         np.asarray(objective.lanes.flight),
         (before.point, before.solver, objective.sums_of(on_host(tried), stage)),
         stage,
