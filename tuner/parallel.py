@@ -15,6 +15,8 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 from numpy.typing import NDArray
 
+from tuner.room import FINE, roomy
+
 _AXIS = "batch"
 _ROW = 768
 """bytes that one variable of a piece may take: some fifty then lie in a first-level cache of 32 kB.
@@ -50,7 +52,8 @@ def over_devices(
 
     The devices never wait for each other: nothing is exchanged between them, padding and joining
     happen on the host. (Reductions over a shared axis inside the compiled program would have them
-    meet, and with a single thread for all devices a meeting can wait for ever.)
+    meet, and with a single thread for all devices a meeting can wait for ever.) A batch is filled
+    up to a size that others have, too, for every size is compiled anew.
 
     Parameters
     ----------
@@ -72,7 +75,7 @@ def over_devices(
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
         size = _size(batch)
         count = min(len(jax.devices()[:devices]), size)
-        missing = -size % count
+        missing = count * roomy(-(-size // count), FINE) - size
         result = compiled(count)(_padded(batch, missing) if missing else batch, *whole)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :size], result)
 

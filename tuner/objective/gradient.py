@@ -90,6 +90,6 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
 
 def _vectors_at_once(flier: Flier, data: LaneData) -> int:
     lanes = data.lanes.count
-    one = 8 * _REMEMBERED * flier.samples * flier.schedule.blocks_per_sample * lanes
+    one = 8 * _REMEMBERED * flier.room * flier.schedule.blocks_per_sample * lanes
     memory = flier.memory // len(jax.devices())
     return max(1, min(piece_that_fits(8) // lanes, memory // one))

@@ -24,6 +24,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.errors import RecordingError
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
+from tuner.room import roomy
 
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
 
@@ -136,7 +137,7 @@ def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> 
         return _reference(flights)
     physics_rate = schedule.physics_rate
     longest = max(flight.duration for flight in flights)
-    clock = np.arange(int(np.ceil(longest * physics_rate)) + 2) / physics_rate
+    clock = np.arange(roomy(int(np.ceil(longest * physics_rate)) + 2)) / physics_rate
 
     def laid(signal: str, update_rate: float | None) -> list[jax.Array]:
         read = between if update_rate is None or sparse(flights, signal, update_rate) else held
@@ -179,7 +180,7 @@ def between(series: Series, clock: Array) -> Array:
 
 
 def _reference(flights: Sequence[Flight]) -> ReferenceInlet:
-    length = max(len(flight.time) for flight in flights)
+    length = roomy(max(len(flight.time) for flight in flights))
     columns = [_points(flight, length) for flight in flights]
     position, velocity, acceleration = (
         Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)

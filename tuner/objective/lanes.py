@@ -23,6 +23,7 @@ from tuner.objective.freedom import freedom_of
 from tuner.objective.inlets import SILENT, InletName, inlet_of, inlets_of
 from tuner.objective.noise import CHANNELS, channel_noise
 from tuner.objective.windows import windows_of
+from tuner.room import roomy
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = ("pose", "flight_controller")
@@ -296,7 +297,7 @@ def _measured(
         time = np.zeros(0) if series is None else series.time[inside]
         values = np.zeros((0, width)) if series is None else series.values[inside]
         picked.append((time, values))
-    length = max(len(time) for time, _ in picked)
+    length = roomy(max(len(time) for time, _ in picked))
     times, tables, scales = [], [], []
     for flight, (time, values) in zip(flights, picked, strict=True):
         room = length - len(time)

@@ -24,6 +24,7 @@ from tuner.objective.residuals import Trace, fly, residuals
 from tuner.objective.terms import OFFSET_UNIT, Jacobian, LaneData, LaneSums, Point, Stage
 from tuner.objective.tunable import Tunable, tunable_of
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
+from tuner.room import roomy
 
 MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed, on all devices."""
@@ -65,7 +66,7 @@ class Objective(eqx.Module):
     @property
     def flier(self) -> Flier:
         """The static half, by which compiled functions are kept."""
-        return Flier(self.schedule, self.samples, self.limits, self.memory)
+        return Flier(self.schedule, roomy(self.samples), self.limits, self.memory)
 
     @property
     def tunable(self) -> Tunable:
@@ -179,7 +180,8 @@ class Flier:
     """The static half of an objective: its methods are functions of arrays alone."""
 
     schedule: Schedule
-    samples: int
+    room: int
+    """Samples that a log has room for."""
     limits: Limits
     memory: int = MEMORY
 
@@ -191,7 +193,7 @@ class Flier:
         starts = 0 if data.states is None else len(data.states)
         columns = moving + starts if moving else 1
         recorded = sum(m.values.shape[0] * m.values.shape[1] for m in data.lanes.measured.values())
-        logged = self.samples * sum(m.values.shape[1] for m in data.lanes.measured.values())
+        logged = self.room * sum(m.values.shape[1] for m in data.lanes.measured.values())
         # the flown derivatives twice, those of the residuals as such and weighted
         one = 8 * (columns + 1) * (2 * logged + 2 * recorded)
         share = self.memory // len(jax.devices())
@@ -210,7 +212,7 @@ class Flier:
             model.at(coefficients),
             lanes,
             self.schedule,
-            samples=self.samples,
+            samples=self.room,
             horizon=horizon,
             limits=self.limits,
             states=states,
