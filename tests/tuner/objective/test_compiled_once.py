@@ -1,0 +1,70 @@
+"""Other recordings, bounds and free coefficients find the code that was compiled for the first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+
+from tests.tuner.identifiability.making import problem, stage_of
+from tuner.config import Options, settle
+from tuner.flights.flight import Series
+from tuner.job.prepare import job_of
+from tuner.objective import normal
+from tuner.objective.normal import Objective
+
+
+def program(objective: Objective) -> object:
+    """Return what compiled code belongs to: statics, structure, shapes and types."""
+    point = objective.start(objective.space.initial)
+    arguments = objective.data(point.offsets, stage_of(objective)), objective.tunable
+    leaves = [jax.typeof(np.asarray(leaf)) for leaf in jax.tree.leaves(arguments)]
+    return objective.flier, jax.tree.structure(arguments), leaves
+
+
+def shortened(flight, seconds):
+    """Return a flight without its last seconds."""
+    kept = flight.time <= flight.time[-1] - seconds
+    end = flight.time[kept][-1]
+    return replace(
+        flight,
+        time=flight.time[kept],
+        signals={name: rows[kept] for name, rows in flight.signals.items()},
+        series={
+            name: Series(one.time[one.time <= end], one.values[one.time <= end])
+            for name, one in flight.series.items()
+        },
+    )
+
+
+@pytest.mark.parametrize("free", [("inertia_zz", "mass"), ("estimate_latency", "quadratic")])
+def test_other_coefficients_and_bounds_are_the_same_program(free):
+    first = problem(("inertia_xx", "motor_constant"))
+    second = problem(free, job={"coefficients": {free[0]: {"prior": {"mean": 0.03, "sd": 0.01}}}})
+    assert program(first) == program(second)
+
+
+def test_a_flight_a_little_shorter_is_the_same_program(flight, updated):
+    settings = settle(Options(flights=(str(flight.path),), vehicle=updated))
+    jobs = [job_of(settings, (one,), ()) for one in (flight, shortened(flight, 0.4))]
+    assert jobs[0].objective.samples != jobs[1].objective.samples
+    assert program(jobs[0].objective) == program(jobs[1].objective)
+
+
+def test_columns_at_a_time_and_the_search_share_their_programs(monkeypatch):
+    """Columns three at a time are those of all at once, and the search finds its code again."""
+    fit = problem(("inertia_xx", "inertia_yy", "inertia_zz", "motor_constant", "moment_constant"))
+    point, stage = fit.start(fit.space.initial + 0.05), stage_of(fit)
+    whole = fit.jacobian(point, stage)
+    traced = []
+    forward = normal._jacobian_forward
+    monkeypatch.setattr(normal, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
+    by_three = fit.jacobian(point, stage, columns=3)
+    assert len(traced) == 1
+    fit.sums(point, stage)  # by five, as the whole was
+    assert len(traced) == 1
+    for name, columns in whole.columns.items():
+        np.testing.assert_allclose(by_three.columns[name], columns, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(by_three.residuals[name], whole.residuals[name])
