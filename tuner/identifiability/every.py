@@ -84,6 +84,7 @@ def with_space(objective: Objective, space: Space) -> Objective:
         schedule=objective.schedule,
         samples=objective.samples,
         limits=objective.limits,
+        memory=objective.memory,
     )
 
 

@@ -7,6 +7,7 @@ coefficients alone and can be added up and split at will.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,24 @@ class Evidence:
     clock_prior: Array
     prior: Array
     crashed: NDArray[np.bool_]
+
+    @staticmethod
+    def joined(parts: Sequence[Evidence]) -> Evidence:
+        """Return what flights say of which each part holds the next ones."""
+        first = parts[0]
+        before = np.cumsum([0, *(int(part.flight.max()) + 1 for part in parts)])
+        return Evidence(
+            channels=first.channels,
+            flight=np.concatenate(
+                [part.flight + begin for part, begin in zip(parts, before, strict=False)]
+            ),
+            information=np.concatenate([part.information for part in parts], axis=1),
+            score=np.concatenate([part.score for part in parts], axis=1),
+            spread=np.concatenate([part.spread for part in parts], axis=1),
+            clock_prior=np.sum([part.clock_prior for part in parts], axis=0),
+            prior=first.prior,
+            crashed=np.concatenate([part.crashed for part in parts]),
+        )
 
     @property
     def data(self) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tuner.identifiability.every import Every, every_coefficient
 from tuner.identifiability.evidence import Evidence, summed
+from tuner.identifiability.portions import portion, portions
 from tuner.identifiability.sensitivity import Sensitivity, sensitivity
 from tuner.identifiability.uncertainty import Uncertainty, judged, references
 from tuner.identifiability.whiteness import Residual, whiteness
@@ -52,36 +53,45 @@ class Examination:
 def examine(
     fitted: Fitted,
     *,
-    flights: Sequence[str] | None = None,
+    names: Sequence[str] | None = None,
     clocks: NDArray[np.bool_] | None = None,
 ) -> Examination:
     """Look at a fit, or at a point where nothing was fitted, from all sides.
+
+    Flights whose Jacobian would not fit the objective's memory take turns.
 
     Parameters
     ----------
     fitted
         A search's result.
-    flights
-        Names of the fitted flights in the order of the objective; ``fitted.scales``' by default.
+    names
+        Of the fitted flights in the order of the objective; ``fitted.scales``' by default.
     clocks
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
-    names = tuple(fitted.scales) if flights is None else tuple(flights)
+    names = tuple(fitted.scales) if names is None else tuple(names)
     every = every_coefficient(fitted.objective, fitted.point)
     objective, point, stage = every.objective, every.point, fitted.stage
-    jacobian = objective.jacobian(point, stage, columns=every.columns)
-    evidence = summed(objective, point, stage, jacobian, clocks=clocks)
     reference = references(objective.space, np.asarray(point.coefficients))
+    evidences, sensitivities = [], []
+    residuals: list[Residual] = []
+    for flights in portions(objective, point, stage):
+        some = portion(objective, point, stage, flights)
+        jacobian = some[0].jacobian(*some[1:], columns=every.columns)
+        own = [names[number] for number in flights]
+        free = None if clocks is None else clocks[:, flights]
+        evidences.append(summed(*some, jacobian, clocks=free))
+        sensitivities.append(sensitivity(*some, jacobian, reference=reference, flights=own))
+        residuals.extend(whiteness(some[0], jacobian, some[2], own))
+    evidence = Evidence.joined(evidences)
     return Examination(
         uncertainty=_judged(every, evidence, every.fitted, names),
         freed={
             name: _judged(every, evidence, (*every.fitted, name), names) for name in every.fixed
         },
         bias=_bias(every, evidence, reference),
-        sensitivity=sensitivity(
-            objective, point, stage, jacobian, reference=reference, flights=names
-        ),
-        residuals=whiteness(objective, jacobian, stage, names),
+        sensitivity=Sensitivity.joined(sensitivities),
+        residuals=tuple(residuals),
         every=every,
         evidence=evidence,
     )

@@ -205,6 +205,7 @@ def _laid_out(objective: Objective, flights: Sequence[Candidate], habits: Habits
         schedule=schedule,
         samples=round(habits.seconds * schedule.log_rate),
         limits=Limits(),
+        memory=objective.memory,
     )
 
 

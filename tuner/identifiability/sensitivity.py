@@ -94,6 +94,28 @@ class Sensitivity:
     time: Array
     acts: Array
 
+    @staticmethod
+    def joined(parts: Sequence[Sensitivity]) -> Sensitivity:
+        """Return the sensitivity of flights of which each part holds the next ones."""
+        first = parts[0]
+
+        def beside(name: str, axis: int = -1) -> Array:
+            return np.concatenate([getattr(part, name) for part in parts], axis=axis)
+
+        return Sensitivity(
+            names=first.names,
+            outputs=tuple(output for part in parts for output in part.outputs),
+            step=first.step,
+            change=beside("change"),
+            rmse_up=beside("rmse_up"),
+            rmse_down=beside("rmse_down"),
+            crashed=np.sum([part.crashed for part in parts], axis=0),
+            flights=tuple(name for part in parts for name in part.flights),
+            windowed=any(part.windowed for part in parts),
+            time=beside("time", 0),
+            acts=beside("acts", 1),
+        )
+
 
 def sensitivity(
     objective: Objective,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -14,6 +15,7 @@ from tests.tuner.identifiability import making
 from tuner.identifiability.examine import Examination, examine
 from tuner.identifiability.files import write_files
 from tuner.identifiability.knowledge import Knowledge, read_knowledge
+from tuner.identifiability.portions import portions
 from tuner.identifiability.telling import half_of_it, tell
 from tuner.objective.normal import Objective
 
@@ -35,6 +37,27 @@ def found(objective: Objective) -> Examination:
 @pytest.fixture(scope="module")
 def knowledge(objective: Objective, found: Examination) -> Knowledge:
     return tell(found, objective.space, making.truth(objective))
+
+
+def test_flights_that_do_not_fit_the_memory_take_turns(
+    objective: Objective, found: Examination
+) -> None:
+    small = replace(objective, memory=1)
+    fitted = making.fitted_of(small, making.truth(small))
+    assert [list(p) for p in portions(small, fitted.point, fitted.stage)] == [[0], [1]]
+    turns = examine(fitted)
+    assert turns.residuals[0].flight != turns.residuals[-1].flight
+    assert [r.flight for r in turns.residuals] == [r.flight for r in found.residuals]
+    for one, other in ((turns.evidence, found.evidence), (turns.sensitivity, found.sensitivity)):
+        for name, value in vars(other).items():
+            if isinstance(value, np.ndarray):
+                size = np.abs(np.nan_to_num(value)).max()
+                np.testing.assert_allclose(getattr(one, name), value, atol=1e-9 * size)
+            elif name != "outputs":
+                assert getattr(one, name) == value
+    assert [o.rmse for o in turns.sensitivity.outputs] == pytest.approx(
+        [o.rmse for o in found.sensitivity.outputs]
+    )
 
 
 def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:

@@ -52,7 +52,7 @@ def fitted() -> Fitted:
 
 @pytest.fixture(scope="module")
 def examination(fitted: Fitted) -> Examination:
-    return examine(fitted, flights=("swing",))
+    return examine(fitted, names=("swing",))
 
 
 @pytest.fixture(scope="module")
