@@ -24,7 +24,7 @@ from sim_jax.control.gains import (
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import rollout
+from sim_jax.rollout import Arrangement, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
@@ -44,7 +44,7 @@ ARM = 0.25 / sqrt(2.0)
 
 
 def _vec(x: float, y: float, z: float) -> Vec3:
-    return Vec3(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z))
+    return Vec3(jnp.asarray(float(x)), jnp.asarray(float(y)), jnp.asarray(float(z)))
 
 
 def _vehicle() -> Vehicle:
@@ -116,7 +116,13 @@ def factors(vehicles: int) -> Array:
     return spread
 
 
-def fly(factor: Array, *, samples: int, precision: Any = "float64") -> Motion:
+def fly(
+    factor: Array,
+    *,
+    samples: int,
+    precision: Any = "float64",
+    arranged: Arrangement | None = None,
+) -> Motion:
     """Fly a circle with factors (12, \\*batch) on the coefficients; return the logged motion."""
     vehicle = _vehicle()
     numbers = [value * factor[i] for i, value in enumerate(_coefficients(vehicle))]
@@ -139,5 +145,6 @@ def fly(factor: Array, *, samples: int, precision: Any = "float64") -> Motion:
         hover(vehicle, Vec3(zero, zero, zero + 1.0)),
         samples=samples,
         precision=precision,
+        arranged=arranged,
     )
     return flown.log.motion

@@ -40,6 +40,12 @@ def jacobian_of(function: Callable[[Array], Motion], factor: Array) -> Motion:
 
 flight = partial(fly, samples=SAMPLES)
 jacobian = partial(jacobian_of, flight)
+"""Of a batch that fits the cache."""
+large_jacobian = partial(
+    jacobian_of,
+    partial(flight, arranged=partial(in_pieces, piece=piece_that_fits(8, COEFFICIENTS))),
+)
+"""Of any batch: a piece of it flies from one sample to the next, then the other pieces do."""
 
 
 def gradient(factor: Array) -> Array:
@@ -54,13 +60,15 @@ def gradient(factor: Array) -> Array:
 
 
 def main(what: str) -> None:
-    columns = COEFFICIENTS if what == JACOBIAN else 1
-    # a quarter of what fits the cache going forward: reverse mode remembers more
-    lanes = piece_that_fits(8, columns) // (4 if what == GRADIENT else 1)
-    function = {FORWARD: flight, JACOBIAN: jacobian, GRADIENT: gradient}[what]
-    pieces = in_pieces(function, lanes)
+    lanes = piece_that_fits(8)
+    function = {
+        FORWARD: in_pieces(flight, lanes),
+        JACOBIAN: large_jacobian,
+        # a quarter of what fits the cache going forward: reverse mode remembers more
+        GRADIENT: in_pieces(gradient, lanes // 4),
+    }[what]
     factor = factors(FLIGHTS)
-    run = jax.jit(shared_among(pieces, len(jax.devices()))).lower(factor).compile()
+    run = jax.jit(shared_among(function, len(jax.devices()))).lower(factor).compile()
     memory = run.memory_analysis()
     assert memory is not None
     answer(

@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import tuner
+from benchmarks.case import factors, fly
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
 CHECK = """
@@ -121,3 +123,17 @@ def test_a_piece_holds_as_many_as_fit() -> None:
     assert piece_that_fits(8) == 64
     assert piece_that_fits(8, columns=12) == 8
     assert piece_that_fits(8, columns=1000) == 8
+
+
+def test_a_rollout_in_pieces_from_sample_to_sample_is_the_same_and_needs_no_memory() -> None:
+    together = partial(fly, samples=200)
+    in_turns = jax.jit(partial(together, arranged=partial(in_pieces, piece=4)))
+    some, many = factors(21), factors(64)
+    for one, other in zip(
+        jax.tree.leaves(in_turns(some)), jax.tree.leaves(together(some)), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    memory = in_turns.lower(many).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 0.1 * memory.output_size_in_bytes
+    by_flight = jax.jit(in_pieces(together, 32)).lower(many).compile().memory_analysis()
+    assert by_flight.temp_size_in_bytes > 0.4 * by_flight.output_size_in_bytes
