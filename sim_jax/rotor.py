@@ -33,8 +33,9 @@ def vehicle_wrench(
     Each rotor at r, turning with Ω, moves through the air with v = air_velocity + ω × r. It gives
     thrust motor_constant·Ω²·clip(1 - |v∥|/max_relative_airspeed, 0, 1) along body z, rotor drag
     -rotor_drag_coefficient·Ω·v⊥, drag torque -spin·moment_constant·motor_constant·Ω² and rolling
-    moment -rolling_moment_coefficient·spin·Ω·v⊥. The coefficients are the same for all, so that
-    they multiply sums over rotors.
+    moment -rolling_moment_coefficient·spin·Ω·v⊥. Torque and rolling moment are summed before their
+    coefficients multiply them, which are the same for all; forces are not, so that opposite ones
+    cancel to the last bit.
 
     Parameters
     ----------
@@ -51,24 +52,20 @@ def vehicle_wrench(
     world_up
         World z in body axes.
     """
-    at = [rotor.position for rotor in rotors]
-    x, y, z = [r.x for r in at], [r.y for r in at], [r.z for r in at]
-    spin = [rotor.spin for rotor in rotors]
-    through = [air_velocity + body_rate.cross(r) for r in at]
-    along_x = [speed * v.x for speed, v in zip(speeds, through, strict=True)]
-    along_y = [speed * v.y for speed, v in zip(speeds, through, strict=True)]
-    square = [speed * speed for speed in speeds]
-    lift = [s * _remaining(aerodynamics, v.z) for s, v in zip(square, through, strict=True)]
-
     thrust, drag = aerodynamics.motor_constant, aerodynamics.rotor_drag_coefficient
+    force = moment = Vec3.zeros(air_velocity.x)
+    square, across_x, across_y = (jnp.zeros_like(air_velocity.x) for _ in range(3))
+    for rotor, speed in zip(rotors, speeds, strict=True):
+        through = air_velocity + body_rate.cross(rotor.position)
+        along_x, along_y = speed * through.x, speed * through.y
+        lift = speed * speed * _remaining(aerodynamics, through.z)
+        own = Vec3(-drag * along_x, -drag * along_y, thrust * lift)
+        force, moment = force + own, moment + rotor.position.cross(own)
+        square = square + rotor.spin * (speed * speed)
+        across_x, across_y = across_x + rotor.spin * along_x, across_y + rotor.spin * along_y
+    torque = -thrust * aerodynamics.moment_constant * square
     rolling = aerodynamics.rolling_moment_coefficient
-    torque = -thrust * aerodynamics.moment_constant * _sum(square, spin)
-    force = Vec3(-drag * _sum(along_x), -drag * _sum(along_y), thrust * _sum(lift))
-    moment = Vec3(
-        thrust * _sum(lift, y) + drag * _sum(along_y, z) - rolling * _sum(along_x, spin),
-        -thrust * _sum(lift, x) - drag * _sum(along_x, z) - rolling * _sum(along_y, spin),
-        drag * (_sum(along_x, y) - _sum(along_y, x)),
-    )
+    moment = moment - Vec3(rolling * across_x, rolling * across_y, jnp.zeros_like(torque))
     if aerodynamics.reaction_torque == "world":
         return Wrench(force, moment + world_up * torque)
     return Wrench(force, Vec3(moment.x, moment.y, moment.z + torque))
@@ -78,15 +75,3 @@ def _remaining(aerodynamics: Aerodynamics, axial: Scalar) -> Scalar:
     """Return the share of a rotor's static thrust that is left at an axial air speed in m/s."""
     lost = jnp.abs(axial) * (1.0 / aerodynamics.max_relative_airspeed)
     return jnp.where(lost < 1.0, 1.0 - lost, 0.0)
-
-
-def _sum(values: Sequence[Scalar], weights: Sequence[Scalar | int] | None = None) -> Scalar:
-    """Return the sum over rotors, weighted by where they sit or which way they turn."""
-    first, *others = (
-        values
-        if weights is None
-        else [weight * value for weight, value in zip(weights, values, strict=True)]
-    )
-    for other in others:
-        first = first + other
-    return first
