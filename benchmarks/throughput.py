@@ -127,7 +127,7 @@ def measure() -> Section:
         f"{ROUNDS} runs in turn. For tune and the yardstick a step is one of 1 kHz physics with "
         "rate control at 250 Hz, position control and a log of 13 states at 100 Hz; those of peers "
         "hold less, as said. The jax peers run with NPROC=1, MuJoCo and the yardstick with a "
-        "thread a core, tune with a device a core.",
+        "thread a core, tune with a device a core; results stay where they were computed.",
         ["", *(f"batch {batch}" for batch in BATCHES), "settings"],
         rows,
         bars,
