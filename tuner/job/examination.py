@@ -43,7 +43,8 @@ from tuner.search.progress import beginning, stage_of, with_feedback
 ROOM = 1.0
 """m added to what the recorded flights took, to make an arena of it."""
 SHORTEST = 20.0
-"""s: the publisher takes ten to wind up."""
+"""s: the publisher takes ten to wind up. Flights are proposed of this length, or twice, four times
+as long, whichever is nearest to the recorded ones: each length is compiled anew."""
 
 
 @dataclass(frozen=True)
@@ -310,7 +311,8 @@ def propose(
         return None
     arena = arena_of(job.flights) if said is None else Arena.of(said)
     seconds = float(np.median([flight.duration for flight in job.fitted]))
-    habits = Habits(SPIN_CHANNELS, round(max(seconds, SHORTEST)))
+    doublings = max(round(float(np.log2(seconds / SHORTEST))), 0)
+    habits = Habits(SPIN_CHANNELS, round(SHORTEST * 2**doublings))
     return next_flights(examination, stage, arena=arena, habits=habits)
 
 
