@@ -116,7 +116,7 @@ def starts() -> str:
 def mass() -> str:
     """Free the mass, which scales with everything that carries or drags it."""
     settings = settings_of()
-    free = [name for name in truth() if name not in ("rolling_moment_coefficient",)]
+    free = tuple(name for name in truth() if name != "rolling_moment_coefficient")
     start = settings.vehicle.replace(mass=1.1 * settings.vehicle.mass)
     settings = replace(settings, vehicle=start, job=settings.job.model_copy(update={"free": free}))
     _, fitted, _ = solved(settings)
@@ -155,9 +155,8 @@ def noise() -> str:
         series = dict(flight.series)
         for name in ("position", "body_rate", "rotor_speed", "command"):
             one = series[name]
-            spread = np.nanstd(one.values, axis=0)
-            middle = np.nanmean(one.values, axis=0)
-            drawn = middle + spread * generator.standard_normal(one.values.shape)
+            told = np.where(np.isfinite(one.values), one.values, 0.0)
+            drawn = told.mean(axis=0) + told.std(axis=0) * generator.standard_normal(told.shape)
             series[name] = Series(one.time, np.where(np.isfinite(one.values), drawn, np.nan))
         turns = generator.standard_normal(series["attitude"].values.shape)
         turns /= np.linalg.norm(turns, axis=1, keepdims=True)
