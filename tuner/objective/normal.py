@@ -132,8 +132,8 @@ class Objective(eqx.Module):
 
 def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
     """Return as one the Jacobians by some parameters each, all followed by what flights own."""
-    first = parts[0][1]
-    if len(parts) == 1:
+    own, first = parts[0]
+    if own == count and len(parts) == 1:
         return first
     columns: dict[str, Any] = {
         name: np.concatenate([part.columns[name][:own] for own, part in parts] + [column[count:]])

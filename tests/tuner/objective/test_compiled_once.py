@@ -53,19 +53,22 @@ def test_a_flight_a_little_shorter_is_the_same_program(flight, updated):
     assert program(jobs[0].objective) == program(jobs[1].objective)
 
 
-def test_columns_at_a_time_and_the_search_share_their_programs(monkeypatch):
-    """Columns three at a time are those of all at once, and the search finds its code again."""
-    fit = problem(("inertia_xx", "inertia_yy", "inertia_zz", "motor_constant", "moment_constant"))
-    point, stage = fit.start(fit.space.initial + 0.05), stage_of(fit)
-    whole = fit.jacobian(point, stage)
+def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypatch):
+    groups = ("inertia_xx", "inertia_zz", "mass"), ("motor_constant", "moment_constant")
+    fit = problem((*groups[0], *groups[1]))
+    names, stage = list(fit.space.names), stage_of(fit)
     traced = []
     forward = normal._jacobian_forward
     monkeypatch.setattr(normal, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
-    by_three = fit.jacobian(point, stage, columns=3)
-    assert len(traced) <= 1
-    traced.clear()
-    fit.sums(point, stage)  # by five, as the whole was
-    assert not traced
-    for name, columns in whole.columns.items():
-        np.testing.assert_allclose(by_three.columns[name], columns, rtol=1e-9, atol=1e-9)
-        np.testing.assert_array_equal(by_three.residuals[name], whole.residuals[name])
+    found = fit.jacobian(fit.start(fit.space.initial), stage, columns=3)
+    for group in groups:
+        one = problem(group)
+        alone = one.jacobian(one.start(one.space.initial), stage, columns=3)
+        for channel, columns in alone.columns.items():
+            for number, name in enumerate(one.space.names):
+                np.testing.assert_allclose(
+                    found.columns[channel][names.index(name)], columns[number], rtol=1e-9, atol=1e-9
+                )
+            offsets = found.columns[channel][len(names) :]
+            np.testing.assert_allclose(offsets, columns[len(group) :], rtol=1e-9, atol=1e-9)
+    assert len(traced) <= 1  # by none, if another test was here before
