@@ -58,7 +58,7 @@ def attitude_from_acceleration(acceleration: Vec3, heading: Vec3) -> Quaternion:
     """Return the attitude of `axes_from_acceleration`, up to the sign of all four numbers.
 
     A turn to the heading, then a roll about x and a pitch about y that bring z where it belongs:
-    the product of three half turns, for a fifth of what taking it from a matrix costs.
+    the product of three quaternions with one axis each, which spares the matrix and its branches.
     """
     z_axis = _unit(acceleration, Vec3.upward(acceleration.z))
     ahead = heading.x * z_axis.x + heading.y * z_axis.y

@@ -80,7 +80,7 @@ def next_flights(
     flights = candidates(arena)
     objective = _laid_out(every.objective, flights, habits)
     point, weights = _there(every.point, stage, objective)
-    jacobian = objective.jacobian(point, weights, columns=every.columns)
+    jacobian = objective.jacobian(point, weights)
     kinds = (np.asarray(every.point.offsets) != 0.0).any(axis=1)
     clocks = np.repeat(kinds[:, None], len(flights), axis=1)
     evidence = summed(objective, point, weights, jacobian, clocks=clocks)
