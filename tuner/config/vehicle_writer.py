@@ -39,16 +39,24 @@ def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
     return commented(header) + _with_units(dump_yaml(data))
 
 
+#: Of numbers that are not fitted.
+_OTHER_UNITS = {
+    ("", "rotors"): "positions in m from the centre of mass: forward, left, up",
+    ("motor", "max_rotor_velocity"): "rad/s",
+}
+
+
 def _with_units(text: str) -> str:
-    """Put a coefficient's unit behind its line."""
+    """Put a number's unit behind its line."""
     units = {coefficient.place: coefficient.unit for coefficient in COEFFICIENTS.values()}
+    units |= _OTHER_UNITS
     section = ""
     lines = []
     for line in text.splitlines():
-        key, _, value = line.partition(":")
+        key = line.partition(":")[0]
         inside = line.startswith("  ")
         if not inside:
             section = key
         unit = units.get((section if inside else "", key.strip()))
-        lines.append(f"{line + '  ':<{UNIT_COLUMN}}# {unit}" if unit and value else line)
+        lines.append(f"{line + '  ':<{UNIT_COLUMN}}# {unit}" if unit else line)
     return "\n".join(lines) + "\n"

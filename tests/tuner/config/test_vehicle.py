@@ -88,6 +88,8 @@ def test_the_unit_stands_beside_each_coefficient(tmp_path):
     write_vehicle(read_vehicle(ORIGINAL), tmp_path / "v.yaml")
     lines = (tmp_path / "v.yaml").read_text().splitlines()
     assert any(line.startswith("mass: 2.079") and line.endswith("# kg") for line in lines)
+    assert any("max_rotor_velocity: " in line and line.endswith("# rad/s") for line in lines)
+    assert any(line.startswith("rotors: ") and "# positions in m" in line for line in lines)
     assert any(
         line.startswith("  motor_constant: 8.55e-06") and line.endswith("# N s²/rad²")
         for line in lines
