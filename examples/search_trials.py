@@ -28,12 +28,12 @@ configure()
 from tuner.comparison.compare import flights_of  # noqa: E402 (jax is configured first)
 from tuner.config import Options, Settings, settle, with_values  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
-from tuner.identifiability import uncertainty  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
 from tuner.job.results import validate, vehicle_fitted  # noqa: E402
 from tuner.job.search import search  # noqa: E402
-from tuner.objective.terms import OFFSET_UNIT  # noqa: E402
+from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.search.fitted import Fitted  # noqa: E402
+from tuner.uncertainty import uncertainty  # noqa: E402
 
 FOLDER = Path(__file__).parents[1] / "reference_flights"
 TIMES = ("time_constant_up", "time_constant_down", "estimate_latency", "actuator_latency")

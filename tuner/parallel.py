@@ -15,7 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 from numpy.typing import NDArray
 
-from tuner.room import FINE, roomy
+from tuner.padding import FINE, padded_size
 
 _AXIS = "batch"
 _ROW = 768
@@ -75,7 +75,7 @@ def over_devices(
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
         size = _size(batch)
         count = min(len(jax.devices()[:devices]), size)
-        missing = count * roomy(-(-size // count), FINE) - size
+        missing = count * padded_size(-(-size // count), FINE) - size
         result = compiled(count)(_padded(batch, missing) if missing else batch, *whole)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :size], result)
 
@@ -186,5 +186,5 @@ def piece_that_fits(itemsize: int, columns: int = 1) -> int:
     columns
         Numbers that each variable holds for one member: those of a Jacobian's columns.
     """
-    lanes = max(_FEWEST, _ROW // (itemsize * columns))
-    return 1 << (lanes.bit_length() - 1)
+    segments = max(_FEWEST, _ROW // (itemsize * columns))
+    return 1 << (segments.bit_length() - 1)

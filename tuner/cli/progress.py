@@ -140,7 +140,7 @@ def _errors(result: RunResult) -> Table:
 
 
 def _folds(folds: Sequence[Fold]) -> Table:
-    table = Table(box=None, title="Each flight foretold by the others", title_justify="left")
+    table = Table(box=None, title="Each flight predicted by the others", title_justify="left")
     table.add_column("left out")
     for axis in AXES:
         unit = "m" if axis in ("x", "y", "z") else "deg"

@@ -64,7 +64,7 @@ def tune(
     force
         Search although the check before it failed.
     cross_validate
-        Also leave each fitted flight out in turn, and tabulate how the others foretell it.
+        Also leave each fitted flight out in turn, and tabulate how the others predict it.
     seed
         Of everything random.
     """

@@ -15,7 +15,7 @@ from sim_jax.rollout import rollout
 from tuner.config import ControllerFile, VehicleFile
 from tuner.flights.flight import Array, Flight
 from tuner.model import model_of, schedule_of
-from tuner.objective.lanes import lanes_of
+from tuner.objective.segments import segments_of
 from tuner.result import AxesRmse
 from tuner.simulation.table import roll_pitch_yaw
 
@@ -121,8 +121,8 @@ class Comparison:
         self._flights = tuple(flights)
         self._controller = controller
         self._offsets = dict(time_offsets or {})
-        lanes = lanes_of(flights, noise={})
-        self._inlet, self._start = lanes.inlet, lanes.start
+        segments = segments_of(flights, noise={})
+        self._inlet, self._start = segments.inlet, segments.start
         self._schedule = schedule_of(controller)
         longest = max(flight.duration for flight in flights)
         self._samples = math.ceil(longest * self._schedule.log_rate) + 2
@@ -147,12 +147,12 @@ class Comparison:
         return {
             flight.name: simulated_minus_recorded(
                 flight,
-                (position[..., lane], attitude[..., lane]),
+                (position[..., segment], attitude[..., segment]),
                 rate=self._schedule.log_rate,
                 late=self._offsets.get(flight.name, 0.0),
-                crash_time=float(crashes[lane]),
+                crash_time=float(crashes[segment]),
             )
-            for lane, flight in enumerate(self._flights)
+            for segment, flight in enumerate(self._flights)
         }
 
 

@@ -20,13 +20,13 @@ from tuner.comparison.errors import FlightErrors, joined, laps_of, simulated_min
 from tuner.config import ControllerFile, VehicleFile
 from tuner.flights.flight import Array, Flight
 from tuner.model import model_of, schedule_of
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.inlets import InletName
-from tuner.objective.lanes import CLOCKS, noise_of, window_lanes
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Trace
-from tuner.objective.terms import Point, Stage
+from tuner.objective.segments import CLOCKS, noise_of, window_segments
 from tuner.objective.windows import windows_of
-from tuner.search.growing import FAR
+from tuner.search.continuation import FAR
 
 
 class WindowComparison:
@@ -59,7 +59,7 @@ class WindowComparison:
         self._offsets = dict(time_offsets or {})
         self._schedule = schedule_of(controller)
         self._windows = [windows_of(flight, seconds) for flight in flights]
-        self._lanes = window_lanes(
+        self._segments = window_segments(
             flights,
             inlets=[inlet] * len(flights),
             seconds=seconds,
@@ -73,7 +73,7 @@ class WindowComparison:
         """Return flight name to its errors with a vehicle, all windows behind each other."""
         objective = Objective(
             model=model_of(vehicle, self._controller),
-            lanes=self._lanes,
+            segments=self._segments,
             space=_NOTHING,
             schedule=self._schedule,
             samples=self._samples,
@@ -82,45 +82,45 @@ class WindowComparison:
         point = objective.start(np.zeros(0))
         flown = self._flown(objective, point, self._starts(objective, point))
         position, attitude = (np.asarray(flown.channels[name]) for name in ("position", "attitude"))
-        found, lane = {}, 0
+        found, segment = {}, 0
         for flight, windows in zip(self._flights, self._windows, strict=True):
             parts = []
             for window in windows:
                 errors = simulated_minus_recorded(
                     window.flight,
-                    (position[..., lane], attitude[..., lane]),
+                    (position[..., segment], attitude[..., segment]),
                     rate=self._schedule.log_rate,
                     late=self._offsets.get(flight.name, 0.0),
                     crash_time=math.inf,
                 )
                 inside = errors.between(0.0, window.flight.duration)
                 parts.append(inside.later(window.begin))
-                lane += 1
+                segment += 1
             found[flight.name] = joined(flight.name, parts, laps_of(flight))
         return found
 
     def _starts(self, objective: Objective, point: Point) -> Array:
-        """Return the likeliest starts (L, F), in the lanes' standard deviations."""
-        assert self._lanes.freedom is not None
-        states = np.zeros(self._lanes.freedom.shape)
+        """Return the likeliest starts (L, F), in the segments' standard deviations."""
+        assert self._segments.freedom is not None
+        states = np.zeros(self._segments.freedom.shape)
         flights = len(self._flights)
         for _ in range(ROUNDS):
-            stage = Stage(
+            criterion = Criterion(
                 horizon=jnp.asarray(self._samples),
-                scale={name: jnp.full(flights, LOOSE) for name in self._lanes.measured},
+                scale={name: jnp.full(flights, LOOSE) for name in self._segments.measured},
                 held=jnp.zeros((len(CLOCKS), flights)),
                 huber=jnp.asarray(jnp.inf),
                 prior=jnp.asarray(1.0),
                 states=jnp.asarray(states),
             )
-            asked = np.asarray(objective.sums(point, stage, derivatives=False).states)
+            asked = np.asarray(objective.sums(point, criterion, derivatives=False).states)
             states = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
         return states
 
     def _flown(self, objective: Objective, point: Point, states: Array) -> Trace:
         horizon = jnp.asarray(self._samples)
         trace: Trace = eqx.filter_jit(objective.flier.fly)(
-            objective.tunable, self._lanes, point.coefficients, horizon, jnp.asarray(states)
+            objective.tunable, self._segments, point.coefficients, horizon, jnp.asarray(states)
         )
         return trace
 

@@ -11,8 +11,8 @@ from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.inlets import NEEDS, sparse
 from tuner.search.fitted import Finding
-from tuner.search.legs import Leg
-from tuner.search.progress import beginning, point_of, stage_of
+from tuner.search.progress import beginning, criterion_of, point_of
+from tuner.search.stages import Stage
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""
@@ -179,10 +179,10 @@ def information(job: Job) -> NDArray[np.float64]:
     objective = job.objective
     rate = float(objective.schedule.log_rate)
     horizon = min(round(HORIZON * rate), objective.samples)
-    leg = Leg("check", horizon, 1.0, False, False, 1, 1.0, False, False)
+    stage = Stage("check", horizon, 1.0, False, False, 1, 1.0, False, False)
     start = beginning(objective, job.space.initial[None])
-    stage = stage_of(leg, start.scales, np.asarray(start.points.offsets[0]), start.states)
-    sums = objective.sums(point_of(start.points, 0), stage)
+    criterion = criterion_of(stage, start.scales, np.asarray(start.points.offsets[0]), start.states)
+    sums = objective.sums(point_of(start.points, 0), criterion)
     count = len(job.space)
     hessian = np.asarray(sums.hessian).sum(axis=-1)[:count, :count]
     slope = job.space.slope(job.space.initial)

@@ -12,7 +12,7 @@ import numpy as np
 
 from tuner.errors import InputError
 from tuner.job.prepare import Job
-from tuner.objective.terms import Point
+from tuner.objective.criterion import Point
 from tuner.search.fitted import Iteration
 from tuner.search.progress import Progress
 
@@ -30,11 +30,11 @@ def fingerprint(job: Job) -> str:
 
 
 def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
-    """Write a checkpoint that appears whole: the leg under way begins again when resumed."""
+    """Write a checkpoint that appears whole: the stage under way begins again when resumed."""
     done = len(progress.iterations) - len(progress.trail)
     head = {
         "key": key,
-        "leg": progress.leg,
+        "stage": progress.stage,
         "evaluations": progress.evaluations - len(progress.trail),
         "feedback": progress.feedback,
         "seconds": seconds,
@@ -72,7 +72,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
                 raise InputError(path, "belongs to other flights or settings", "leave --resume out")
             progress = replace(
                 fresh,
-                leg=head["leg"],
+                stage=head["stage"],
                 points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
                 scales=dict(zip(head["channels"], data["scales"], strict=True)),
                 losses=data["losses"],

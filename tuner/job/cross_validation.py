@@ -1,4 +1,4 @@
-"""Each fitted flight left out in turn: how well the others foretell it, and what they agree on."""
+"""Each fitted flight left out in turn: how well the others predict it, and what they agree on."""
 
 from __future__ import annotations
 
@@ -89,11 +89,11 @@ def cross_validate(
 
 def _without(objective: Objective, flight: int) -> Objective:
     """Return an objective to which one flight contributes nothing."""
-    others = jnp.asarray(objective.lanes.flight) != flight
+    others = jnp.asarray(objective.segments.flight) != flight
     changed: Objective = eqx.tree_at(
-        lambda o: [measured.weight for measured in o.lanes.measured.values()],
+        lambda o: [measured.weight for measured in o.segments.measured.values()],
         objective,
-        [measured.weight * others for measured in objective.lanes.measured.values()],
+        [measured.weight * others for measured in objective.segments.measured.values()],
     )
     return changed
 

@@ -14,31 +14,31 @@ from tuner.comparison.compare import flights_of, offset_of
 from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
 from tuner.config import Options, Settings, check_names, settle, values_of
+from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
+from tuner.design.next_flight import Habits, next_flights
+from tuner.design.proposals import Proposals, write_proposals
 from tuner.errors import InputError
+from tuner.examination.examine import Examination, examine
+from tuner.examination.files import write_files
+from tuner.examination.knowledge import Knowledge
+from tuner.examination.summary import tell as told_of
 from tuner.flights.flight import Flight
-from tuner.identifiability.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
-from tuner.identifiability.examine import Examination, examine
-from tuner.identifiability.files import write_files
-from tuner.identifiability.global_indices import Method, write_global
-from tuner.identifiability.knowledge import Knowledge
-from tuner.identifiability.next_flight import Habits, next_flights
-from tuner.identifiability.profile import profile
-from tuner.identifiability.profiles import write_profiles
-from tuner.identifiability.proposals import Proposals, write_proposals
-from tuner.identifiability.telling import tell as told_of
-from tuner.identifiability.whole_range import whole_range
-from tuner.job.noticed import UNMATCHED
+from tuner.job.findings import UNMATCHED
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
 from tuner.job.results import controller_flown, versions
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.terms import Point, Stage
 from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
+from tuner.search.continuation import FEEDBACK_GAIN
 from tuner.search.fitted import Finding, Fitted
-from tuner.search.growing import FEEDBACK_GAIN
-from tuner.search.legs import WHOLE, schedule_of
-from tuner.search.progress import beginning, stage_of, with_feedback
+from tuner.search.progress import beginning, criterion_of, with_feedback
+from tuner.search.stages import WHOLE, schedule_of
+from tuner.sensitivity.global_files import Method, write_global
+from tuner.sensitivity.global_indices import whole_range
+from tuner.uncertainty.profile import profile
+from tuner.uncertainty.profile_files import write_profiles
 
 ROOM = 1.0
 """m added to what the recorded flights took, to make an arena of it."""
@@ -148,7 +148,7 @@ def _on_request(
         found = whole_range(
             fitted.objective,
             fitted.point,
-            fitted.stage,
+            fitted.criterion,
             method=request.whole_range,
             flights=[flight.name for flight in job.fitted],
             bounds=range_of(job, examination, request.span),
@@ -159,7 +159,7 @@ def _on_request(
     profiles = []
     for name in request.profiles:
         say(f"fitting the others again for each value of {name}")
-        profiles.append(profile(examination, fitted.stage, name))
+        profiles.append(profile(examination, fitted.criterion, name))
     if profiles:
         write_profiles(profiles, folder)
 
@@ -202,7 +202,7 @@ def write_examination(
     knowledge = told_of(examination, job.space, fitted.point)
     write_files(knowledge, folder)
     once_known()
-    proposals = propose(job, examination, fitted.stage, arena)
+    proposals = propose(job, examination, fitted.criterion, arena)
     if proposals is not None:
         write_proposals(proposals, folder)
     return knowledge, proposals
@@ -227,7 +227,7 @@ def as_it_is(job: Job) -> Fitted:
     return Fitted(
         objective=met.objective,
         point=met.point,
-        stage=met.stage,
+        criterion=met.criterion,
         noise=job.noise,
         scales={
             name: {channel: float(one[i]) for channel, one in met.scale.items()}
@@ -252,7 +252,7 @@ class _Met:
 
     objective: Objective
     point: Point
-    stage: Stage
+    criterion: Criterion
     scale: dict[str, NDArray[np.float64]]
     loss: float
 
@@ -261,23 +261,23 @@ def _met(objective: Objective, vector: NDArray[np.float64]) -> _Met:
     """Return a problem whose noise is scaled to the residuals where these are larger."""
     rate = float(objective.schedule.log_rate)
     (*_, whole) = (
-        leg
-        for leg in schedule_of(objective.samples, rate, robust=False, steps=1)
-        if leg.name == WHOLE
+        stage
+        for stage in schedule_of(objective.samples, rate, robust=False, steps=1)
+        if stage.name == WHOLE
     )
     fresh, point = beginning(objective, vector[None]), objective.start(vector)
     offsets = np.asarray(point.offsets)
     sums = objective.sums(
-        point, stage_of(whole, fresh.scales, offsets, fresh.states), derivatives=False
+        point, criterion_of(whole, fresh.scales, offsets, fresh.states), derivatives=False
     )
-    flight = np.asarray(objective.lanes.flight)
+    flight = np.asarray(objective.segments.flight)
     scale = {}
     for name, squares in sums.squares.items():
         total = np.bincount(flight, np.asarray(squares), minlength=objective.flights)
         count = np.bincount(flight, np.asarray(sums.counts[name]), minlength=objective.flights)
         scale[name] = np.maximum(np.sqrt(total / np.maximum(count, 1.0)), 1.0)
-    stage = stage_of(whole, scale, offsets, fresh.states)
-    return _Met(objective, point, stage, scale, float(np.sum(np.asarray(sums.loss))))
+    criterion = criterion_of(whole, scale, offsets, fresh.states)
+    return _Met(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
 
 
 def _findings(
@@ -304,16 +304,16 @@ def _findings(
 
 
 def propose(
-    job: Job, examination: Examination, stage: Stage, said: Sequence[float] | None = None
+    job: Job, examination: Examination, criterion: Criterion, said: Sequence[float] | None = None
 ) -> Proposals | None:
     """Return what to fly next; None where the controllers that flew are not simulated."""
-    if not isinstance(examination.every.objective.lanes.inlet, ReferenceInlet):
+    if not isinstance(examination.all_free.objective.segments.inlet, ReferenceInlet):
         return None
     arena = arena_of(job.flights) if said is None else Arena.of(said)
     seconds = float(np.median([flight.duration for flight in job.fitted]))
     doublings = max(round(float(np.log2(seconds / SHORTEST))), 0)
     habits = Habits(SPIN_CHANNELS, round(SHORTEST * 2**doublings))
-    return next_flights(examination, stage, arena=arena, habits=habits)
+    return next_flights(examination, criterion, arena=arena, habits=habits)
 
 
 def arena_of(flights: Sequence[Flight]) -> Arena:

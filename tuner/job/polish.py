@@ -1,4 +1,4 @@
-"""The last legs of a search once more, from where it ended, with something changed."""
+"""The last stages of a search once more, from where it ended, with something changed."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.job.prepare import Job
-from tuner.objective.terms import Point
+from tuner.objective.criterion import Point
+from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted
-from tuner.search.growing import grow
-from tuner.search.legs import plan
-from tuner.search.progress import Free, Progress, point_of, stage_of
+from tuner.search.progress import Free, Progress, criterion_of, point_of
+from tuner.search.stages import plan
 
 
 def polished(
@@ -35,7 +35,7 @@ def polished(
     free
         What may move.
     title
-        For people, before the legs' names.
+        For people, before the stages' names.
     tell
         Called after every iteration.
     """
@@ -44,34 +44,34 @@ def polished(
         "gradient",
         objective.samples,
         float(objective.schedule.log_rate),
-        windows=objective.lanes.freedom is not None,
+        windows=objective.segments.freedom is not None,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
-    legs = tuple(replace(leg, name=f"{title}, {leg.name}") for leg in (first, last))
+    stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in (first, last))
     names = [flight.name for flight in job.fitted]
     progress = Progress(
-        leg=0,
+        stage=0,
         points=Point(
             jnp.asarray(fitted.point.coefficients)[None], jnp.asarray(fitted.point.offsets)[None]
         ),
         scales={
             channel: np.array([fitted.scales[name][channel] for name in names])
-            for channel in objective.lanes.measured
+            for channel in objective.segments.measured
         },
-        states=None if fitted.stage.states is None else np.asarray(fitted.stage.states),
+        states=None if fitted.criterion.states is None else np.asarray(fitted.criterion.states),
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
         feedback=float(objective.model.controller.rate.saturation_feedback),
     )
-    for reached in grow(objective, legs, progress, free=free, clipped=False, tell=tell):
+    for reached in grow(objective, stages, progress, free=free, clipped=False, tell=tell):
         progress = reached
     point = point_of(progress.points, 0)
     return replace(
         fitted,
         point=point,
-        stage=stage_of(last, progress.scales, np.asarray(point.offsets), progress.states),
+        criterion=criterion_of(last, progress.scales, np.asarray(point.offsets), progress.states),
         scales={
             name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
             for i, name in enumerate(names)

@@ -1,4 +1,4 @@
-"""From settled options to the problem that is searched: flights read, noise told, lanes laid."""
+"""From settled options to the problem that is searched: flights read, noise told, segments laid."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.inlets import InletName, inlet_for
-from tuner.objective.lanes import Lanes, begins_gently, lanes_of, noise_of, window_lanes
 from tuner.objective.noise import CHANNELS
 from tuner.objective.normal import Objective
+from tuner.objective.segments import Segments, begins_gently, noise_of, segments_of, window_segments
 
 #: What a yaw spin is compared by: nothing holds its position, so that a gust or a tilt of a
 #: hundredth of a degree moves it by metres without meaning anything.
@@ -107,13 +107,13 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
 
-    def problem(lanes: Lanes, seconds: float, limits: Limits) -> Objective:
+    def problem(segments: Segments, seconds: float, limits: Limits) -> Objective:
         samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
-        return Objective(model, lanes, space, schedule, samples, limits)
+        return Objective(model, segments, space, schedule, samples, limits)
 
     windows = None
     if not closed or not all(begins_gently(flight) for flight in fitted):
-        lanes = window_lanes(
+        segments = window_segments(
             on_time,
             inlets=inlets,
             seconds=job.search.window,
@@ -122,9 +122,11 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
             noise=noise,
             weights=_weights(settings, fitted, whole=False),
         )
-        windows = problem(lanes, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE)
+        windows = problem(
+            segments, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE
+        )
     if closed:
-        whole = lanes_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
+        whole = segments_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
         objective = problem(whole, longest, limits_of(fitted))
         return Job(settings, fitted, held_out, noise, space, inlets, objective, windows)
     assert windows is not None

@@ -24,12 +24,10 @@ from tuner.config import (
 )
 from tuner.config.yaml_file import write_text
 from tuner.flights.flight import Flight
-from tuner.identifiability import Uncertainty
-from tuner.identifiability.uncertainty import Estimate
 from tuner.job.prepare import Job, given_offset
-from tuner.objective.freedom import STATES
-from tuner.objective.lanes import CLOCKS, OFFSETS
-from tuner.objective.terms import OFFSET_UNIT
+from tuner.objective.criterion import OFFSET_UNIT
+from tuner.objective.initial_conditions import STATES
+from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.result import (
     BEST_FIT_FILE,
     SCHEMA_VERSION,
@@ -41,6 +39,8 @@ from tuner.result import (
     write_result,
 )
 from tuner.search.fitted import Fitted
+from tuner.uncertainty import Uncertainty
+from tuner.uncertainty.estimates import Estimate
 
 INERTIA = ("inertia_xx", "inertia_yy", "inertia_zz")
 METRICS_FILE = "metrics.csv"
@@ -111,7 +111,7 @@ def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
 
     Name of `STATES` -> in its unit there: how much was given to nuisances, not to coefficients.
     """
-    freedom, states = fitted.objective.lanes.freedom, fitted.stage.states
+    freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
     if freedom is None or states is None:
         return {}
     moved, found, first = np.asarray(states) * np.asarray(freedom), dict[str, JsonValue](), 0
@@ -190,7 +190,7 @@ def _coefficients(
         start.setdefault("gyro_cutoff", float(cutoff))
     best = best_values(job, fitted)
     raw, kept = job.space.values(fitted.point.coefficients), impossible(job, fitted)
-    untold = {
+    undetermined = {
         name: fitted.held[parameter.name]
         for parameter in job.space.parameters
         if parameter.name in fitted.held
@@ -220,12 +220,12 @@ def _coefficients(
             upper=high,
             std_error=_finite(estimate.std_error),
             ci95=_interval(estimate.ci95),
-            identifiable=estimate.identifiable and name not in kept and name not in untold,
+            identifiable=estimate.identifiable and name not in kept and name not in undetermined,
             note=(
                 f"kept as given: fitted to {float(raw[name]):.4g}, which with the other moments no "
                 "rigid body has"
                 if name in kept
-                else _note(name, estimate, untold.get(name))
+                else _note(name, estimate, undetermined.get(name))
             ),
         )
     return found
@@ -234,12 +234,12 @@ def _coefficients(
 def _note(name: str, estimate: Estimate, held: str | None) -> str:
     if held is None:
         return f"{estimate.verdict.value}: {estimate.reason}"
-    untold = f"not identifiable: {estimate.reason}"
+    undetermined = f"not identifiable: {estimate.reason}"
     if estimate.identifiable:
-        untold = "not identifiable with all others free"
+        undetermined = "not identifiable with all others free"
     if held == name:
-        return f"{untold}; kept as given"
-    return f"{untold}; the value goes with {held} as given"
+        return f"{undetermined}; kept as given"
+    return f"{undetermined}; the value goes with {held} as given"
 
 
 def _finite(value: float) -> float | None:

@@ -96,8 +96,8 @@ def run(
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
     from tuner.job.examination import write_examination  # noqa: PLC0415
-    from tuner.job.hold import with_the_untold_held  # noqa: PLC0415
-    from tuner.job.noticed import surer_than_steps  # noqa: PLC0415
+    from tuner.job.findings import surer_than_steps  # noqa: PLC0415
+    from tuner.job.holding import with_undetermined_held  # noqa: PLC0415
     from tuner.job.prepare import prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
         result_of,
@@ -107,7 +107,7 @@ def run(
     )
     from tuner.job.search import search  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
-    from tuner.report.aside import Aside  # noqa: PLC0415
+    from tuner.report.background import BackgroundDrawing  # noqa: PLC0415
 
     settings = settle(options)
     listener.settled(settings)
@@ -122,9 +122,9 @@ def run(
     except KeyboardInterrupt:
         listener.message(f"the best so far is in {folder}; go on with --out {folder} --resume")
         raise
-    aside = Aside()
+    background = BackgroundDrawing()
     listener.message("telling how far each coefficient can be trusted")
-    fitted, examination = with_the_untold_held(job, fitted, keep, listener.message)
+    fitted, examination = with_undetermined_held(job, fitted, keep, listener.message)
     uncertainty = examination.uncertainty
     fitted = replace(fitted, findings=(*fitted.findings, *surer_than_steps(uncertainty)))
     vehicle = vehicle_fitted(job, fitted)
@@ -139,8 +139,8 @@ def run(
     if cross_validated:
         listener.folds(cross_validate(job, fitted, folder, _teller(listener)))
     listener.message("simulating what could be flown next")
-    write_examination(folder, job, examination, fitted, once_known=lambda: aside.begin(folder))
-    render(folder, drawn=aside.drawn)
+    write_examination(folder, job, examination, fitted, once_known=lambda: background.begin(folder))
+    render(folder, drawn=background.drawn)
     for line in export_as_asked(
         folder, settings.job.export, refly=refly, today=datetime.date.today()
     ):

@@ -12,24 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.job.checkpoint import fingerprint, load, save
-from tuner.job.noticed import noticed, offsets_found, unmatched
+from tuner.job.findings import noticed, offsets_found, unmatched
 from tuner.job.prepare import Job, given_offset
 from tuner.job.starts import starting_vectors
-from tuner.objective.lanes import CLOCKS, OFFSETS
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.terms import OFFSET_UNIT, Point, Stage
+from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.search.continuation import grow
 from tuner.search.fitted import Finding, Fitted, Outcome
-from tuner.search.growing import grow
-from tuner.search.legs import Leg, left, plan
 from tuner.search.levenberg_marquardt import total
 from tuner.search.progress import (
     Free,
     Progress,
     beginning,
+    criterion_of,
     point_of,
-    stage_of,
     with_feedback,
 )
+from tuner.search.stages import Stage, left, plan
 
 CHECKPOINT = "checkpoint.npz"
 SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
@@ -118,18 +118,18 @@ def _run(
 ) -> Fitted:
     """Run one method from the starts, or from where its checkpoint stands."""
     objective, settings = job.objective, job.settings.job.search
-    legs = plan(
+    stages = plan(
         method,
         objective.samples,
         float(objective.schedule.log_rate),
-        windows=objective.lanes.freedom is not None,
+        windows=objective.segments.freedom is not None,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
     starts = starting_vectors(job)
     free = Free(np.ones(len(job.space), bool), free_offsets(job))
     if job.windows is not None:
-        legs = tuple(leg for leg in legs if leg.horizon == objective.samples)
+        stages = tuple(stage for stage in stages if stage.horizon == objective.samples)
     progress, spent = beginning(objective, starts), 0.0
     key = fingerprint(job)
     if resume:
@@ -139,24 +139,26 @@ def _run(
     def keep(now: Progress) -> None:
         seconds = spent + time.perf_counter() - clock
         save(checkpoint, key, now, seconds)
-        tell(job, replace(now, left=left(legs, now.leg, len(now.trail), seconds)))
+        tell(job, replace(now, left=left(stages, now.stage, len(now.trail), seconds)))
 
     if job.windows is not None and not resume:
         progress = beginning(objective, _through_windows(job, starts, free))
     for reached in grow(
-        objective, legs, progress, free=free, clipped=job.clipped, tell=keep, seed=settings.seed
+        objective, stages, progress, free=free, clipped=job.clipped, tell=keep, seed=settings.seed
     ):
         progress = reached
     save(checkpoint, key, progress, spent + time.perf_counter() - clock)
     spent += time.perf_counter() - clock
-    return _fitted(job, legs[-1], progress, starts, method=method, seconds=spent, findings=findings)
+    return _fitted(
+        job, stages[-1], progress, starts, method=method, seconds=spent, findings=findings
+    )
 
 
 def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArray[np.float64]:
     """Return where windows lead each start (S, K), for flights that do not begin gently."""
     objective, settings = job.windows, job.settings.job.search
     assert objective is not None
-    legs = plan(
+    stages = plan(
         "gradient",
         objective.samples,
         float(objective.schedule.log_rate),
@@ -166,7 +168,7 @@ def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArr
     )
     progress = beginning(objective, starts)
     for reached in grow(
-        objective, legs[:-1], progress, free=free, clipped=False, tell=lambda _: None
+        objective, stages[:-1], progress, free=free, clipped=False, tell=lambda _: None
     ):
         progress = reached
     return np.asarray(progress.points.coefficients)
@@ -188,7 +190,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
 
 def _fitted(
     job: Job,
-    leg: Leg,
+    stage: Stage,
     progress: Progress,
     starts: NDArray[np.float64],
     *,
@@ -199,7 +201,7 @@ def _fitted(
     best = int(np.argmin(progress.losses))
     point = point_of(progress.points, best)
     objective = with_feedback(job.objective, progress.feedback)
-    stage = stage_of(leg, progress.scales, np.asarray(point.offsets), progress.states)
+    criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
     vectors = np.asarray(progress.points.coefficients)
     outcomes = tuple(
         Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
@@ -213,7 +215,7 @@ def _fitted(
     return Fitted(
         objective=objective,
         point=point,
-        stage=stage,
+        criterion=criterion,
         noise=job.noise,
         scales=scales,
         iterations=progress.iterations,
@@ -221,7 +223,7 @@ def _fitted(
         method=method,
         evaluations=progress.evaluations,
         wall_time=seconds,
-        loss_initial=_loss_at(objective, objective.start(starts[0]), stage),
+        loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
         loss_best=float(progress.losses[best]),
         converged=progress.converged,
         message="the last steps gained nothing" if progress.converged else "stopped at its limit",
@@ -237,10 +239,12 @@ def _origin(number: int) -> str:
     return "vehicle file" if number == 0 else "random"
 
 
-def _loss_at(objective: Objective, point: Point, stage: Stage) -> float:
+def _loss_at(objective: Objective, point: Point, criterion: Criterion) -> float:
     """Return the loss at a point, as the search counts it."""
-    flight = np.asarray(objective.lanes.flight)
-    return float(total(objective.space, flight, point, stage, objective.sums(point, stage))[0])
+    flight = np.asarray(objective.segments.flight)
+    return float(
+        total(objective.space, flight, point, criterion, objective.sums(point, criterion))[0]
+    )
 
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:

@@ -13,8 +13,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from tuner.objective.criterion import Criterion, Point, SegmentData
 from tuner.objective.normal import Flier, Objective, robust_loss
-from tuner.objective.terms import LaneData, Point, Stage
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -32,7 +32,7 @@ class Batch(eqx.Module):
     squares
         Channel -> (S, k, F) plain sum of squares in unscaled standard deviations.
     crash_time
-        (S, F) s, infinite for a lane that flew.
+        (S, F) s, infinite for a segment that flew.
     """
 
     loss: Float[Array, "S F"]
@@ -41,13 +41,13 @@ class Batch(eqx.Module):
 
 
 def evaluate(
-    objective: Objective, vectors: NDArray[np.float64], point: Point, stage: Stage
+    objective: Objective, vectors: NDArray[np.float64], point: Point, criterion: Criterion
 ) -> Batch:
-    """Fly all lanes with every vector, in chunks of one compiled shape.
+    """Fly all segments with every vector, in chunks of one compiled shape.
 
     Parameters
     ----------
-    objective, stage
+    objective, criterion
         The problem.
     vectors
         (S, K) search vectors.
@@ -60,11 +60,11 @@ def evaluate(
         chunk = vectors[first : first + CHUNK]
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
         found = flown(
-            objective.data(point.offsets, stage),
+            objective.data(point.offsets, criterion),
             objective.tunable,
             padded,
-            np.asarray(stage.horizon),
-            np.asarray(stage.huber),
+            np.asarray(criterion.horizon),
+            np.asarray(criterion.huber),
         )
         parts.append(_first(found, len(chunk)))
     joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
@@ -78,8 +78,8 @@ def _first(batch: Batch, count: int) -> Batch:
 
 @lru_cache(maxsize=16)
 def _shared(flier: Flier) -> Callable[..., Batch]:
-    def lanewise(
-        data: LaneData, model: Tunable, vectors: Array, horizon: Array, huber: Array
+    def segmentwise(
+        data: SegmentData, model: Tunable, vectors: Array, horizon: Array, huber: Array
     ) -> Batch:
         def one(vector: Array) -> Batch:
             trace, errors = flier.compared(data, model, vector, horizon)
@@ -90,4 +90,4 @@ def _shared(flier: Flier) -> Callable[..., Batch]:
         found: Batch = jax.vmap(one)(vectors)
         return found
 
-    return over_devices(in_pieces(lanewise, max(1, piece_that_fits(8) // CHUNK)))
+    return over_devices(in_pieces(segmentwise, max(1, piece_that_fits(8) // CHUNK)))

@@ -18,8 +18,8 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from tuner.objective.criterion import Criterion, Point, SegmentData
 from tuner.objective.normal import Flier, Objective, robust_loss
-from tuner.objective.terms import LaneData, Point, Stage
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -33,7 +33,7 @@ class Gradients(eqx.Module):
     Attributes
     ----------
     loss
-        (S,) half the robust sum of squares of all lanes, priors not included.
+        (S,) half the robust sum of squares of all segments, priors not included.
     gradient
         (K, S) by the search vector.
     """
@@ -43,7 +43,7 @@ class Gradients(eqx.Module):
 
 
 def gradients(
-    objective: Objective, vectors: NDArray[np.float64], point: Point, stage: Stage
+    objective: Objective, vectors: NDArray[np.float64], point: Point, criterion: Criterion
 ) -> Gradients:
     """Return loss and gradient for every vector, computed on all devices.
 
@@ -51,7 +51,7 @@ def gradients(
 
     Parameters
     ----------
-    objective, stage
+    objective, criterion
         The problem.
     vectors
         (S, K) search vectors.
@@ -60,10 +60,10 @@ def gradients(
     """
     found: Gradients = _shared(objective.flier)(
         np.asarray(vectors).T,
-        objective.data(point.offsets, stage),
+        objective.data(point.offsets, criterion),
         objective.tunable,
-        np.asarray(stage.horizon),
-        np.asarray(stage.huber),
+        np.asarray(criterion.horizon),
+        np.asarray(criterion.huber),
     )
     return found
 
@@ -71,7 +71,7 @@ def gradients(
 @lru_cache(maxsize=16)
 def _shared(flier: Flier) -> Callable[..., Gradients]:
     def some(
-        vectors: Array, data: LaneData, model: Tunable, horizon: Array, huber: Array
+        vectors: Array, data: SegmentData, model: Tunable, horizon: Array, huber: Array
     ) -> Gradients:
         def loss(vector: Array) -> Array:
             errors = flier.compared(data, model, vector, horizon, whole=True)[1]
@@ -81,15 +81,15 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
         values, slopes = jax.vmap(jax.value_and_grad(loss), in_axes=-1, out_axes=-1)(vectors)
         return Gradients(values, slopes)
 
-    def share(vectors: Array, data: LaneData, *rest: Any) -> Gradients:
+    def share(vectors: Array, data: SegmentData, *rest: Any) -> Gradients:
         found: Gradients = in_pieces(some, _vectors_at_once(flier, data))(vectors, data, *rest)
         return found
 
     return over_devices(share)
 
 
-def _vectors_at_once(flier: Flier, data: LaneData) -> int:
-    lanes = data.lanes.count
-    one = 8 * _REMEMBERED * flier.room * flier.schedule.blocks_per_sample * lanes
+def _vectors_at_once(flier: Flier, data: SegmentData) -> int:
+    segments = data.segments.count
+    one = 8 * _REMEMBERED * flier.capacity * flier.schedule.blocks_per_sample * segments
     memory = flier.memory // len(jax.devices())
-    return max(1, min(piece_that_fits(8) // lanes, memory // one))
+    return max(1, min(piece_that_fits(8) // segments, memory // one))

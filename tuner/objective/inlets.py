@@ -24,7 +24,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.errors import RecordingError
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
-from tuner.room import roomy
+from tuner.padding import padded_size
 
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
 
@@ -82,7 +82,7 @@ def _complete(flight: Flight, signal: str) -> bool:
 
 
 def inlets_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
-    """Lay what was recorded side by side, each lane's for its own inlet.
+    """Lay what was recorded side by side, each segment's for its own inlet.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> 
     name
         Which inlet.
     flights
-        F lanes.
+        F segments.
     schedule
         All but the reference enter at its ``physics_rate``.
     """
@@ -137,7 +137,7 @@ def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> 
         return _reference(flights)
     physics_rate = schedule.physics_rate
     longest = max(flight.duration for flight in flights)
-    clock = np.arange(roomy(int(np.ceil(longest * physics_rate)) + 2)) / physics_rate
+    clock = np.arange(padded_size(int(np.ceil(longest * physics_rate)) + 2)) / physics_rate
 
     def laid(signal: str, update_rate: float | None) -> list[jax.Array]:
         read = between if update_rate is None or sparse(flights, signal, update_rate) else held
@@ -180,7 +180,7 @@ def between(series: Series, clock: Array) -> Array:
 
 
 def _reference(flights: Sequence[Flight]) -> ReferenceInlet:
-    length = roomy(max(len(flight.time) for flight in flights))
+    length = padded_size(max(len(flight.time) for flight in flights))
     columns = [_points(flight, length) for flight in flights]
     position, velocity, acceleration = (
         Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)

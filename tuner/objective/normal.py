@@ -1,4 +1,4 @@
-"""Cost, gradient and Gauss-Newton Hessian of a fit, lane by lane, without keeping a Jacobian."""
+"""Loss, gradient and Gauss-Newton Hessian of a fit, segment by segment, keeping no Jacobian."""
 
 from __future__ import annotations
 
@@ -18,13 +18,20 @@ from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
 from tuner.coefficients import Space
 from tuner.model import Model, with_coefficients
-from tuner.objective.freedom import eliminated
-from tuner.objective.lanes import OFFSETS, Lanes
+from tuner.objective.criterion import (
+    OFFSET_UNIT,
+    Criterion,
+    Jacobian,
+    Point,
+    SegmentData,
+    SegmentSums,
+)
+from tuner.objective.initial_conditions import eliminated
 from tuner.objective.residuals import Trace, fly, residuals
-from tuner.objective.terms import OFFSET_UNIT, Jacobian, LaneData, LaneSums, Point, Stage
+from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.tunable import Tunable, tunable_of
+from tuner.padding import padded_size
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
-from tuner.room import roomy
 
 MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed, on all devices."""
@@ -37,7 +44,7 @@ class Objective(eqx.Module):
     ----------
     model
         Fixed coefficients and the controllers.
-    lanes
+    segments
         The data.
     space
         Free coefficients.
@@ -46,18 +53,18 @@ class Objective(eqx.Module):
     """
 
     model: Model
-    lanes: Lanes
+    segments: Segments
     space: Space = eqx.field(static=True)
     schedule: Schedule = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
     memory: int = eqx.field(static=True, default=MEMORY)
-    """bytes that derivatives may take while they are computed: lanes beyond take turns."""
+    """bytes that derivatives may take while they are computed: segments beyond take turns."""
 
     @property
     def flights(self) -> int:
-        """How many flights the lanes belong to."""
-        return int(np.max(np.asarray(self.lanes.flight))) + 1
+        """How many flights the segments belong to."""
+        return int(np.max(np.asarray(self.segments.flight))) + 1
 
     def start(self, vector: np.ndarray[Any, Any]) -> Point:
         """Return a point with a search vector and no offset."""
@@ -66,7 +73,7 @@ class Objective(eqx.Module):
     @property
     def flier(self) -> Flier:
         """The static half, by which compiled functions are kept."""
-        return Flier(self.schedule, roomy(self.samples), self.limits, self.memory)
+        return Flier(self.schedule, padded_size(self.samples), self.limits, self.memory)
 
     @property
     def tunable(self) -> Tunable:
@@ -74,34 +81,38 @@ class Objective(eqx.Module):
         return tunable_of(self.model, self.space)
 
     def simulate(self, coefficients: Float[Array, " K"], horizon: Int[Array, ""]) -> Trace:
-        """Fly every lane with a search vector."""
-        return self.flier.fly(self.tunable, self.lanes, coefficients, horizon)
+        """Fly every segment with a search vector."""
+        return self.flier.fly(self.tunable, self.segments, coefficients, horizon)
 
-    def sums(self, point: Point, stage: Stage, *, derivatives: bool = True) -> LaneSums:
-        """Return every lane's contribution at a point, computed on all devices."""
+    def sums(self, point: Point, criterion: Criterion, *, derivatives: bool = True) -> SegmentSums:
+        """Return every segment's contribution at a point, computed on all devices."""
         alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], point)
-        found: LaneSums = jax.tree.map(
-            lambda leaf: leaf[0], self.sums_of(alone, stage, derivatives=derivatives)
+        found: SegmentSums = jax.tree.map(
+            lambda leaf: leaf[0], self.sums_of(alone, criterion, derivatives=derivatives)
         )
         return found
 
-    def sums_of(self, points: Point, stage: Stage, *, derivatives: bool = True) -> LaneSums:
-        """Return every lane's contribution at S points; all leaves have S first."""
-        found: LaneSums = _shared_sums(self.flier, derivatives)(
-            self.data(points.offsets, stage),
+    def sums_of(
+        self, points: Point, criterion: Criterion, *, derivatives: bool = True
+    ) -> SegmentSums:
+        """Return every segment's contribution at S points; all leaves have S first."""
+        found: SegmentSums = _shared_sums(self.flier, derivatives)(
+            self.data(points.offsets, criterion),
             self.tunable,
             np.asarray(points.coefficients),
-            np.asarray(stage.horizon),
-            np.asarray(stage.huber),
+            np.asarray(criterion.horizon),
+            np.asarray(criterion.huber),
         )
         return found
 
-    def jacobian(self, point: Point, stage: Stage, *, columns: int | None = None) -> Jacobian:
+    def jacobian(
+        self, point: Point, criterion: Criterion, *, columns: int | None = None
+    ) -> Jacobian:
         """Return every residual's derivatives, computed on all devices.
 
         They are computed for ``columns`` parameters at a time, or all of them.
         """
-        vector, data = np.asarray(point.coefficients), self.data(point.offsets, stage)
+        vector, data = np.asarray(point.coefficients), self.data(point.offsets, criterion)
         model = with_coefficients(self.model, self.space.values(jnp.asarray(vector)))
         count = len(self.space) if columns is None else columns
         parts = []
@@ -109,22 +120,22 @@ class Objective(eqx.Module):
             some = Space(self.space.parameters[first : first + count], {})
             moved = np.pad(vector[first : first + count], (0, count - len(some)))
             found = _shared_jacobian(self.flier)(
-                data, tunable_of(model, some, count=count), moved, np.asarray(stage.horizon)
+                data, tunable_of(model, some, count=count), moved, np.asarray(criterion.horizon)
             )
             parts.append((len(some), found))
         return _beside(count, parts)
 
-    def data(self, offsets: Array, stage: Stage) -> LaneData:
-        """Return what each device needs of its own lanes; offsets are (\\*starts, offsets, N)."""
-        flight = np.asarray(self.lanes.flight)
-        own: LaneData = jax.tree.map(
+    def data(self, offsets: Array, criterion: Criterion) -> SegmentData:
+        """Return what each device needs of its segments; offsets are (\\*starts, offsets, N)."""
+        flight = np.asarray(self.segments.flight)
+        own: SegmentData = jax.tree.map(
             np.asarray,
-            LaneData(
-                lanes=self.lanes,
+            SegmentData(
+                segments=self.segments,
                 offsets=offsets[..., flight],
-                scale={name: scale[flight] for name, scale in stage.scale.items()},
-                held=stage.held[:, flight],
-                states=stage.states,
+                scale={name: scale[flight] for name, scale in criterion.scale.items()},
+                held=criterion.held[:, flight],
+                states=criterion.states,
             ),
         )
         return own
@@ -144,35 +155,35 @@ def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
 
 @lru_cache(maxsize=16)
 def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
-    def lanewise(data: LaneData, *rest: Any) -> Jacobian:
-        pieces = in_pieces(flier.jacobian, flier.lanes_at_once(data, len(rest[0].coordinates)))
+    def segmentwise(data: SegmentData, *rest: Any) -> Jacobian:
+        pieces = in_pieces(flier.jacobian, flier.segments_at_once(data, len(rest[0].coordinates)))
         found: Jacobian = pieces(data, *rest)
         return found
 
-    return over_devices(lanewise)
+    return over_devices(segmentwise)
 
 
 @lru_cache(maxsize=16)
-def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., LaneSums]:
+def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., SegmentSums]:
     """Return the sums over all devices for S points, compiled once however often used."""
 
-    def some(data: LaneData, model: Tunable, coefficients: Array, *rest: Any) -> LaneSums:
-        def at(point: tuple[Array, Array]) -> LaneSums:
+    def some(data: SegmentData, model: Tunable, coefficients: Array, *rest: Any) -> SegmentSums:
+        def at(point: tuple[Array, Array]) -> SegmentSums:
             vector, offsets = point
             own = eqx.tree_at(lambda d: d.offsets, data, offsets)
             return flier.sums(own, model, vector, *rest, derivatives=derivatives)
 
-        # one start after the other: lanes and columns fill the processor already
-        found: LaneSums = lax.map(at, (coefficients, data.offsets))
+        # one start after the other: segments and columns fill the processor already
+        found: SegmentSums = lax.map(at, (coefficients, data.offsets))
         return found
 
-    def lanewise(data: LaneData, *rest: Any) -> LaneSums:
+    def segmentwise(data: SegmentData, *rest: Any) -> SegmentSums:
         moving = len(rest[0].coordinates) if derivatives or data.states is not None else 0
-        pieces = in_pieces(some, flier.lanes_at_once(data, moving))
-        found: LaneSums = pieces(data, *rest)
+        pieces = in_pieces(some, flier.segments_at_once(data, moving))
+        found: SegmentSums = pieces(data, *rest)
         return found
 
-    return over_devices(lanewise)
+    return over_devices(segmentwise)
 
 
 @dataclass(frozen=True)
@@ -180,20 +191,22 @@ class Flier:
     """The static half of an objective: its methods are functions of arrays alone."""
 
     schedule: Schedule
-    room: int
+    capacity: int
     """Samples that a log has room for."""
     limits: Limits
     memory: int = MEMORY
 
-    def lanes_at_once(self, data: LaneData, moving: int) -> int:
-        """Return how many lanes a device flies at a time: what fits its cache and the memory.
+    def segments_at_once(self, data: SegmentData, moving: int) -> int:
+        """Return how many segments a device flies at a time: what fits its cache and the memory.
 
         ``moving`` is how many parameters it differentiates by; zero if it does not.
         """
         starts = 0 if data.states is None else len(data.states)
         columns = moving + starts if moving else 1
-        recorded = sum(m.values.shape[0] * m.values.shape[1] for m in data.lanes.measured.values())
-        logged = self.room * sum(m.values.shape[1] for m in data.lanes.measured.values())
+        recorded = sum(
+            m.values.shape[0] * m.values.shape[1] for m in data.segments.measured.values()
+        )
+        logged = self.capacity * sum(m.values.shape[1] for m in data.segments.measured.values())
         # the flown derivatives twice, those of the residuals as such and weighted
         one = 8 * (columns + 1) * (2 * logged + 2 * recorded)
         share = self.memory // len(jax.devices())
@@ -202,17 +215,17 @@ class Flier:
     def fly(
         self,
         model: Tunable,
-        lanes: Lanes,
+        segments: Segments,
         coefficients: Array,
         horizon: Array | None,
         states: Array | None = None,
     ) -> Trace:
-        """Simulate some lanes with a search vector (K,) up to a horizon in samples, or whole."""
+        """Simulate some segments with a search vector (K,) up to a horizon in samples, or whole."""
         return fly(
             model.at(coefficients),
-            lanes,
+            segments,
             self.schedule,
-            samples=self.room,
+            samples=self.capacity,
             horizon=horizon,
             limits=self.limits,
             states=states,
@@ -220,7 +233,7 @@ class Flier:
 
     def compared(
         self,
-        data: LaneData,
+        data: SegmentData,
         model: Tunable,
         coefficients: Array,
         horizon: Array,
@@ -232,15 +245,15 @@ class Flier:
         Reverse mode needs the ``whole`` flights flown; the residuals end at the horizon anyway.
         """
         flown = None if whole else horizon
-        trace = self.fly(model, data.lanes, coefficients, flown, data.states)
+        trace = self.fly(model, data.segments, coefficients, flown, data.states)
         return trace, self._compare(data, horizon, trace, data.offsets)
 
     def _compare(
-        self, data: LaneData, horizon: Array, trace: Trace, offsets: Array
+        self, data: SegmentData, horizon: Array, trace: Trace, offsets: Array
     ) -> dict[str, Array]:
         return residuals(
             trace,
-            data.lanes,
+            data.segments,
             offsets * OFFSET_UNIT,
             data.held,
             rate=float(self.schedule.log_rate),
@@ -249,15 +262,15 @@ class Flier:
 
     def sums(
         self,
-        data: LaneData,
+        data: SegmentData,
         model: Tunable,
         coefficients: Array,
         horizon: Array,
         huber: Array,
         *,
         derivatives: bool,
-    ) -> LaneSums:
-        """Return what some lanes contribute; see `Objective.sums`."""
+    ) -> SegmentSums:
+        """Return what some segments contribute; see `Objective.sums`."""
         if derivatives or data.states is not None:
             trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
         else:
@@ -265,12 +278,16 @@ class Flier:
             columns = None
         squares = {name: jnp.sum(e * e, axis=(0, 1)) for name, e in errors.items()}
         rate = float(self.schedule.log_rate)
-        counts = {name: _count(data.lanes, name, rate, horizon) for name in errors}
+        counts = {name: _count(data.segments, name, rate, horizon) for name in errors}
         scaled = {name: e / data.scale[name] for name, e in errors.items()}
         loss = robust_loss(scaled, huber)
-        lanes = jnp.shape(data.offsets)[-1]
+        segments = jnp.shape(data.offsets)[-1]
         size = len(coefficients) + len(OFFSETS)
-        gradient, hessian, states = jnp.zeros((size, lanes)), jnp.zeros((size, size, lanes)), None
+        gradient, hessian, states = (
+            jnp.zeros((size, segments)),
+            jnp.zeros((size, size, segments)),
+            None,
+        )
         if columns is not None:
             gradient, hessian = _normal(columns, scaled, data.scale, huber)
         if data.states is not None:
@@ -279,18 +296,18 @@ class Flier:
             for name, column in (columns or {}).items():
                 there = errors[name] + jnp.einsum("lnkf,lf->nkf", column[size:], change)
                 squares[name] = jnp.sum(there * there, axis=(0, 1))
-        return LaneSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
+        return SegmentSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
 
     def jacobian(
-        self, data: LaneData, model: Tunable, coefficients: Array, horizon: Array
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
     ) -> Jacobian:
-        """Return every residual of some lanes and its derivatives."""
+        """Return every residual of some segments and its derivatives."""
         trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
         return Jacobian(errors, columns, trace.crash_time)
 
     @partial(jax.jit, static_argnums=0)
     def _with_columns(
-        self, data: LaneData, model: Tunable, coefficients: Array, horizon: Array
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
     ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
         """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 
@@ -299,7 +316,7 @@ class Flier:
         """
         offsets = data.offsets
         trace, moved = _jacobian_forward(
-            lambda vector, starts: self.fly(model, data.lanes, vector, horizon, starts),
+            lambda vector, starts: self.fly(model, data.segments, vector, horizon, starts),
             coefficients,
             data.states,
         )
@@ -327,7 +344,7 @@ def _jacobian_forward(
 ) -> tuple[Trace, Trace]:
     """Return a simulation and its derivatives, first by a vector (K,), then by starts (L, F).
 
-    All lanes' starts move at once: a lane depends on its own alone.
+    All segments' starts move at once: a segment depends on its own alone.
     """
     basis = jnp.eye(len(vector) + (0 if states is None else len(states)), dtype=vector.dtype)
 
@@ -370,7 +387,7 @@ def robust(error: Array, limit: Array) -> Array:
     return jnp.where(size > limit, 2.0 * limit * size - limit * limit, error * error)
 
 
-def _count(lanes: Lanes, name: str, rate: float, horizon: Array) -> Array:
-    measured = lanes.measured[name]
+def _count(segments: Segments, name: str, rate: float, horizon: Array) -> Array:
+    measured = segments.measured[name]
     flown = measured.time * rate < horizon - 1
     return jnp.sum((measured.weight > 0) & flown[:, None], axis=(0, 1)).astype(float)

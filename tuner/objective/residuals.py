@@ -14,8 +14,8 @@ from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
-from tuner.objective.freedom import moved, spun_up, trimmed
-from tuner.objective.lanes import CLOCK_OF, CLOCKS, Lanes, Measured
+from tuner.objective.initial_conditions import moved, spun_up, trimmed
+from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
 
 
 class Trace(eqx.Module):
@@ -26,7 +26,7 @@ class Trace(eqx.Module):
     channels
         Channel -> (samples, columns, F).
     crash_time
-        (F,) s, infinite for a lane that flew.
+        (F,) s, infinite for a segment that flew.
     """
 
     channels: dict[str, Float[Array, "samples c F"]]
@@ -35,7 +35,7 @@ class Trace(eqx.Module):
 
 def fly(
     model: Model,
-    lanes: Lanes,
+    segments: Segments,
     schedule: Schedule,
     *,
     samples: int,
@@ -43,21 +43,21 @@ def fly(
     limits: Limits,
     states: Float[Array, "L F"] | None = None,
 ) -> Trace:
-    """Simulate every lane up to a horizon in samples.
+    """Simulate every segment up to a horizon in samples.
 
     Parameters
     ----------
-    model, lanes, schedule, samples, horizon, limits
+    model, segments, schedule, samples, horizon, limits
         As of `sim_jax.rollout.rollout`.
     states
-        How far the starts lie from the recorded ones, in the lanes' standard deviations.
+        How far the starts lie from the recorded ones, in the segments' standard deviations.
     """
-    start, inlet = lanes.start, lanes.inlet
-    if lanes.turning is not None:
-        start = spun_up(start, model.vehicle, lanes.turning)
-    if states is not None and lanes.freedom is not None:
-        start = moved(start, states * lanes.freedom)
-        inlet = trimmed(inlet, model.vehicle, states * lanes.freedom)
+    start, inlet = segments.start, segments.inlet
+    if segments.turning is not None:
+        start = spun_up(start, model.vehicle, segments.turning)
+    if states is not None and segments.freedom is not None:
+        start = moved(start, states * segments.freedom)
+        inlet = trimmed(inlet, model.vehicle, states * segments.freedom)
     flown = rollout(
         model.vehicle,
         model.controller,
@@ -77,13 +77,13 @@ def fly(
         "command": flown.log.command,
     }
     return Trace(
-        {name: jnp.stack(every[name], axis=1) for name in lanes.measured}, flown.crash_time
+        {name: jnp.stack(every[name], axis=1) for name in segments.measured}, flown.crash_time
     )
 
 
 def residuals(
     trace: Trace,
-    lanes: Lanes,
+    segments: Segments,
     offsets: Float[Array, "offsets F"],
     held: Float[Array, "clocks F"],
     *,
@@ -96,7 +96,7 @@ def residuals(
     ----------
     trace
         The simulation.
-    lanes
+    segments
         The recording.
     offsets
         s by which each clock's stamps are late: a sample stamped t was taken at t - offset; then
@@ -110,7 +110,7 @@ def residuals(
         Samples of the trace that were flown.
     """
     found = {}
-    for name, measured in lanes.measured.items():
+    for name, measured in segments.measured.items():
         clock = CLOCK_OF[name]
         place = (measured.time - offsets[clock]) * rate
         if name == "command":
@@ -163,5 +163,5 @@ def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Flo
 
 
 def sum_of_squares(parts: Mapping[str, Array]) -> Array:
-    """Return the sum of squares over channels and samples, per lane (F,)."""
+    """Return the sum of squares over channels and samples, per segment (F,)."""
     return sum((jnp.sum(part * part, axis=(0, 1)) for part in parts.values()), jnp.zeros(()))

@@ -6,12 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from tuner.design.proposals import Proposals, read_proposals
 from tuner.errors import InputError
+from tuner.examination.knowledge import Knowledge, read_knowledge
 from tuner.flights.flight import Array
-from tuner.identifiability.global_indices import GlobalIndices, read_global
-from tuner.identifiability.knowledge import Knowledge, read_knowledge
-from tuner.identifiability.profiles import Profiles, read_profiles
-from tuner.identifiability.proposals import Proposals, read_proposals
 from tuner.report.record import (
     About,
     LapTable,
@@ -23,6 +21,8 @@ from tuner.report.record import (
 )
 from tuner.report.traces import read_traces
 from tuner.result import RESULT_FILE, Run, read_run
+from tuner.sensitivity.global_files import GlobalIndices, read_global
+from tuner.uncertainty.profile_files import Profiles, read_profiles
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import JsonValue
 
 from tuner.config.yaml_file import write_text
-from tuner.identifiability.knowledge import Part, read_part
+from tuner.examination.knowledge import Part, read_part
 from tuner.result import AxesRmse
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 
-from tuner.identifiability.proposals import listed
+from tuner.design.proposals import listed
 from tuner.report.contents import Contents
 from tuner.result import RunResult
 

@@ -11,39 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.batch import CHUNK, evaluate
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.terms import Point, Stage
 from tuner.search.fitted import Iteration
-from tuner.search.legs import Leg
-from tuner.search.progress import Free, Progress, point_of, stage_of, with_feedback
+from tuner.search.progress import Free, Progress, criterion_of, point_of, with_feedback
+from tuner.search.stages import Stage
 
 POPULATION = CHUNK
 """Vectors in one generation."""
 SPREAD = 0.5
 """First standard deviation, in those of the coefficients' priors."""
 FLAT = 1e-3
-"""A leg ends when the best losses of the last generations differ by less than this share."""
+"""A stage ends when the best losses of the last generations differ by less than this share."""
 
 
 def evolve(
     objective: Objective,
-    leg: Leg,
+    stage: Stage,
     progress: Progress,
     *,
     free: Free,
     seed: int,
     tell: Callable[[Progress], None],
 ) -> Progress:
-    """Run one leg from the best start so far; clock offsets stay where they are.
+    """Run one stage from the best start so far; clock offsets stay where they are.
 
     Parameters
     ----------
-    objective, leg, progress
-        As for `tuner.search.growing.run_leg`.
+    objective, stage, progress
+        As for `tuner.search.continuation.run_leg`.
     free
         What may move.
     seed
-        Of the population; each leg draws its own.
+        Of the population; each stage draws its own.
     tell
         Called after every generation.
 
@@ -57,9 +57,9 @@ def evolve(
     objective = with_feedback(objective, progress.feedback)
     best = int(np.argmin(progress.losses))
     point = point_of(progress.points, best)
-    stage = stage_of(leg, progress.scales, np.asarray(point.offsets), progress.states)
+    criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
     space, centre = objective.space, np.asarray(point.coefficients)
-    loss_of = _loss(objective, point, stage)
+    loss_of = _loss(objective, point, criterion)
     moves = np.flatnonzero(free.coefficients)
     spread = SPREAD * (space.prior_sd / space.width)[moves]
     with warnings.catch_warnings():
@@ -70,9 +70,9 @@ def evolve(
             {
                 "bounds": [0.0, 1.0],
                 "CMA_stds": np.minimum(spread, 0.25),
-                "seed": 1 + seed + 1000 * progress.leg,
+                "seed": 1 + seed + 1000 * progress.stage,
                 "popsize": POPULATION,
-                "maxiter": leg.steps,
+                "maxiter": stage.steps,
                 "tolfunrel": FLAT,
                 "verbose": -9,
             },
@@ -88,30 +88,30 @@ def evolve(
             here = int(np.argmin(losses))
             if losses[here] < least:
                 vector, least = vectors[here], float(losses[here])
-            progress = _told(objective, leg, progress, least, float(position_rmse[here]))
+            progress = _told(objective, stage, progress, least, float(position_rmse[here]))
             progress = _placed(progress, best, vector, least)
             tell(progress)
     return replace(
         progress,
-        leg=progress.leg + 1,
+        stage=progress.stage + 1,
         converged="maxiter" not in strategy.stop(),
     )
 
 
 def _loss(
-    objective: Objective, point: Point, stage: Stage
+    objective: Objective, point: Point, criterion: Criterion
 ) -> Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return (S, K) vectors -> (S,) losses as least squares counts them, and position RMSE in m."""
     space = objective.space
-    counts = objective.sums(point, stage).counts
+    counts = objective.sums(point, criterion).counts
     compared = max(float(sum(np.sum(number) for number in counts.values())), 1.0)
-    position = objective.lanes.measured.get("position")
+    position = objective.segments.measured.get("position")
     sigma = np.nan if position is None else 1.0 / np.asarray(position.weight).max()
 
     def loss(vectors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        batch = evaluate(objective, vectors, point, stage)
+        batch = evaluate(objective, vectors, point, criterion)
         scaled = np.stack([np.asarray(space.scaled(jnp.asarray(vector))) for vector in vectors])
-        pull = (scaled - space.prior_mean) / space.prior_sd * float(stage.prior)
+        pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
         total = np.asarray(batch.loss).sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
         squares = np.asarray(batch.squares.get("position", np.full((len(vectors), 1, 1), np.nan)))
         placed = np.sum(counts.get("position", np.ones(1)))
@@ -122,15 +122,15 @@ def _loss(
 
 
 def _told(
-    objective: Objective, leg: Leg, progress: Progress, loss: float, position_rmse: float
+    objective: Objective, stage: Stage, progress: Progress, loss: float, position_rmse: float
 ) -> Progress:
     iteration = Iteration(
-        stage=leg.name,
+        stage=stage.name,
         number=len(progress.iterations),
         loss=loss,
         position_rmse=position_rmse,
         accepted=True,
-        horizon=leg.horizon / float(objective.schedule.log_rate),
+        horizon=stage.horizon / float(objective.schedule.log_rate),
     )
     return replace(
         progress,

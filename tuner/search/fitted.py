@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.terms import Point, Stage
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Iteration:
 
     Attributes
     ----------
-    stage
+    criterion
         What was being done, in words.
     number
         Counts all iterations of the search.
@@ -95,7 +95,7 @@ class Fitted:
         The problem.
     point
         The best point.
-    stage
+    criterion
         Horizon, scales and robust limit of the final problem, in which ``point`` is the minimum.
     noise
         Channel -> standard deviation of the measurement in its unit (attitude: rad).
@@ -122,7 +122,7 @@ class Fitted:
 
     objective: Objective
     point: Point
-    stage: Stage
+    criterion: Criterion
     noise: Mapping[str, float]
     scales: Mapping[str, Mapping[str, float]]
     iterations: tuple[Iteration, ...]

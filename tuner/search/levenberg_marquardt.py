@@ -14,10 +14,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from tuner.coefficients import Coordinates, Space
+from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.objective.terms import LaneSums, Point, Stage
 
-_Before: TypeAlias = tuple[Point, Any, LaneSums]
+_Before: TypeAlias = tuple[Point, Any, SegmentSums]
 """Best points, solver states and the sums at the points that these wanted to try."""
 RIDGE = 1e-13
 """Relative to the largest diagonal element: keeps a singular Hessian factorisable."""
@@ -33,7 +33,7 @@ class Step(eqx.Module):
     solver
         optimistix's own state.
     sums
-        The lanes' sums at the point that was tried, gradient and Hessian included; None before.
+        The segments' sums at the point that was tried, gradient and Hessian included; None before.
     loss
         Scalar: the loss at the best point, per compared value.
     accepted
@@ -42,7 +42,7 @@ class Step(eqx.Module):
 
     point: Point
     solver: Any
-    sums: LaneSums | None
+    sums: SegmentSums | None
     loss: Float[Array, ""]
     accepted: Array
 
@@ -51,10 +51,10 @@ def total(
     space: Space | Coordinates,
     flight: ArrayLike,
     point: Point,
-    stage: Stage,
-    sums: LaneSums,
+    criterion: Criterion,
+    sums: SegmentSums,
 ) -> tuple[Array, Array, Array]:
-    """Return loss, gradient (P,) and Hessian (P, P) over all lanes, priors included.
+    """Return loss, gradient (P,) and Hessian (P, P) over all segments, priors included.
 
     The parameters are the coefficients, then the flights' offsets, one kind after the other;
     everything is divided by the number of compared values, so that damping means the same at every
@@ -65,16 +65,16 @@ def total(
     space
         Free coefficients and their priors.
     flight
-        (F,) number of the flight that each lane belongs to.
-    point, stage, sums
-        Where, in which terms, and what the lanes contribute there.
+        (F,) number of the flight that each segment belongs to.
+    point, criterion, sums
+        Where, in which terms, and what the segments contribute there.
     """
     count, (kinds, flights) = len(space), point.offsets.shape
     compared = jnp.maximum(sum(jnp.sum(n) for n in sums.counts.values()), 1.0)
     mean, sd = jnp.asarray(space.prior_mean), jnp.asarray(space.prior_sd)
 
     def prior(vector: Array) -> Array:
-        return (space.scaled(vector) - mean) / sd * stage.prior
+        return (space.scaled(vector) - mean) / sd * criterion.prior
 
     pull, slope = jax.jvp(prior, (point.coefficients,), (jnp.ones(count),))
     offset_pull = point.offsets / OFFSET_SD
@@ -168,11 +168,11 @@ def _begin(packed: Array, free: ArrayLike) -> Any:
 
 @eqx.filter_jit
 def _step(
-    space: Coordinates, flight: ArrayLike, before: _Before, stage: Stage, free: ArrayLike
+    space: Coordinates, flight: ArrayLike, before: _Before, criterion: Criterion, free: ArrayLike
 ) -> Step:
-    def one(point: Point, solver: Any, sums: LaneSums) -> Step:
+    def one(point: Point, solver: Any, sums: SegmentSums) -> Step:
         tried = _unpack(solver.y_eval, point)
-        fn = _square_problem(*total(space, flight, tried, stage, sums), free)
+        fn = _square_problem(*total(space, flight, tried, criterion, sums), free)
         packed = _pack(point)
         static = eqx.filter(_fresh(packed, fn), eqx.is_array, inverse=True)
         new, state, _ = _SOLVER.step(fn, packed, None, {}, eqx.combine(solver, static), frozenset())
@@ -200,7 +200,7 @@ def begin(points: Point, free: ArrayLike) -> Step:
     return cast(Step, on_host(fresh))
 
 
-def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -> Step:
+def advance(objective: Objective, before: Step, criterion: Criterion, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
 
     The points are flown on all devices; the step itself, a small affair, is taken on one.
@@ -211,7 +211,7 @@ def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -
         The problem.
     before
         What `begin` or the last call returned.
-    stage
+    criterion
         Horizon, scales, robust limit: may change without compiling again, but only at `begin`.
     free
         As given to `begin`.
@@ -219,9 +219,9 @@ def advance(objective: Objective, before: Step, stage: Stage, free: ArrayLike) -
     tried = jax.vmap(_unpack)(jnp.asarray(before.solver.y_eval), before.point)
     after = _step(
         objective.space.coordinates,
-        np.asarray(objective.lanes.flight),
-        (before.point, before.solver, objective.sums_of(on_host(tried), stage)),
-        stage,
+        np.asarray(objective.segments.flight),
+        (before.point, before.solver, objective.sums_of(on_host(tried), criterion)),
+        criterion,
         np.asarray(free),
     )
     return cast(Step, on_host(after))

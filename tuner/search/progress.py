@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.lanes import CLOCKS
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.objective.terms import OFFSET_UNIT, Point, Stage
+from tuner.objective.segments import CLOCKS
 from tuner.search.fitted import Iteration
-from tuner.search.legs import Leg
 from tuner.search.levenberg_marquardt import Step, on_host
+from tuner.search.stages import Stage
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
@@ -44,31 +44,32 @@ class Progress:
 
     Attributes
     ----------
-    leg
-        Number of the leg that comes next, or that is under way where ``step`` is not None.
+    stage
+        Number of the stage that comes next, or that is under way where ``step`` is not None.
     points
         S points.
     scales
         Channel -> (N,) how much larger than the noise the residuals are taken to be.
     states
-        (L, F) starts of the lanes, in their standard deviations; None where they are known.
+        (L, F) starts of the segments, in their standard deviations; None where they are known.
     losses
-        (S,) at the end of the last leg.
+        (S,) at the end of the last stage.
     iterations
         The trace so far.
     evaluations
         Jacobians so far.
     converged
-        Whether the last leg ended by itself.
+        Whether the last stage ended by itself.
     feedback
         The mixer's saturation feedback that is flown: 1 as in PX4.
     left
         s that the search may still take; NaN where nobody said.
     step, trail
-        The solver's state inside a leg, and the losses (S,) of the leg so far; None between legs.
+        The solver's state inside a stage, and the losses (S,) of the stage so far; None between
+        stages.
     """
 
-    leg: int
+    stage: int
     points: Point
     scales: dict[str, NDArray[np.float64]]
     states: NDArray[np.float64] | None
@@ -83,13 +84,13 @@ class Progress:
 
 
 def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
-    """Return the state before the first leg for S start vectors (S, K)."""
+    """Return the state before the first stage for S start vectors (S, K)."""
     offsets = np.zeros((len(vectors), *objective.start(vectors[0]).offsets.shape))
-    freedom = objective.lanes.freedom
+    freedom = objective.segments.freedom
     return Progress(
-        leg=0,
+        stage=0,
         points=Point(jnp.asarray(vectors), jnp.asarray(offsets)),
-        scales={name: np.ones(objective.flights) for name in objective.lanes.measured},
+        scales={name: np.ones(objective.flights) for name in objective.segments.measured},
         states=None if freedom is None else np.zeros(freedom.shape),
         losses=np.full(len(vectors), np.inf),
         iterations=(),
@@ -97,32 +98,32 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
     )
 
 
-def stage_of(
-    leg: Leg,
+def criterion_of(
+    stage: Stage,
     scales: dict[str, NDArray[np.float64]],
     offsets: NDArray[np.float64],
     states: NDArray[np.float64] | None = None,
-) -> Stage:
-    """Return what the solver needs to know of a leg.
+) -> Criterion:
+    """Return what the solver needs to know of a stage.
 
     Parameters
     ----------
-    leg, scales
+    stage, scales
         Horizon and weights.
     offsets
         (offsets, N) at which commands are read exactly, as in a `Point`.
     states
         (L, F) starts around which is linearised.
     """
-    stage = Stage(
-        horizon=jnp.asarray(leg.horizon),
-        scale={name: jnp.asarray(leg.loosening * scale) for name, scale in scales.items()},
+    criterion = Criterion(
+        horizon=jnp.asarray(stage.horizon),
+        scale={name: jnp.asarray(stage.noise_inflation * scale) for name, scale in scales.items()},
         held=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
-        huber=jnp.asarray(HUBER if leg.robust else np.inf),
+        huber=jnp.asarray(HUBER if stage.robust else np.inf),
         prior=jnp.asarray(1.0),
         states=None if states is None else jnp.asarray(states),
     )
-    return cast(Stage, on_host(stage))
+    return cast(Criterion, on_host(criterion))
 
 
 def point_of(points: Point, start: int) -> Point:

@@ -16,7 +16,7 @@ def root_mean_squares(objective: Objective, step: Step) -> dict[str, NDArray[np.
     """Return channel -> (N,) root mean square residual in σ at the best start's point, or NaN."""
     assert step.sums is not None
     best, found = int(np.argmin(step.loss)), {}
-    flight, flights = np.asarray(objective.lanes.flight), objective.flights
+    flight, flights = np.asarray(objective.segments.flight), objective.flights
     for name, squares in step.sums.squares.items():
         counts = np.bincount(flight, np.asarray(step.sums.counts[name][best]), flights)
         mean = np.bincount(flight, np.asarray(squares[best]), flights) / np.maximum(counts, 1.0)
@@ -25,16 +25,16 @@ def root_mean_squares(objective: Objective, step: Step) -> dict[str, NDArray[np.
 
 
 def strays(
-    found: dict[str, NDArray[np.float64]], loosening: float
+    found: dict[str, NDArray[np.float64]], noise_inflation: float
 ) -> dict[str, NDArray[np.float64]]:
     """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
-    table = np.stack(list(found.values())) / loosening
+    table = np.stack(list(found.values())) / noise_inflation
     with np.errstate(all="ignore"):
         per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
     typical = max(float(np.median(per_flight)), 1.0)
     stray = per_flight > STRAY * typical
     return {
-        name: np.where(stray & np.isfinite(values), np.maximum(values / loosening, 1.0), 1.0)
+        name: np.where(stray & np.isfinite(values), np.maximum(values / noise_inflation, 1.0), 1.0)
         for name, values in found.items()
     }
 

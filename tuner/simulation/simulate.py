@@ -96,17 +96,17 @@ def simulate(
         flown = fly(columns, model, reference.inlet, reference.start)
         logged = _logged(flown)
         crashes = np.asarray(flown.crash_time).reshape(-1)
-        for lane in range(wanted):
+        for segment in range(wanted):
             signals = {
-                name: resample(name, Series(log_time, values[..., lane]), clock)
+                name: resample(name, Series(log_time, values[..., segment]), clock)
                 for name, values in logged.items()
             }
             signals["acceleration"] = _specific_force(clock, signals)
             yield Simulation(
                 time=clock,
                 signals=signals | sent,
-                crash_time=float(crashes[lane]) if np.isfinite(crashes[lane]) else None,
-                coefficients={name: float(column[lane]) for name, column in columns.items()},
+                crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
+                coefficients={name: float(column[segment]) for name, column in columns.items()},
             )
 
 
@@ -138,13 +138,13 @@ def _flier(schedule: Schedule, samples: int, precision: Precision) -> Callable[.
             precision=precision,
         )
 
-    lanes = piece_that_fits(np.dtype(precision).itemsize)
-    alone, side_by_side = jax.jit(fly), over_devices(in_pieces(fly, lanes))
+    segments = piece_that_fits(np.dtype(precision).itemsize)
+    alone, side_by_side = jax.jit(fly), over_devices(in_pieces(fly, segments))
     return lambda columns, *rest: (side_by_side if columns else alone)(columns, *rest)
 
 
 def _logged(flown: Rollout) -> dict[str, Array]:
-    """Return signal -> (samples, k, lanes)."""
+    """Return signal -> (samples, k, segments)."""
     log = flown.log
     motion, setpoints = log.motion, log.setpoints
     attitude = motion.attitude
@@ -158,10 +158,10 @@ def _logged(flown: Rollout) -> dict[str, Array]:
         "rate_setpoint": (setpoints.rate.x, setpoints.rate.y, setpoints.rate.z),
         "thrust_setpoint": (setpoints.thrust,),
     }
-    lanes = flown.crash_time.size
+    segments = flown.crash_time.size
     return {
         name: np.stack(
-            [np.asarray(leaf, dtype=np.float64).reshape(-1, lanes) for leaf in leaves], axis=1
+            [np.asarray(leaf, dtype=np.float64).reshape(-1, segments) for leaf in leaves], axis=1
         )
         for name, leaves in parts.items()
     }

@@ -10,7 +10,7 @@ from tuner.comparison.errors import Comparison
 from tuner.config import ControllerFile, read_vehicle, with_values
 from tuner.config.shipped import find_config
 from tuner.flights.load import load_flight
-from tuner.objective.lanes import noise_of
+from tuner.objective.segments import noise_of
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 NAMES = sorted(path.stem for path in FLIGHTS.glob("*.bag"))

@@ -6,15 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.tuner.identifiability.making import fitted_of, problem, truth
+from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.coefficients import space_of
 from tuner.config import JobFile
 from tuner.config.job import Search
 from tuner.job import search as module
-from tuner.job.noticed import noticed, surer_than_steps, unmatched
+from tuner.job.findings import noticed, surer_than_steps, unmatched
 from tuner.job.starts import starting_vectors
 from tuner.search.fitted import Outcome
-from tuner.search.legs import left, plan
+from tuner.search.stages import left, plan
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 
@@ -105,8 +105,8 @@ def test_a_lag_told_more_finely_than_steps_allow_is_said():
 
 
 def test_time_left_falls_to_nothing():
-    legs = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
-    told = [left(legs, leg, 0, 10.0) for leg in range(1, len(legs) + 1)]
+    stages = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
+    told = [left(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
     assert told == sorted(told, reverse=True)
     assert told[-1] == 0.0
-    assert np.isnan(left(legs, 0, 0, 0.0))
+    assert np.isnan(left(stages, 0, 0, 0.0))

@@ -9,11 +9,11 @@ from tuner.comparison.layout import Layout
 from tuner.config import JobFile, Options, settle, values_of, with_values
 from tuner.config.job import FlightSettings, Search
 from tuner.job.check import check
-from tuner.job.hold import with_the_untold_held
+from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
 from tuner.job.search import search
-from tuner.search.legs import WHOLE, plan
-from tuner.search.progress import beginning, stage_of
+from tuner.search.progress import beginning, criterion_of
+from tuner.search.stages import WHOLE, plan
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
 FREE = ("inertia_xx", "inertia_yy", "motor_constant", "moment_constant", "rotor_drag_coefficient")
@@ -38,7 +38,7 @@ def fitted_through(job, folder):
 def test_the_truth_is_found_through_every_inlet(inlet, full_flight, full_bag, updated, tmp_path):
     job = job_through(inlet, full_flight, full_bag, updated)
     fitted = fitted_through(job, tmp_path)
-    assert fitted.objective.lanes.count > 15
+    assert fitted.objective.segments.count > 15
     found = job.space.values(fitted.point.coefficients)
     truth = values_of(updated)
     for name in ("inertia_xx", "inertia_yy", "motor_constant"):
@@ -56,10 +56,10 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
     mixed = job_of(settings, (full_flight, second), ())
     assert mixed.inlets == ("actuator", "rotor_speed")
     start = mixed.objective.start(mixed.space.initial)
-    stage = stage_for(mixed)
-    both = mixed.objective.sums(start, stage)
+    criterion = stage_for(mixed)
+    both = mixed.objective.sums(start, criterion)
     alone = single.objective.sums(single.objective.start(single.space.initial), stage_for(single))
-    count = single.objective.lanes.count
+    count = single.objective.segments.count
     np.testing.assert_allclose(both.loss[:count], alone.loss, rtol=1e-8)
     np.testing.assert_allclose(both.gradient[..., :count], alone.gradient, rtol=1e-6, atol=1e-6)
     fitted = fitted_through(mixed, tmp_path)
@@ -71,8 +71,10 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
 
 def stage_for(job):
     progress = beginning(job.objective, job.space.initial[None])
-    (leg,) = [leg for leg in plan_of(job) if leg.name == WHOLE]
-    return stage_of(leg, progress.scales, np.asarray(progress.points.offsets[0]), progress.states)
+    (stage,) = [stage for stage in plan_of(job) if stage.name == WHOLE]
+    return criterion_of(
+        stage, progress.scales, np.asarray(progress.points.offsets[0]), progress.states
+    )
 
 
 def plan_of(job):
@@ -107,7 +109,7 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     free = (*FREE, "mass", "inertia_zz")
     job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
     said = []
-    fitted, examination = with_the_untold_held(
+    fitted, examination = with_undetermined_held(
         job, fitted_through(job, tmp_path), lambda *_: None, said.append
     )
     assert fitted.held["motor_constant"] == "mass"

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuner.identifiability.making import problem, stage_of
+from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.objective.batch import CHUNK, evaluate
-from tuner.objective.terms import Point
+from tuner.objective.criterion import Point
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 
@@ -18,14 +18,14 @@ def fit():
 
 
 def test_each_vector_gives_what_it_gives_alone(fit):
-    stage = eqx.tree_at(lambda s: s.huber, stage_of(fit), jnp.asarray(2.0))
+    criterion = eqx.tree_at(lambda s: s.huber, criterion_of(fit), jnp.asarray(2.0))
     steps = np.random.default_rng(1).normal(0.0, 0.2, (CHUNK + 1, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
     late = jnp.full((5, 2), 0.1)
-    batch = evaluate(fit, vectors, Point(jnp.asarray(vectors[0]), late), stage)
+    batch = evaluate(fit, vectors, Point(jnp.asarray(vectors[0]), late), criterion)
     assert batch.loss.shape == (CHUNK + 1, 2)
     for number in (0, 3, CHUNK):
-        alone = fit.sums(Point(jnp.asarray(vectors[number]), late), stage, derivatives=False)
+        alone = fit.sums(Point(jnp.asarray(vectors[number]), late), criterion, derivatives=False)
         np.testing.assert_allclose(batch.loss[number], alone.loss, rtol=1e-9)
         for name, squares in alone.squares.items():
             np.testing.assert_allclose(batch.squares[name][number].sum(axis=0), squares, rtol=1e-9)

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.tuner.identifiability.making import problem, stage_of
+from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
 from tuner.flights.flight import Series
 from tuner.job.prepare import job_of
@@ -19,7 +19,7 @@ from tuner.objective.normal import Objective
 def program(objective: Objective) -> object:
     """Return what compiled code belongs to: statics, structure, shapes and types."""
     point = objective.start(objective.space.initial)
-    arguments = objective.data(point.offsets, stage_of(objective)), objective.tunable
+    arguments = objective.data(point.offsets, criterion_of(objective)), objective.tunable
     leaves = [jax.typeof(np.asarray(leaf)) for leaf in jax.tree.leaves(arguments)]
     return objective.flier, jax.tree.structure(arguments), leaves
 
@@ -56,14 +56,14 @@ def test_a_flight_a_little_shorter_is_the_same_program(flight, updated):
 def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypatch):
     groups = ("inertia_xx", "inertia_zz", "mass"), ("motor_constant", "moment_constant")
     fit = problem((*groups[0], *groups[1]))
-    names, stage = list(fit.space.names), stage_of(fit)
+    names, criterion = list(fit.space.names), criterion_of(fit)
     traced = []
     forward = normal._jacobian_forward
     monkeypatch.setattr(normal, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
-    found = fit.jacobian(fit.start(fit.space.initial), stage, columns=3)
+    found = fit.jacobian(fit.start(fit.space.initial), criterion, columns=3)
     for group in groups:
         one = problem(group)
-        alone = one.jacobian(one.start(one.space.initial), stage, columns=3)
+        alone = one.jacobian(one.start(one.space.initial), criterion, columns=3)
         for channel, columns in alone.columns.items():
             for number, name in enumerate(one.space.names):
                 np.testing.assert_allclose(

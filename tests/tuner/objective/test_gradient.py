@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.tuner.identifiability.making import problem, stage_of
+from tests.tuner.uncertainty.making import criterion_of, problem
+from tuner.objective.criterion import Point
 from tuner.objective.gradient import gradients
-from tuner.objective.terms import Point
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 
@@ -18,14 +18,14 @@ def fit():
 
 
 def test_reverse_mode_gives_forward_modes_gradient(fit):
-    stage = eqx.tree_at(lambda s: s.huber, stage_of(fit), jnp.asarray(2.0))
+    criterion = eqx.tree_at(lambda s: s.huber, criterion_of(fit), jnp.asarray(2.0))
     late = jnp.full((5, 2), 0.1)
     steps = np.random.default_rng(1).normal(0.0, 0.2, (3, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
-    found = gradients(fit, vectors, Point(jnp.asarray(vectors[0]), late), stage)
+    found = gradients(fit, vectors, Point(jnp.asarray(vectors[0]), late), criterion)
     assert found.gradient.shape == (len(FREE), 3)
     for number, vector in enumerate(vectors):
-        sums = fit.sums(Point(jnp.asarray(vector), late), stage)
+        sums = fit.sums(Point(jnp.asarray(vector), late), criterion)
         np.testing.assert_allclose(found.loss[number], np.sum(sums.loss), rtol=1e-9)
         forward = np.sum(sums.gradient, axis=-1)[: len(FREE)]
         np.testing.assert_allclose(
@@ -34,12 +34,12 @@ def test_reverse_mode_gives_forward_modes_gradient(fit):
 
 
 def test_a_smaller_memory_gives_the_same_sums(fit):
-    stage = stage_of(fit)
+    criterion = criterion_of(fit)
     point = fit.start(np.asarray(fit.space.initial))
     small = type(fit)(**{**vars(fit), "memory": 1})
-    data = small.data(point.offsets, stage)
-    assert small.flier.lanes_at_once(data, len(fit.space)) == 1
-    assert fit.flier.lanes_at_once(data, len(fit.space)) > 1
-    want, got = fit.sums(point, stage), small.sums(point, stage)
+    data = small.data(point.offsets, criterion)
+    assert small.flier.segments_at_once(data, len(fit.space)) == 1
+    assert fit.flier.segments_at_once(data, len(fit.space)) > 1
+    want, got = fit.sums(point, criterion), small.sums(point, criterion)
     np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
     np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)

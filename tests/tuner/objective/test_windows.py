@@ -10,7 +10,7 @@ from sim_jax.schedule import Schedule
 from tuner.errors import RecordingError
 from tuner.flights.flight import Series
 from tuner.objective.inlets import between, held, inlet_for, inlet_of
-from tuner.objective.lanes import window_lanes
+from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 
 
@@ -76,7 +76,7 @@ def test_the_actuator_inlet_holds_what_was_recorded(flight):
 
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
 def test_every_inlet_makes_lanes_whose_starts_are_free(flight, inlet):
-    lanes = window_lanes(
+    segments = window_segments(
         [flight],
         inlets=[inlet],
         seconds=1.0,
@@ -84,7 +84,7 @@ def test_every_inlet_makes_lanes_whose_starts_are_free(flight, inlet):
         lag=0.02,
         noise={"position": 1e-3, "body_rate": 0.02, "rotor_speed": 2.0, "command": 1e-3},
     )
-    assert lanes.freedom is not None
-    assert ("command" in lanes.measured) == (inlet == "body_rate")
-    assert ("rotor_speed" in lanes.measured) == (inlet != "rotor_speed")
-    assert lanes.begins.tolist() == pytest.approx(list(range(lanes.count)), abs=0.02)
+    assert segments.freedom is not None
+    assert ("command" in segments.measured) == (inlet == "body_rate")
+    assert ("rotor_speed" in segments.measured) == (inlet != "rotor_speed")
+    assert segments.begins.tolist() == pytest.approx(list(range(segments.count)), abs=0.02)

@@ -9,13 +9,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from tests.tuner.identifiability import making
+from tests.tuner.uncertainty import making
 from tuner.comparison.errors import FlightErrors
 from tuner.config import COEFFICIENTS, values_of, write_vehicle
+from tuner.examination.examine import Examination, examine
+from tuner.examination.files import write_files
+from tuner.examination.summary import tell
 from tuner.flights.flight import Array
-from tuner.identifiability.examine import Examination, examine
-from tuner.identifiability.files import write_files
-from tuner.identifiability.telling import tell
 from tuner.objective.normal import Objective
 from tuner.report import write_laps
 from tuner.report.record import Move, SearchRecord, Start
@@ -34,8 +34,8 @@ COMMAND = "tune --flights 'lab/*.bag' </script><b>"
 def problem(free: Sequence[str], *, without: Sequence[str] = ()) -> Objective:
     exact = making.problem(free)
     noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
-    kept = {name: one for name, one in noisy.lanes.measured.items() if name not in without}
-    changed: Objective = eqx.tree_at(lambda o: o.lanes.measured, noisy, kept)
+    kept = {name: one for name, one in noisy.segments.measured.items() if name not in without}
+    changed: Objective = eqx.tree_at(lambda o: o.segments.measured, noisy, kept)
     return changed
 
 
@@ -51,7 +51,7 @@ def write_run(folder: Path, free: Sequence[str], *, without: Sequence[str] = ())
     write_result(_result(found, errors, better), folder)
     write_laps(folder, {e.name: e for e in errors}, {e.name: e for e in better})
     save_traces(
-        folder, {name: _traces(objective, lane) for lane, name in enumerate(making.FLIGHTS)}
+        folder, {name: _traces(objective, segment) for segment, name in enumerate(making.FLIGHTS)}
     )
     values = values_of(vehicle)
     SearchRecord(
@@ -82,10 +82,10 @@ def _errors(name: str, size: float) -> FlightErrors:
     return FlightErrors(name, time, place, time, 10 * place, np.array([2.0, 4.0]), None)
 
 
-def _traces(objective: Objective, lane: int) -> dict[str, Array]:
+def _traces(objective: Objective, segment: int) -> dict[str, Array]:
     point = making.truth(objective)
     trace = objective.simulate(point.coefficients, jnp.asarray(objective.samples))
-    place = np.asarray(trace.channels["position"])[::4, :, lane]
+    place = np.asarray(trace.channels["position"])[::4, :, segment]
     time = np.arange(len(place)) * 4 / making.PHYSICS
     turn = 10.0 * place
     return {

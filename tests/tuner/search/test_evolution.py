@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from tests.tuner.identifiability.making import problem, truth, with_data
-from tuner.objective.lanes import OFFSETS
-from tuner.search.growing import grow
-from tuner.search.legs import Leg, plan
+from tests.tuner.uncertainty.making import problem, truth, with_data
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
 from tuner.search.progress import Free, beginning
+from tuner.search.stages import Stage, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
 
@@ -19,7 +19,7 @@ def fit():
 
 
 def evolved(fit, *, seed, free=None):
-    leg = Leg("CMA-ES", 400, 5.0, False, False, 12, 1e-3, False, False, "cma")
+    stage = Stage("CMA-ES", 400, 5.0, False, False, 12, 1e-3, False, False, "cma")
     free = Free(
         np.ones(len(FREE), bool) if free is None else free, np.zeros((len(OFFSETS), 2), bool)
     )
@@ -32,7 +32,7 @@ def evolved(fit, *, seed, free=None):
     told = []
     (end,) = grow(
         fit,
-        (leg,),
+        (stage,),
         beginning(fit, start[None]),
         free=free,
         clipped=False,
@@ -72,8 +72,8 @@ def test_what_is_held_stays(fit):
 @pytest.mark.parametrize("windows", [True, False])
 def test_plans_do_what_their_method_says(windows):
     def solvers(method):
-        legs = plan(method, 4000, 400.0, windows=windows, robust=True, steps=50)
-        return [leg.solver for leg in legs]
+        stages = plan(method, 4000, 400.0, windows=windows, robust=True, steps=50)
+        return [stage.solver for stage in stages]
 
     assert set(solvers("gradient")) == {"gradient"}
     hybrid = solvers("hybrid")

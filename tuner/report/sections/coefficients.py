@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tuner.config import COEFFICIENTS
-from tuner.identifiability.knowledge import Known
+from tuner.examination.knowledge import Known
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.identifiability.knowledge import Knowledge, OutputChange
+from tuner.examination.knowledge import Knowledge, OutputChange
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tuner.identifiability.global_indices import MEANING, GlobalIndices
 from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.sensitivity.global_files import MEANING, GlobalIndices
 
 
 def whole_range(contents: Contents) -> Section | None:

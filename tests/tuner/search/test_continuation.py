@@ -1,0 +1,71 @@
+"""The growing horizon on two short simulated flights whose truth is known."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import problem, truth, with_data
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
+from tuner.search.progress import Free, beginning
+from tuner.search.stages import schedule_of
+
+FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
+
+
+@pytest.fixture(scope="module")
+def fit():
+    return with_data(problem(FREE), truth(problem(FREE)), noise=np.random.default_rng(5))
+
+
+def searched(fit, vectors, *, offsets=False):
+    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
+    told = []
+    free = Free(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
+    progress = beginning(fit, np.asarray(vectors))
+    for state in grow(fit, stages, progress, free=free, clipped=False, tell=told.append):
+        progress = state
+    return progress, told
+
+
+def test_truth_is_recovered_from_every_start(fit):
+    wrong = {"inertia_xx": 1.5, "inertia_zz": 0.7, "time_constant_up": 1.6, "motor_constant": 0.8}
+    values = fit.space.values(jnp.asarray(fit.space.initial))
+    starts = [
+        fit.space.vector_of({n: float(v) * wrong.get(n, 1.0) ** sign for n, v in values.items()})
+        for sign in (1, -1)
+    ]
+    progress, told = searched(fit, starts)
+    for start in range(2):
+        found = fit.space.values(progress.points.coefficients[start])
+        for name, value in values.items():
+            assert float(found[name]) == pytest.approx(float(value), rel=0.02), (start, name)
+    assert progress.converged
+    assert len(told) == progress.evaluations
+    assert told[-1].iterations[-1].stage == "polish again"
+
+
+def test_a_flight_of_noise_is_weighed_down_and_the_others_are_fitted(fit):
+    noise = np.random.default_rng(6)
+    spoilt = {}
+    for name, measured in fit.segments.measured.items():
+        values = np.array(measured.values)
+        values[..., 1] += (
+            noise.normal(size=values[..., 1].shape) * 300.0 / np.array(measured.weight).max()
+        )
+        spoilt[name] = eqx.tree_at(lambda m: m.values, measured, jnp.asarray(values))
+    poisoned = eqx.tree_at(lambda o: o.segments.measured, fit, spoilt)
+    progress, _ = searched(poisoned, [np.asarray(fit.space.initial) + 0.1])
+    assert min(float(scale[1]) for scale in progress.scales.values()) > 10
+    found = fit.space.values(progress.points.coefficients[0])
+    true = fit.space.values(jnp.asarray(fit.space.initial))
+    assert float(found["inertia_xx"]) == pytest.approx(float(true["inertia_xx"]), rel=0.05)
+    assert float(found["motor_constant"]) == pytest.approx(float(true["motor_constant"]), rel=0.01)
+
+
+def test_the_same_search_twice_gives_the_same_numbers(fit):
+    start = [np.asarray(fit.space.initial) + 0.1]
+    first, _ = searched(fit, start)
+    second, _ = searched(fit, start)
+    np.testing.assert_array_equal(first.points.coefficients, second.points.coefficients)

@@ -1,0 +1,130 @@
+"""What takes longer: indices over a range, and profiles of the likelihood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty import making
+from tuner.errors import InputError
+from tuner.examination.examine import Examination, examine
+from tuner.objective.normal import Objective
+from tuner.search.fitted import Fitted
+from tuner.sensitivity.global_files import (
+    GlobalIndices,
+    Method,
+    read_global,
+    write_global,
+)
+from tuner.sensitivity.global_indices import _outputs, whole_range
+from tuner.uncertainty.profile import profile
+from tuner.uncertainty.profile_files import Profile, read_profiles, write_profiles
+
+FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
+
+
+@pytest.fixture(scope="module")
+def objective() -> Objective:
+    exact = making.problem(FREE)
+    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def fitted(objective: Objective) -> Fitted:
+    return making.fitted_of(objective, making.truth(objective))
+
+
+@pytest.fixture(scope="module")
+def examination(fitted: Fitted) -> Examination:
+    return examine(fitted)
+
+
+def indices(objective: Objective, method: Method, samples: int) -> GlobalIndices:
+    bounds = {p.name: (p.initial / 1.3, p.initial * 1.3) for p in objective.space.parameters}
+    return whole_range(
+        objective,
+        making.truth(objective),
+        making.criterion_of(objective),
+        method=method,
+        flights=making.FLIGHTS,
+        bounds=bounds,
+        samples=samples,
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "samples", "simulations"), [("morris", 4, 16), ("sobol", 7, 40)]
+)
+def test_indices_put_first_what_matters_most(
+    objective: Objective, method: Method, samples: int, simulations: int, tmp_path: Path
+) -> None:
+    found = indices(objective, method, samples)
+    assert found.simulations == simulations
+    total = {one.coefficient: one.total for one in found.indices if not one.flight}
+    assert total["motor_constant"] > 10 * total["rolling_moment_coefficient"]
+    spin = {
+        one.coefficient: one.total
+        for one in found.indices
+        if (one.flight, one.channel) == ("spin", "body_rate")
+    }
+    assert spin["moment_constant"] > spin["rolling_moment_coefficient"]
+    assert indices(objective, method, samples) == found
+    write_global(found, tmp_path)
+    assert read_global(tmp_path) == found
+    lines = (tmp_path / "global_sensitivity.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(FREE) * (1 + 8)
+
+
+def test_a_crash_counts_as_no_better_than_the_worst_that_flew(objective: Objective) -> None:
+    channels = objective.segments.measured
+    squares = {name: np.ones((3, m.weight.shape[1], 2)) for name, m in channels.items()}
+    for one in squares.values():
+        one[1] = 100.0
+        one[2] = np.nan
+    crashed = np.array([[True, False], [False, False], [False, False]])
+    names, values = _outputs(objective, squares, crashed, making.FLIGHTS)
+    swing = names.index(("swing", "position"))
+    spin = names.index(("spin", "position"))
+    assert values[0, swing] == values[1, swing]  # it fell on the swing
+    assert values[0, spin] < values[1, spin]  # and flew the spin
+    assert values[2, swing] == values[1, swing]  # not a number is a failure too
+    assert np.isfinite(values).all()
+
+
+@pytest.fixture(scope="module")
+def known(examination: Examination, fitted: Fitted) -> Profile:
+    return profile(examination, fitted.criterion, "moment_constant")
+
+
+@pytest.mark.slow
+def test_a_well_known_coefficients_profile_is_its_interval(
+    examination: Examination, known: Profile
+) -> None:
+    low, high = examination.uncertainty.estimates["moment_constant"].ci95
+    assert known.interval[0] is not None
+    assert known.interval[1] is not None
+    assert known.interval[1] - known.interval[0] == pytest.approx(high - low, rel=0.1)
+    assert min(one for one in known.rise if one is not None) == 0.0
+
+
+@pytest.mark.slow
+def test_what_cannot_be_told_has_an_open_profile(
+    examination: Examination, fitted: Fitted, known: Profile, tmp_path: Path
+) -> None:
+    rough = {name: 30.0 * scale for name, scale in fitted.criterion.scale.items()}
+    criterion = eqx.tree_at(lambda s: s.scale, fitted.criterion, rough)
+    rolling = profile(examination, criterion, "rolling_moment_coefficient")
+    assert rolling.interval == (None, None)
+    write_profiles([known, rolling], tmp_path)
+    read = read_profiles(tmp_path)
+    assert read is not None
+    assert read.profiles == [known, rolling]
+
+
+@pytest.mark.slow
+def test_an_unknown_coefficient_is_named(examination: Examination, fitted: Fitted) -> None:
+    with pytest.raises(InputError, match="did you mean 'moment_constant'"):
+        profile(examination, fitted.criterion, "moment_constand")

@@ -1,0 +1,153 @@
+"""Small fits whose truth is known: short simulated flights, sampled with white noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.control.position import ReferencePoint
+from sim_jax.crash import AIRBORNE
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.state import hover
+from sim_jax.vector import Vec3
+from tuner.coefficients import space_of
+from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
+from tuner.config.shipped import find_config
+from tuner.model import model_of, schedule_of
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.objective.segments import Measured, Segments
+from tuner.search.fitted import Fitted
+
+NOISE = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 4.0}
+SECONDS = 6.0
+PHYSICS = 200
+SAMPLE_EVERY = 4
+FLIGHTS = ("swing", "spin")
+
+
+def vehicle_file() -> VehicleFile:
+    return read_vehicle(find_config("vehicles", "hovergames", Path()))
+
+
+def controller_file() -> ControllerFile:
+    file = ControllerFile()
+    return file.replace(
+        physics=file.physics.replace(rate=float(PHYSICS)),
+        rate=file.rate.replace(rate=float(PHYSICS)),
+    )
+
+
+def references() -> ReferenceInlet:
+    """Return a swing along three axes that grows quickly, and a hover with a turn about up."""
+    time = np.arange(round(SECONDS * 100)) / 100.0
+    grow = np.minimum(time / 1.5, 1.0)
+    still = np.zeros_like(time)
+    x = np.stack([grow * 1.2 * np.sin(2.2 * time), still], axis=-1)
+    y = np.stack([grow * 1.0 * np.sin(3.1 * time), still], axis=-1)
+    z = np.stack([1.0 + grow * 0.4 * np.sin(2.7 * time), still + 1.0], axis=-1)
+    nothing = Vec3.zeros(jnp.asarray(x))
+    point = ReferencePoint(Vec3(jnp.asarray(x), jnp.asarray(y), jnp.asarray(z)), nothing, nothing)
+    return ReferenceInlet(point, spins=jnp.asarray([False, True]), yaw_rate=jnp.asarray([0.0, 2.0]))
+
+
+def problem(free: Sequence[str], *, job: Mapping[str, object] | None = None) -> Objective:
+    """Return a fit of two noiseless flights; the truth is the space's initial vector."""
+    vehicle, controller = vehicle_file(), controller_file()
+    space = space_of(vehicle, JobFile(free=tuple(free), **(job or {})))
+    model, schedule = model_of(vehicle, controller), schedule_of(controller)
+    samples = round(SECONDS * PHYSICS)
+    at_rest = Vec3(jnp.zeros(2), jnp.zeros(2), jnp.ones(2))
+    start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (2,)), hover(model.vehicle, at_rest)
+    )
+    segments = Segments(references(), start, _sensors(), jnp.arange(2))
+    objective = Objective(model, segments, space, schedule, samples, AIRBORNE)
+    return with_data(objective, truth(objective))
+
+
+def _sensors() -> dict[str, Measured]:
+    time = np.arange(SAMPLE_EVERY, round(SECONDS * PHYSICS) - 1, SAMPLE_EVERY) / PHYSICS
+    count = len(time)
+    found = {}
+    for channel, sigma in NOISE.items():
+        read = 4 if channel in ("attitude", "rotor_speed") else 3
+        compared = 3 if channel == "attitude" else read
+        values = np.zeros((count, read, 2))
+        values[:, 0] = 1.0 if channel == "attitude" else 0.0
+        found[channel] = Measured(
+            time=jnp.asarray(np.stack([time, time], axis=-1)),
+            values=jnp.asarray(values),
+            weight=jnp.full((count, compared, 2), 1.0 / sigma),
+        )
+    return found
+
+
+def truth(objective: Objective) -> Point:
+    return objective.start(objective.space.initial)
+
+
+def with_data(
+    objective: Objective, point: Point, *, noise: np.random.Generator | None = None
+) -> Objective:
+    """Return the fit with what would be recorded at a point, white noise added if asked for."""
+    trace = fly_at(objective, point)
+    measured = {}
+    for channel, old in objective.segments.measured.items():
+        values = np.array(trace[channel][SAMPLE_EVERY : objective.samples - 1 : SAMPLE_EVERY])
+        if noise is not None and channel == "attitude":
+            turn = noise.normal(size=(len(values), 3, 2)) * NOISE[channel] / 2.0
+            values = _turned(values, turn)
+        elif noise is not None:
+            values = values + noise.normal(size=values.shape) * NOISE[channel]
+        measured[channel] = Measured(old.time, jnp.asarray(values), old.weight)
+    return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
+
+
+def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
+    trace = objective.simulate(point.coefficients, jnp.asarray(objective.samples))
+    return {name: np.asarray(series) for name, series in trace.channels.items()}
+
+
+def _turned(quaternion: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Turn attitudes (n, 4, F) by small half angles (n, 3, F)."""
+    w, v = quaternion[:, :1], quaternion[:, 1:]
+    scalar = w - np.sum(v * half, axis=1, keepdims=True)
+    vector = w * half + v + np.cross(v, half, axis=1)
+    both = np.concatenate([scalar, vector], axis=1)
+    return both / np.linalg.norm(both, axis=1, keepdims=True)
+
+
+def criterion_of(objective: Objective, *, prior: float = 1.0) -> Criterion:
+    segments = objective.segments.count
+    return Criterion(
+        horizon=jnp.asarray(objective.samples),
+        scale={channel: jnp.ones(segments) for channel in objective.segments.measured},
+        held=jnp.zeros((2, segments)),
+        huber=jnp.asarray(jnp.inf),
+        prior=jnp.asarray(prior),
+    )
+
+
+def fitted_of(objective: Objective, point: Point) -> Fitted:
+    return Fitted(
+        objective=objective,
+        point=point,
+        criterion=criterion_of(objective),
+        noise=NOISE,
+        scales={name: dict.fromkeys(NOISE, 1.0) for name in FLIGHTS},
+        iterations=(),
+        outcomes=(),
+        method="gradient",
+        evaluations=0,
+        wall_time=0.0,
+        loss_initial=1.0,
+        loss_best=1.0,
+        converged=True,
+        message="",
+    )

@@ -1,0 +1,93 @@
+"""Standard errors against repeated experiments on linear problems."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner.uncertainty.covariance import covariance
+from tuner.uncertainty.information import FisherInformation
+
+COUNT, BLOCKS, LENGTH = 3, 40, 25
+
+
+def regression(noise: np.ndarray, design: np.ndarray) -> tuple[FisherInformation, np.ndarray]:
+    """Return the evidence of a least-squares fit, and the fit; truth is zero, σ is 1."""
+    fit, *_ = np.linalg.lstsq(design, noise, rcond=None)
+    rows = design.reshape(BLOCKS, LENGTH, COUNT)
+    residual = (design @ fit - noise).reshape(BLOCKS, LENGTH)
+    information = FisherInformation(
+        channels=("only",),
+        flight=np.zeros(1, int),
+        blocks=np.einsum("bnp,bnq->bpq", rows, rows)[None, None],
+        score=np.einsum("bnp,bn->bp", rows, residual)[None, None],
+        spread=np.full((1, 1), np.mean(residual**2)),
+        clock_prior=np.zeros((COUNT, COUNT)),
+        prior=1e-9 * np.eye(COUNT),
+        crashed=np.zeros(1, bool),
+    )
+    return information, fit
+
+
+def smooth_design(seed: int) -> np.ndarray:
+    """Return slowly varying columns, as sensitivities are."""
+    time = np.arange(BLOCKS * LENGTH) / LENGTH
+    phase = np.random.default_rng(seed).uniform(0, 6, COUNT)
+    waves = [np.sin(0.7 * (k + 1) * time + phase[k]) for k in range(COUNT)]
+    return np.stack(waves, axis=-1) + 0.3
+
+
+def autoregressive(generator: np.random.Generator, memory: float) -> np.ndarray:
+    steps = generator.normal(size=BLOCKS * LENGTH) * np.sqrt(1 - memory**2)
+    series = np.empty_like(steps)
+    last = generator.normal()
+    for index, step in enumerate(steps):
+        last = memory * last + step
+        series[index] = last
+    return series
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_the_standard_error_is_the_spread_of_repeated_fits(memory: float) -> None:
+    generator = np.random.default_rng(3)
+    design = smooth_design(1)
+    fits, errors = [], []
+    for _ in range(300):
+        information, fit = regression(autoregressive(generator, memory), design)
+        fits.append(fit)
+        errors.append(covariance(information).error)
+    spread = np.std(fits, axis=0)
+    assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.2)
+
+
+def test_white_noise_widens_hardly_anything() -> None:
+    generator = np.random.default_rng(5)
+    design = smooth_design(2)
+    found = [
+        covariance(regression(generator.normal(size=BLOCKS * LENGTH), design)[0]) for _ in range(50)
+    ]
+    assert np.median([one.inflation for one in found]) < 1.05
+    assert min(one.inflation.min() for one in found) >= 1.0
+
+
+def test_residuals_larger_than_assumed_widen_the_interval() -> None:
+    generator = np.random.default_rng(7)
+    design = smooth_design(3)
+    noise = generator.normal(size=BLOCKS * LENGTH)
+    quiet, _ = regression(noise, design)
+    loud, _ = regression(4.0 * noise, design)
+    assert covariance(loud).error == pytest.approx(4.0 * covariance(quiet).error, rel=1e-6)
+
+
+def test_a_direction_without_data_is_known_from_the_prior_alone() -> None:
+    generator = np.random.default_rng(9)
+    design = smooth_design(4)
+    design[:, 2] = design[:, 0]
+    information, _ = regression(generator.normal(size=BLOCKS * LENGTH), design)
+    information = FisherInformation(**{**vars(information), "prior": np.eye(COUNT) / 0.5**2})
+    found = covariance(information)
+    # the sum of the two is known, their difference has the prior's 0.5·√2, half of it each
+    assert found.error[0] == pytest.approx(0.5 / np.sqrt(2), rel=0.02)
+    assert found.data_error[0] > 10.0
+    assert found.data_error[1] == pytest.approx(found.error[1], rel=0.1)
+    assert found.correlation[0, 2] < -0.9

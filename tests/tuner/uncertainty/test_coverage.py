@@ -1,0 +1,44 @@
+"""Over repeats with different noise the 95 % intervals hold the truth as often as they say."""
+
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
+from tuner.search.progress import Free, beginning, point_of
+from tuner.search.stages import plan
+from tuner.uncertainty import uncertainty
+
+FREE = (
+    "inertia_xx",
+    "inertia_zz",
+    "input_scaling",
+    "time_constant_up",
+    "motor_constant",
+    "moment_constant",
+    "rotor_drag_coefficient",
+    "estimate_latency",
+)
+REPEATS = 20
+
+
+@pytest.mark.slow
+def test_intervals_cover_the_truth():
+    exact = problem(FREE)
+    right = exact.space.values(exact.space.initial)
+    stages = plan("gradient", exact.samples, 200.0, windows=False, robust=True, steps=20)[-3:]
+    free = Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool))
+    covered = np.zeros((REPEATS, len(FREE)), bool)
+    for repeat in range(REPEATS):
+        noisy = with_data(exact, truth(exact), noise=np.random.default_rng(100 + repeat))
+        progress = beginning(noisy, np.asarray(exact.space.initial)[None] + 0.02)
+        for reached in grow(noisy, stages, progress, free=free, clipped=False, tell=lambda _: None):
+            progress = reached
+        found = uncertainty(fitted_of(noisy, point_of(progress.points, 0)))
+        for number, name in enumerate(FREE):
+            low, high = found.estimates[name].ci95
+            covered[repeat, number] = low <= float(right[name]) <= high
+    share = covered.mean()
+    assert 0.85 <= share <= 1.0, covered.mean(axis=0)
+    assert covered.mean(axis=0).min() >= 0.7, dict(zip(FREE, covered.mean(axis=0), strict=True))

@@ -1,0 +1,61 @@
+"""The worst-determined combinations are found and named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner.uncertainty.directions import is_common_scale, weakest
+
+NAMES = ("mass", "inertia_xx", "motor_constant", "input_scaling")
+
+
+def covariance_of(vector: list[float], error: float) -> np.ndarray:
+    unit = np.array(vector) / np.linalg.norm(vector)
+    return 1e-6 * np.eye(len(unit)) + error**2 * np.outer(unit, unit)
+
+
+def test_a_common_scale_is_named_as_such() -> None:
+    worst = weakest(covariance_of([1, 1, 1, 0], 30.0), np.ones(4), NAMES)[0]
+    assert worst.null
+    assert worst.text == (
+        "mass, inertia_xx and motor_constant scale together: multiplied by one factor, every "
+        "motion stays the same; that factor cannot be told at all. Weigh the mass and fix it."
+    )
+    assert set(worst.moves) == {"mass", "inertia_xx", "motor_constant"}
+
+
+def test_a_trade_off_is_named_with_its_proportion_and_size() -> None:
+    worst = weakest(covariance_of([0, 0, 1, -0.5], 0.1), np.ones(4), NAMES)[0]
+    assert not worst.null
+    assert "motor_constant trades off against input_scaling" in worst.text
+    assert "motor_constant +100%, input_scaling -50%" in worst.text
+    # one standard error along the eigenvector moves its largest member by 0.1·1/√1.25
+    assert worst.error == pytest.approx(0.1 / np.sqrt(1.25), rel=1e-3)
+    assert "±18 %" in worst.text
+
+
+def test_one_coefficient_alone() -> None:
+    worst = weakest(covariance_of([0, 1, 0, 0], 0.2), np.ones(4), NAMES)[0]
+    assert worst.text == "inertia_xx alone: it is known to ±39 %."
+
+
+def test_the_reference_says_what_counts_as_a_hundred_percent() -> None:
+    covariance = np.diag([1e-4, 1e-4, 1e-4, 4e-6])
+    reference = np.array([1.0, 1.0, 1.0, 0.01])
+    worst = weakest(covariance, reference, NAMES)[0]
+    assert set(worst.moves) == {"input_scaling"}
+    assert worst.error == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("moves", "common"),
+    [
+        ({"mass": 1.0, "motor_constant": 0.97, "moment_constant": 0.01}, True),
+        ({"mass": 1.0, "motor_constant": 0.5}, False),
+        ({"mass": 1.0, "motor_constant": 1.0, "moment_constant": 0.6}, False),
+        ({"motor_constant": 1.0, "inertia_xx": 1.0}, False),
+    ],
+)
+def test_what_a_common_scale_is(moves: dict[str, float], common: bool) -> None:
+    assert is_common_scale(moves) is common

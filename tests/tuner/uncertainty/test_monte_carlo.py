@@ -1,0 +1,48 @@
+"""Intervals against the spread of fits to fifty noisy recordings of the same flights."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty import making
+from tuner.objective.criterion import Point
+from tuner.objective.normal import Objective
+from tuner.search.levenberg_marquardt import advance, begin, on_host
+from tuner.uncertainty import uncertainty
+
+FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
+REFITS = 50
+JUDGED = 5
+ITERATIONS = 3
+
+
+def refit(objective: Objective, start: Point) -> Point:
+    criterion = on_host(making.criterion_of(objective, prior=0.01))
+    offsets = np.asarray(start.offsets)
+    free = np.concatenate([np.ones(len(objective.space)), np.zeros(offsets.size)])
+    points = Point(np.asarray(start.coefficients)[None], offsets[None])
+    step = begin(points, free)
+    for _ in range(ITERATIONS):
+        step = advance(objective, step, criterion, free)
+    return Point(jnp.asarray(step.point.coefficients[0]), jnp.asarray(offsets))
+
+
+@pytest.mark.slow
+def test_standard_errors_are_the_spread_of_refits() -> None:
+    exact = making.problem(FREE)
+    truth, noise = making.truth(exact), np.random.default_rng(5)
+    found, errors = [], []
+    for number in range(REFITS):
+        noisy = making.with_data(exact, truth, noise=noise)
+        point = refit(noisy, truth)
+        found.append(np.asarray(noisy.space.scaled(point.coefficients)))
+        if number < JUDGED:
+            judged = uncertainty(making.fitted_of(noisy, point))
+            errors.append(judged.covariance.error)
+    spread = np.std(found, axis=0, ddof=1)
+    assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.3)
+    # and they scatter about the truth
+    true = np.asarray(exact.space.scaled(truth.coefficients))
+    assert np.all(np.abs(np.mean(found, axis=0) - true) < 3.5 * spread / np.sqrt(REFITS))

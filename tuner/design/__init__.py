@@ -1,0 +1,1 @@
+"""Experiment design: which flight, flown next, would narrow which interval."""

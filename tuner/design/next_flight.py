@@ -1,0 +1,288 @@
+"""Which one more flight would tell the most about what is not known well yet.
+
+Every candidate is simulated with the coefficients found, differentiated by all of them, and weighed
+with the noise that the recorded flights had in each channel; its information is added to theirs.
+The measures are those of experiment design: the D-optimal flight shrinks the volume of the
+confidence ellipsoid the most, the A-optimal one the sum of squared relative errors (Goodwin and
+Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 1977).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.crash import Limits
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.rigid_body import Motion
+from sim_jax.schedule import Schedule
+from sim_jax.state import Start, hover
+from sim_jax.vector import Vec3
+from tuner.design.candidates import Arena, Candidate, candidates
+from tuner.design.proposals import Proposal, Proposals, in_words
+from tuner.examination.examine import Examination
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.objective.segments import Measured, Segments
+from tuner.simulation.trajectory import published
+from tuner.uncertainty.covariance import WIDE
+from tuner.uncertainty.information import summed
+from tuner.uncertainty.verdict import Verdict
+
+Array = NDArray[np.float64]
+
+WEIGHED = ("mass",)
+"""Fixed because it is weighed: nobody flies for it."""
+LOG_RATE = 100
+"""Hz, at least, at which candidates are logged."""
+SAMPLE_RATE = 100.0
+"""Hz at which they are compared; their weight stands for the samples in between."""
+
+
+@dataclass(frozen=True)
+class Habits:
+    """How flights are recorded and weighed.
+
+    Attributes
+    ----------
+    spin_channels
+        What a yaw spin is compared by.
+    seconds
+        How long a flight would last.
+    """
+
+    spin_channels: Sequence[str]
+    seconds: float
+
+
+def next_flights(
+    examination: Examination, criterion: Criterion, *, arena: Arena, habits: Habits
+) -> Proposals:
+    """Rank the flights that could be flown next.
+
+    Parameters
+    ----------
+    examination
+        Of the recorded flights.
+    criterion
+        In whose weights they speak.
+    arena
+        Where the next one must fit.
+    habits
+        How it would be recorded.
+    """
+    all_free = examination.all_free
+    flights = candidates(arena)
+    objective = _laid_out(all_free.objective, flights, habits)
+    point, weights = _there(all_free.point, criterion, objective)
+    jacobian = objective.jacobian(point, weights)
+    kinds = (np.asarray(all_free.point.offsets) != 0.0).any(axis=1)
+    clocks = np.repeat(kinds[:, None], len(flights), axis=1)
+    information = summed(objective, point, weights, jacobian, clocks=clocks)
+    flown = ~information.crashed & _inside(objective, jacobian.residuals, arena)
+    gained = information.blocks.sum(axis=(0, 2))
+    now = examination.information.data + examination.information.prior / WIDE**2
+    return _ranked(
+        examination,
+        [(one, more) for one, more, flies in zip(flights, gained, flown, strict=True) if flies],
+        now,
+        arena=arena,
+        seconds=habits.seconds,
+    )
+
+
+def _ranked(
+    examination: Examination,
+    flights: Sequence[tuple[Candidate, Array]],
+    now: Array,
+    *,
+    arena: Arena,
+    seconds: float,
+) -> Proposals:
+    names = examination.sensitivity.names
+    fitted = examination.uncertainty
+    count = len(fitted.names)
+    verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
+    verdicts |= {name: one.estimates[name].verdict for name, one in examination.freed.items()}
+    weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
+    free = [name for name in weak if name in fitted.names]
+    fixed = [name for name in weak if name in examination.freed and name not in WEIGHED]
+    targets = free or fixed or list(fitted.names)
+    rows = [
+        Proposal(
+            name=one.name,
+            trajectory=one.trajectory.model_dump(mode="json"),
+            shrinks={name: _ratio(now, more, names.index(name), count) for name in targets},
+            volume=_volume(now, more, count),
+        )
+        for one, more in flights
+    ]
+    rows.sort(key=lambda row: (row.mean, row.name))
+    return Proposals(
+        arena=(arena.x, arena.y, arena.z),
+        seconds=seconds,
+        targets=targets,
+        all_known=not free,
+        flights=rows,
+        sentences=in_words(rows, targets, fixed=tuple(examination.freed)),
+    )
+
+
+def _ratio(now: Array, more: Array, place: int, count: int) -> float:
+    """Return an interval's width after a flight over that before, all fitted ones free too."""
+    places = [*range(count), *([place] if place >= count else [])]
+    own = np.ix_(places, places)
+    row = places.index(place)
+    before, after = (_inverse(matrix[own])[row, row] for matrix in (now, now + more))
+    return float(np.sqrt(after / before))
+
+
+def _volume(now: Array, more: Array, count: int) -> float:
+    """Return the factor on the geometric mean of the ellipsoid's half axes of the fitted ones."""
+    before, after = (
+        np.linalg.slogdet(_scaled(matrix[:count, :count], now[:count, :count]))[1]
+        for matrix in (now, now + more)
+    )
+    return float(np.exp(-0.5 * (after - before) / count))
+
+
+def _scaled(matrix: Array, by: Array) -> Array:
+    unit = 1.0 / np.sqrt(np.diag(by))
+    return np.asarray(matrix * np.outer(unit, unit))
+
+
+def _inverse(matrix: Array) -> Array:
+    unit = 1.0 / np.sqrt(np.diag(matrix))
+    return np.asarray(np.linalg.inv(_scaled(matrix, matrix)) * np.outer(unit, unit))
+
+
+def _laid_out(objective: Objective, flights: Sequence[Candidate], habits: Habits) -> Objective:
+    """Return the problem with candidates in the place of recordings, whose values are zero."""
+    schedule = _logged_less(objective.schedule)
+    references = [
+        published(
+            one.trajectory,
+            duration=habits.seconds,
+            control_rate=schedule.position_control_rate,
+        )
+        for one in flights
+    ]
+    inlet: ReferenceInlet = jax.tree.map(
+        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves], axis=-1),
+        *(reference.inlet for reference in references),
+    )
+    starts = Vec3(
+        *(jnp.stack([getattr(r.start, axis) for r in references]) for axis in ("x", "y", "z"))
+    )
+    spins = np.array([one.trajectory.name == "yaw_spin" for one in flights])
+    segments = Segments(
+        inlet=inlet,
+        start=_hovering(objective, starts, len(flights)),
+        measured={
+            name: _sampled(
+                measured,
+                silent=spins & (name not in habits.spin_channels),
+                seconds=habits.seconds,
+                recorded=_seconds(objective),
+            )
+            for name, measured in objective.segments.measured.items()
+        },
+        flight=jnp.arange(len(flights)),
+    )
+    return Objective(
+        model=objective.model,
+        segments=segments,
+        space=objective.space,
+        schedule=schedule,
+        samples=round(habits.seconds * schedule.log_rate),
+        limits=Limits(),
+        memory=objective.memory,
+    )
+
+
+def _logged_less(schedule: Schedule) -> Schedule:
+    """Return the schedule with the lowest rate of logging that is not below `LOG_RATE`."""
+    physics = schedule.physics_rate
+    rates = [physics // all_free for all_free in range(1, physics + 1) if physics % all_free == 0]
+    return replace(schedule, log_rate=min(rate for rate in rates if rate >= min(LOG_RATE, physics)))
+
+
+def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
+    start = hover(objective.model.vehicle, places)
+    wide: Start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (count,)), start
+    )
+    assert isinstance(wide.motion, Motion)
+    return wide
+
+
+def _seconds(objective: Objective) -> Array:
+    """Return (F,) s that each segment was recorded for."""
+    ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
+    return np.asarray(np.maximum(np.max(ends, axis=0), 1e-9))
+
+
+def _sampled(
+    measured: Measured, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
+) -> Measured:
+    """Return one channel of every candidate: as often and as precisely recorded as the best was.
+
+    Parameters
+    ----------
+    measured
+        The channel of the recorded segments.
+    silent
+        (C,) for which candidates it does not speak.
+    seconds, recorded
+        How long a candidate lasts, and (F,) how long each segment was recorded.
+    """
+    weight = np.asarray(measured.weight)
+    rate = (weight > 0).sum(axis=0) / recorded
+    each = np.where(weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(rate / SAMPLE_RATE), 0.0)
+    time = np.arange(1, int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
+    segments = len(silent)
+    values = np.zeros((len(time), np.asarray(measured.values).shape[1], segments))
+    if values.shape[1] > weight.shape[1]:
+        values[:, 0] = 1.0  # an attitude
+    alike = np.where(silent, 0.0, each.max(axis=1)[:, None])
+    return Measured(
+        time=jnp.asarray(np.repeat(time[:, None], segments, axis=1)),
+        values=jnp.asarray(values),
+        weight=jnp.asarray(np.broadcast_to(alike, (len(time), *alike.shape))),
+    )
+
+
+def _there(point: Point, criterion: Criterion, objective: Objective) -> tuple[Point, Criterion]:
+    """Return point and stage for other flights: weighed as the recorded ones mostly were."""
+    count = objective.flights
+    offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
+    held = np.zeros((np.asarray(criterion.held).shape[0], count))
+    scale = {
+        name: jnp.full(count, float(np.median(np.asarray(one))))
+        for name, one in criterion.scale.items()
+    }
+    return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
+        horizon=jnp.asarray(objective.samples),
+        scale=scale,
+        held=jnp.asarray(held),
+        huber=jnp.asarray(np.inf),
+        prior=criterion.prior,
+    )
+
+
+def _inside(
+    objective: Objective, residuals: dict[str, jax.Array], arena: Arena
+) -> NDArray[np.bool_]:
+    """Return (C,) whether the simulated vehicle stays between the walls, where that is told."""
+    fits = np.ones(objective.segments.count, bool)
+    if "position" not in residuals:
+        return fits
+    weight = np.asarray(objective.segments.measured["position"].weight)
+    place = np.abs(np.asarray(residuals["position"])) / np.where(weight > 0, weight, np.inf)
+    half = np.array([arena.x / 2, arena.y / 2, arena.z])
+    return np.asarray((place.max(axis=0) <= half[:, None]).all(axis=0))

@@ -1,0 +1,1 @@
+"""What recordings say of each coefficient: uncertainty and sensitivity together, as data."""

@@ -1,0 +1,97 @@
+"""What is known of the coefficients as tables for other programs: long CSV and matrices."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from tuner.config.yaml_file import write_text
+from tuner.examination.knowledge import Knowledge, write_knowledge
+
+SENSITIVITY_FILE = "sensitivity.csv"
+SHARES_FILE = "information_shares.csv"
+MATRICES = ("correlation", "covariance", "information")
+
+COLUMNS = (
+    "coefficient",
+    "fitted",
+    "flight",
+    "channel",
+    "axis",
+    "unit",
+    "rms_change_1pct",
+    "rmse",
+    "rmse_plus_10pct",
+    "rmse_minus_10pct",
+    "acts_from",
+    "acts_to",
+    "information_share",
+)
+
+
+def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
+    """Write everything into a folder, and return the paths.
+
+    ``sensitivity.csv`` has one row for each coefficient and axis of a channel of a flight;
+    ``information_share`` is the whole channel's on that flight. The matrices are square, their
+    first column and first row the names; covariance and information in the coefficients' units.
+
+    Raises
+    ------
+    ConfigError
+        The folder cannot be written to.
+    """
+    write_knowledge(knowledge, folder)
+    texts = {
+        SENSITIVITY_FILE: table(COLUMNS, _sensitivity(knowledge)),
+        SHARES_FILE: table(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
+    }
+    for name in MATRICES:
+        rows = zip(knowledge.names, getattr(knowledge, name), strict=True)
+        header = ("coefficient", *knowledge.names)
+        texts[f"{name}.csv"] = table(header, ([one, *row] for one, row in rows))
+    for name, text in texts.items():
+        write_text(folder / name, text)
+    return tuple(folder / name for name in texts)
+
+
+def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
+    spans = {one.flight: one.span for one in knowledge.acting}
+    for name, known in knowledge.coefficients.items():
+        for output in knowledge.outputs:
+            if name not in output.change:
+                continue  # tied to another, which speaks for both
+            yield [
+                name,
+                int(known.fitted),
+                output.flight,
+                output.channel,
+                output.axis,
+                output.unit,
+                output.change[name],
+                output.rmse,
+                output.rmse_up[name],
+                output.rmse_down[name],
+                *spans[output.flight][name],
+                known.shares[output.channel][output.flight],
+            ]
+
+
+def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
+    for name, known in knowledge.coefficients.items():
+        for channel, flights in known.shares.items():
+            for flight, share in flights.items():
+                yield [name, flight, channel, share]
+        yield [name, "", "prior", known.prior_share]
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return CSV text, numbers in full precision and nothing for None."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(["" if v is None else repr(v) if isinstance(v, float) else v for v in row])
+    return text.getvalue()

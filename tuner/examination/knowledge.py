@@ -1,0 +1,228 @@
+"""What was found about every coefficient, as ``sensitivity.json`` holds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from tuner.config.model import config_error
+from tuner.config.yaml_file import Document, write_text
+from tuner.errors import ConfigError, InputError
+
+SCHEMA_VERSION = 1
+P = TypeVar("P", bound=BaseModel)
+KNOWLEDGE_FILE = "sensitivity.json"
+MAX_BYTES = 50_000_000
+
+Number = float | None
+"""None stands for what cannot be told: a simulation that crashed, an interval without end."""
+
+
+class Part(BaseModel):
+    """A part of what was found; keys that a later version adds are passed over."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class Known(Part):
+    """One coefficient.
+
+    Attributes
+    ----------
+    unit
+        Of everything said about it.
+    fitted
+        Whether it was fitted; of a fixed one is said what would be known, were it fitted too.
+    value, std_error, ci95
+        See `tuner.uncertainty.estimates.Estimate`.
+    verdict, reason
+        How well it is known, and why.
+    step
+        One hundred percent: its value, or its usual uncertainty where that is larger.
+    shares
+        Channel -> flight -> share of what is known of it that came from there.
+    prior_share
+        The rest: from the priors.
+    bias
+        Of a fixed one: fitted coefficient -> percent by which that is wrong for each percent by
+        which this one is.
+    """
+
+    unit: str
+    fitted: bool
+    value: float
+    std_error: Number
+    ci95: tuple[Number, Number]
+    verdict: str
+    reason: str
+    step: float
+    shares: dict[str, dict[str, float]]
+    prior_share: float
+    bias: dict[str, float]
+
+
+class OutputChange(Part):
+    """What the coefficients do to one recorded signal: an axis of a channel of a flight.
+
+    Attributes
+    ----------
+    flight, channel, axis, unit
+        Which signal.
+    rmse
+        Simulated minus recorded, in ``unit`` as everything here.
+    change
+        Coefficient -> RMS change for +1 %.
+    rmse_up, rmse_down
+        Coefficient -> RMSE for +10 % and −10 %; None where the simulation crashed.
+    """
+
+    flight: str
+    channel: str
+    axis: str
+    unit: str
+    rmse: float
+    change: dict[str, float]
+    rmse_up: dict[str, Number]
+    rmse_down: dict[str, Number]
+
+
+class Acting(Part):
+    """When coefficients act during one flight.
+
+    Attributes
+    ----------
+    flight
+        Its name.
+    windowed
+        Whether time counts from the start of each window of the flight, not from the mission's.
+    time
+        s, middles of equal stretches.
+    change
+        Coefficient -> RMS change of all channels for +1 % in each stretch, in standard deviations.
+    span
+        Coefficient -> s from and to which half of its effect is felt; the shortest such stretch.
+    """
+
+    flight: str
+    windowed: bool = False
+    time: list[float]
+    change: dict[str, list[float]]
+    span: dict[str, tuple[float, float]]
+
+
+class Combination(Part):
+    """A direction of the fitted coefficients, see `tuner.uncertainty.directions.Direction`."""
+
+    text: str
+    moves: dict[str, float]
+    error: float
+    null: bool
+
+
+class ResidualColour(Part):
+    """Whether residuals are white noise, see `tuner.uncertainty.whiteness.Residual`."""
+
+    flight: str
+    channel: str
+    rms: float
+    spacing: float
+    autocorrelation: list[float]
+    limit: float
+    memory: float
+    white: bool
+
+
+class Knowledge(Part):
+    """The content of ``sensitivity.json``.
+
+    Attributes
+    ----------
+    coefficients
+        Name -> what is known; the fitted ones first.
+    flights, channels
+        Names.
+    outputs, acting, residuals
+        Of every recorded signal, of every flight, of every channel of a flight.
+    directions
+        The worst-determined combinations of the fitted coefficients, worst first.
+    names
+        The rows of the matrices: the fitted parameters; of a tie, the first of the group.
+    correlation
+        Of their estimates.
+    covariance, information
+        Of their estimates, flights and priors together, and what the flights alone say; in the
+        coefficients' units.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    coefficients: dict[str, Known]
+    flights: list[str]
+    channels: list[str]
+    outputs: list[OutputChange]
+    acting: list[Acting]
+    residuals: list[ResidualColour]
+    directions: list[Combination]
+    names: list[str]
+    correlation: list[list[float]]
+    covariance: list[list[float]]
+    information: list[list[float]]
+
+
+def numbers(values: NDArray[np.float64]) -> list[Number]:
+    """Return a row with None for what is not finite."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def write_knowledge(knowledge: Knowledge, folder: Path) -> None:
+    """Write ``sensitivity.json``; it appears whole.
+
+    Raises
+    ------
+    ConfigError
+        The folder cannot be written to.
+    """
+    write_text(folder / KNOWLEDGE_FILE, knowledge.model_dump_json() + "\n")
+
+
+def read_knowledge(folder: Path) -> Knowledge | None:
+    """Read ``sensitivity.json`` of a folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or was written by a newer version.
+    """
+    return read_part(Knowledge, folder / KNOWLEDGE_FILE)
+
+
+def read_part(kind: type[P], path: Path) -> P | None:
+    """Read one file of a result folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, is no such file, or was written by a newer version.
+    """
+    if not path.exists():
+        return None
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "check the file") from None
+    if len(raw) > MAX_BYTES:
+        raise InputError(path, "is larger than 50 MB", "was it edited?")
+    try:
+        part = kind.model_validate_json(raw)
+    except ValidationError as error:
+        wrong: ConfigError = config_error(error, Document(path, {}, {}))
+        raise InputError(path, wrong.what, wrong.remedy) from None
+    version = getattr(part, "schema_version", SCHEMA_VERSION)
+    if version > SCHEMA_VERSION:
+        newer = f"has schema version {version}, newer than {SCHEMA_VERSION}"
+        raise InputError(path, newer, "update tune")
+    return part

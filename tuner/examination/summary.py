@@ -1,0 +1,177 @@
+"""An examination as the plain data that is written, tabulated and plotted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients import Space
+from tuner.config import COEFFICIENTS
+from tuner.examination.examine import Examination
+from tuner.examination.knowledge import (
+    Acting,
+    Combination,
+    Knowledge,
+    Known,
+    OutputChange,
+    ResidualColour,
+    numbers,
+)
+from tuner.objective.criterion import Point
+from tuner.uncertainty.estimates import Uncertainty
+
+Array = NDArray[np.float64]
+
+
+def tell(examination: Examination, space: Space, point: Point) -> Knowledge:
+    """Return what an examination of a fit found.
+
+    Parameters
+    ----------
+    examination
+        What was found.
+    space, point
+        The fit's own coefficients and where it ended.
+    """
+    found = examination.uncertainty
+    worth = _worth(space, point)
+    count = len(found.names)
+    information = examination.information.data[:count, :count]
+    return Knowledge(
+        coefficients=_coefficients(examination, space),
+        flights=list(found.flights),
+        channels=list(found.channels),
+        outputs=_outputs(examination),
+        acting=_acting(examination),
+        residuals=[
+            ResidualColour(
+                flight=one.flight,
+                channel=one.channel,
+                rms=one.rms,
+                spacing=float(one.lag[1]),
+                autocorrelation=one.autocorrelation.round(4).tolist(),
+                limit=one.limit,
+                memory=one.memory,
+                white=one.white,
+            )
+            for one in examination.residuals
+        ],
+        directions=[
+            Combination(text=one.text, moves=dict(one.moves), error=one.error, null=one.null)
+            for one in found.directions
+        ],
+        names=list(found.names),
+        correlation=found.correlation.tolist(),
+        covariance=(found.covariance.matrix * np.outer(worth, worth)).tolist(),
+        information=(information / np.outer(worth, worth)).tolist(),
+    )
+
+
+def _worth(space: Space, point: Point) -> Array:
+    """Return (K,) units of each parameter in one of its scaled coordinate."""
+    scaled = np.asarray(space.scaled(jnp.asarray(point.coefficients)))
+    return np.array(
+        [
+            space.from_scaled(i, x) if parameter.scale == "log" else 1.0
+            for i, (parameter, x) in enumerate(zip(space.parameters, scaled, strict=True))
+        ]
+    )
+
+
+def _coefficients(examination: Examination, space: Space) -> dict[str, Known]:
+    found = examination.uncertainty
+    steps = dict(zip(examination.sensitivity.names, examination.sensitivity.step, strict=True))
+    known = {}
+    for index, parameter in enumerate(space.parameters):
+        for name, ratio in parameter.ratios.items():
+            step = float(steps[parameter.name] * abs(ratio))
+            known[name] = _known(name, found, index, step, fitted=True, bias={})
+    for row, (name, freed) in enumerate(examination.freed.items()):
+        bias = dict(zip(found.names, examination.bias[row].tolist(), strict=True))
+        known[name] = _known(
+            name, freed, len(freed.names) - 1, float(steps[name]), fitted=False, bias=bias
+        )
+    return known
+
+
+def _known(
+    name: str,
+    found: Uncertainty,
+    index: int,
+    step: float,
+    *,
+    fitted: bool,
+    bias: Mapping[str, float],
+) -> Known:
+    estimate = found.estimates[name]
+    error, low, high = numbers(np.array([estimate.std_error, *estimate.ci95]))
+    return Known(
+        unit=COEFFICIENTS[name].unit,
+        fitted=fitted,
+        value=estimate.value,
+        std_error=error,
+        ci95=(low, high),
+        verdict=estimate.verdict.value,
+        reason=estimate.reason,
+        step=step,
+        shares={
+            channel: dict(zip(found.flights, row[:, index].tolist(), strict=True))
+            for channel, row in zip(found.channels, found.shares, strict=True)
+        },
+        prior_share=float(found.prior_share[index]),
+        bias=dict(bias),
+    )
+
+
+def _outputs(examination: Examination) -> list[OutputChange]:
+    sensitivity = examination.sensitivity
+    names = sensitivity.names
+    return [
+        OutputChange(
+            flight=output.flight,
+            channel=output.channel,
+            axis=output.axis,
+            unit=output.unit,
+            rmse=output.rmse,
+            change=dict(zip(names, sensitivity.change[:, row].tolist(), strict=True)),
+            rmse_up=dict(zip(names, numbers(sensitivity.rmse_up[:, row]), strict=True)),
+            rmse_down=dict(zip(names, numbers(sensitivity.rmse_down[:, row]), strict=True)),
+        )
+        for row, output in enumerate(sensitivity.outputs)
+    ]
+
+
+def _acting(examination: Examination) -> list[Acting]:
+    sensitivity = examination.sensitivity
+    return [
+        Acting(
+            flight=flight,
+            windowed=sensitivity.windowed,
+            time=sensitivity.time[row].round(3).tolist(),
+            change={
+                name: sensitivity.acts[index, row].tolist()
+                for index, name in enumerate(sensitivity.names)
+            },
+            span={
+                name: half_of_it(sensitivity.time[row], sensitivity.acts[index, row])
+                for index, name in enumerate(sensitivity.names)
+            },
+        )
+        for row, flight in enumerate(sensitivity.flights)
+    ]
+
+
+def half_of_it(time: Sequence[float] | Array, acts: Array) -> tuple[float, float]:
+    """Return the shortest stretch, from and to in s, with half of the squared effect."""
+    middles = np.asarray(time)
+    width = float(middles[1] - middles[0])
+    summed = np.concatenate([[0.0], np.cumsum(np.square(acts))])
+    if summed[-1] <= 0.0:
+        return 0.0, float(middles[-1] + width / 2)
+    ends = np.searchsorted(summed, summed[:-1] + summed[-1] / 2)
+    lengths = np.where(ends < len(summed), ends - np.arange(len(acts)), len(summed))
+    first = int(np.argmin(lengths))
+    return round(first * width, 3), round(int(ends[first]) * width, 3)

@@ -1,0 +1,116 @@
+"""What an objective is asked with and what it answers: points, stages, sums and derivatives."""
+
+from __future__ import annotations
+
+import equinox as eqx
+from jax import Array
+from jaxtyping import Float, Int
+
+from tuner.objective.segments import Segments
+
+OFFSET_UNIT = 0.01
+"""s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
+
+
+class Point(eqx.Module):
+    """Where the search is: what all flights share, and each flight's own.
+
+    Attributes
+    ----------
+    coefficients
+        (K,) search vector of the `Space`.
+    offsets
+        (offsets, N) of `OFFSETS`, a column for each flight, in units of `OFFSET_UNIT`.
+    """
+
+    coefficients: Float[Array, " K"]
+    offsets: Float[Array, "offsets N"]
+
+
+class Criterion(eqx.Module):
+    """What changes from one stage of the search to the next, without compiling again.
+
+    Attributes
+    ----------
+    horizon
+        Samples of the simulation that are compared.
+    scale
+        Channel -> (N,) factor on the standard deviations: inflated at first, more for a flight that
+        the model cannot match.
+    held
+        (clocks, N) s of clock offset for the signals that jump between samples.
+    huber
+        Residuals beyond so many (scaled) standard deviations count linearly; infinite for plain
+        squares.
+    prior
+        Factor on the prior's residuals.
+    states
+        (L, F) start of every segment around which is linearised, in the segments' standard
+        deviations; None where starts are known.
+    """
+
+    horizon: Int[Array, ""]
+    scale: dict[str, Float[Array, " N"]]
+    held: Float[Array, "clocks N"]
+    huber: Float[Array, ""]
+    prior: Float[Array, ""]
+    states: Float[Array, "L F"] | None = None
+
+
+class SegmentSums(eqx.Module):
+    """What one segment contributes; P = K + offsets. Where starts are free, at the best of them.
+
+    Attributes
+    ----------
+    loss
+        (F,) half the robust sum of squares.
+    gradient, hessian
+        (P, F) and (P, P, F); zero where derivatives were not asked for.
+    squares
+        Channel -> (F,) plain sum of squares in unscaled standard deviations.
+    counts
+        Channel -> (F,) how many values were compared.
+    crash_time
+        (F,) s.
+    states
+        (L, F) best start, in the segments' standard deviations; None where starts are known.
+    """
+
+    loss: Float[Array, " F"]
+    gradient: Float[Array, "P F"]
+    hessian: Float[Array, "P P F"]
+    squares: dict[str, Float[Array, " F"]]
+    counts: dict[str, Float[Array, " F"]]
+    crash_time: Float[Array, " F"]
+    states: Float[Array, "L F"] | None
+
+
+class Jacobian(eqx.Module):
+    """Every residual and its derivatives at a point; Q = K + offsets + L.
+
+    It holds P numbers for every recorded one: some 10 MB for a flight of 40 s.
+
+    Attributes
+    ----------
+    residuals
+        Channel -> (n, k, F), in unscaled standard deviations.
+    columns
+        Channel -> (Q, n, k, F): derivatives by the search vector, then by each offset in units of
+        `OFFSET_UNIT`, then by the start in the segments' standard deviations.
+    crash_time
+        (F,) s.
+    """
+
+    residuals: dict[str, Float[Array, "n k F"]]
+    columns: dict[str, Float[Array, "Q n k F"]]
+    crash_time: Float[Array, " F"]
+
+
+class SegmentData(eqx.Module):
+    """Recordings and the part of a point and a stage that concerns them, segment by segment."""
+
+    segments: Segments
+    offsets: Float[Array, "*starts offsets F"]
+    scale: dict[str, Float[Array, " F"]]
+    held: Float[Array, "clocks F"]
+    states: Float[Array, "L F"] | None

@@ -1,0 +1,172 @@
+"""How far a segment's start may differ from the recorded one, and how that freedom is taken out.
+
+A window starts in the middle of a flight, from a state that was smoothed out of noisy samples, with
+an integrator that nobody recorded. Each segment's start is therefore free, near what was recorded.
+It is no part of the search: to first order the best start follows from the coefficients, segment by
+segment, and what is left of the normal equations speaks of the coefficients alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, RotorSpeedInlet
+from sim_jax.motor import reference_speed
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.state import Start
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+
+#: What a start consists of: name -> (how many numbers, standard deviation of the smoothed one).
+#: m, m/s, rad about the body's axes, rad/s, share of the rotor's speed, rate controller's output.
+#: The trim is no state: rotors differ and the mass is never quite in the middle, so that what was
+#: recorded of the motors holds a steady torque about each axis that the model has no use for. In
+#: closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
+STATES: Mapping[str, tuple[int, float]] = {
+    "position": (3, 0.01),
+    "velocity": (3, 0.1),
+    "attitude": (3, 0.03),
+    "body_rate": (3, 0.3),
+    "rotor_speed": (4, 0.05),
+    "rate_integral": (3, 0.05),
+    "trim": (3, 0.02),
+}
+COUNT = sum(count for count, _ in STATES.values())
+
+
+def freedom_of(free: Mapping[str, bool]) -> NDArray[np.float64]:
+    """Return the standard deviations (L,) of a start; zero for what cannot matter.
+
+    Parameters
+    ----------
+    free
+        Name of `STATES` -> whether it acts on the segment; those not named do.
+    """
+    return np.concatenate(
+        [
+            np.full(count, sd if free.get(name, True) else 0.0)
+            for name, (count, sd) in STATES.items()
+        ]
+    )
+
+
+def moved(start: Start, change: Float[Array, "L F"]) -> Start:
+    """Return a start that differs from a recorded one by so much, in the units of `STATES`."""
+    parts, first = {}, 0
+    for name, (count, _) in STATES.items():
+        parts[name] = change[first : first + count]
+        first += count
+    motion = start.motion
+    turn = parts["attitude"]
+    attitude = motion.attitude.product(
+        Quaternion(jnp.ones_like(turn[0]), 0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2])
+    ).normalized()
+    a, b, c, d = (
+        speed * (1.0 + share)
+        for speed, share in zip(start.rotor_speed, parts["rotor_speed"], strict=True)
+    )
+    return Start(
+        motion=Motion(
+            motion.position + Vec3.of(parts["position"]),
+            motion.velocity + Vec3.of(parts["velocity"]),
+            attitude,
+            motion.body_rate + Vec3.of(parts["body_rate"]),
+        ),
+        rotor_speed=(a, b, c, d),
+        command=start.command,
+        rate_integral=start.rate_integral + Vec3.of(parts["rate_integral"]),
+    )
+
+
+def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
+    """Return an inlet whose rotors are told a steady difference about roll, pitch and yaw."""
+    if isinstance(inlet, MixedInlet):
+        parts = (trimmed(part, vehicle, change) for part in inlet.parts)
+        changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
+        return changed
+    if not isinstance(inlet, ActuatorInlet | RotorSpeedInlet):
+        return inlet
+    first = COUNT - STATES["trim"][0]
+    arms = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
+    width = sum(abs(y) for _, y in arms) / len(arms)
+    length = sum(abs(x) for x, _ in arms) / len(arms)
+    extra = [
+        change[first] * (y / width)
+        - change[first + 1] * (x / length)
+        - change[first + 2] * rotor.spin
+        for (x, y), rotor in zip(arms, vehicle.rotors, strict=True)
+    ]
+    if isinstance(inlet, ActuatorInlet):
+        a, b, c, d = (one + more for one, more in zip(inlet.command, extra, strict=True))
+        return ActuatorInlet((a, b, c, d))
+    a, b, c, d = (one * (1.0 + more) for one, more in zip(inlet.speed, extra, strict=True))
+    return RotorSpeedInlet((a, b, c, d))
+
+
+def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Start:
+    """Return a start whose rotors without a tachometer turn as their commands ask.
+
+    Parameters
+    ----------
+    turning
+        Recent motor commands 0..1, NaN for a rotor whose speed was measured.
+    """
+    measured = jnp.isnan(turning)
+    asked = jnp.where(measured, 0.5, turning)
+    a, b, c, d = (
+        jnp.where(measured[i], speed, reference_speed(vehicle.motor, asked[i]))
+        for i, speed in enumerate(start.rotor_speed)
+    )
+    return Start(start.motion, (a, b, c, d), start.command, start.rate_integral)
+
+
+def eliminated(
+    loss: Float[Array, " F"],
+    gradient: Float[Array, "Q F"],
+    hessian: Float[Array, "Q Q F"],
+    states: Float[Array, "L F"],
+) -> tuple[Array, Array, Array, Array]:
+    """Minimise every segment's quadratic model over its own start, whose prior is 0 ± 1.
+
+    Parameters
+    ----------
+    loss, gradient, hessian
+        Of the data at ``states``; the last L of the Q parameters are the start's, in standard
+        deviations.
+    states
+        The start around which was linearised.
+
+    Returns
+    -------
+    tuple
+        Loss, gradient (P, F) and Hessian (P, P, F) of the others, and the best start (L, F).
+    """
+    kept = gradient.shape[0] - states.shape[0]
+    gradient = gradient.at[kept:].add(states)
+    hessian = hessian + jnp.diag(jnp.arange(len(gradient)) >= kept).astype(hessian.dtype)[..., None]
+    loss = loss + 0.5 * jnp.sum(states**2, axis=0)
+    # One at a time, for all segments at once. A library's solver would take one segment at a
+    # time, and a blocking call inside a program of several devices can wait for ever for
+    # their single thread.
+    rows = []
+    while len(gradient) > kept:
+        row, pull = hessian[-1], gradient[-1]
+        rows.append((row[kept:-1], pull, row[-1]))
+        follow = row[:-1] / row[-1]
+        loss = loss - 0.5 * pull * pull / row[-1]
+        gradient = gradient[:-1] - follow * pull
+        hessian = hessian[:-1, :-1] - follow[:, None] * row[None, :-1]
+    step: list[Array] = []
+    for row, pull, own in reversed(rows):
+        across = sum((h * s for h, s in zip(row, step, strict=True)), jnp.zeros_like(pull))
+        step.append(-(pull + across) / own)
+    best = states + jnp.stack(step)
+    return jnp.maximum(loss, 0.0), gradient, hessian, best

@@ -1,0 +1,63 @@
+"""The papers' figures drawn by a process of their own, while the rest of a run goes on.
+
+``python -m tuner.report.background`` reads a folder's name from its input, draws what the folder
+holds by then, and prints the keys of the figures.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tuner.report.contents import read_contents
+from tuner.report.paper import write_plots
+from tuner.report.sections import sections_of
+
+
+class BackgroundDrawing:
+    """A process that draws; it starts up as soon as this is made."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "tuner.report.background"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+        )
+
+    def begin(self, folder: Path) -> None:
+        """Have it draw what a result folder holds now."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{folder.resolve()}\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            return  # it did not come up; `drawn` will tell of nothing
+
+    def drawn(self) -> frozenset[str]:
+        """Wait for its end, and return the keys of the figures that are there.
+
+        A process that could not draw tells of none, so that they are drawn here after all.
+        """
+        told, _ = self._process.communicate()
+        return frozenset(json.loads(told)) if self._process.returncode == 0 else frozenset()
+
+
+def main() -> None:
+    """Draw one folder's figures and print their keys."""
+    folder = sys.stdin.readline().rstrip("\n")
+    if not folder:
+        return  # whoever asked has gone
+    contents = read_contents(folder)
+    charts = [chart for section in sections_of(contents) for chart in section.charts]
+    write_plots(charts, contents.folder)
+    sys.stdout.write(json.dumps([chart.key for chart in charts]))
+
+
+if __name__ == "__main__":
+    from matplotlib import pyplot  # noqa: F401 (a second that is over before it matters)
+
+    main()

@@ -1,0 +1,190 @@
+"""What a search does one after the other: how far it looks, how loosely, and by which method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
+"""s; the whole flights follow. The first are so short that even a vehicle with a third of the
+thrust is still near where it began, so that a bad start has a slope to go down."""
+NOISE_INFLATION = (20.0, 20.0, 20.0, 20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
+"""Factor on every standard deviation, stage by stage; 1 on whole flights."""
+WINDOWS = ((0.3, 20.0, False), (0.6, 5.0, True))
+"""Share of a window, noise inflation, whether offsets are free, before the windows are whole."""
+GENTLE = 1.0
+"""s of horizon below which a Jacobian costs so little that a stage may take its time."""
+ENOUGH = 0.01
+"""Loss at which such a stage has done its part: the next sees further."""
+OFFSETS_FROM = 5.0
+"""s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
+EVOLVED = (0.8, 3.0)
+"""s of horizon at which CMA-ES looks for where to begin."""
+GENERATIONS = 60
+"""Of CMA-ES in one stage, at most."""
+WHOLE = "whole length"
+USUAL = 5
+"""Steps that a stage takes, more or less."""
+PAUSE = 4000
+"""What a step costs beside its simulation, in samples of it."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the schedule.
+
+    Attributes
+    ----------
+    name
+        For people.
+    horizon
+        Samples of the simulation.
+    noise inflation
+        Factor on the standard deviations.
+    robust
+        Whether large residuals count linearly.
+    offsets
+        Whether clock offsets are free; in the polish, those that matter.
+    steps
+        At most so many iterations.
+    tolerance
+        The stage ends when no start's loss falls by more than this share.
+    weighs
+        Whether each channel of each flight is weighed by its residuals after it, rather than only
+        strays.
+    prunes
+        Whether offsets too small to matter are dropped before it.
+    solver
+        ``gradient`` moves everything down the slope, ``offsets`` the flights' offsets alone, and
+        ``cma`` the coefficients alone by CMA-ES.
+    enough
+        Loss, in inflated standard deviations, below which the next stage may as well begin.
+    """
+
+    name: str
+    horizon: int
+    noise_inflation: float
+    robust: bool
+    offsets: bool
+    steps: int
+    tolerance: float
+    weighs: bool
+    prunes: bool
+    solver: Literal["gradient", "offsets", "cma"] = "gradient"
+    enough: float = 0.0
+
+
+def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
+    """Return the stages for flights of at most so many samples at a rate in Hz."""
+    stages = []
+    for seconds, noise_inflation in zip(HORIZONS, NOISE_INFLATION, strict=True):
+        horizon = round(seconds * rate)
+        if horizon < samples:
+            stages.append(
+                Stage(
+                    name=f"first {seconds:g} s",
+                    horizon=horizon,
+                    noise_inflation=noise_inflation,
+                    robust=False,
+                    offsets=seconds >= OFFSETS_FROM,
+                    steps=min(16 if seconds < GENTLE else 8, steps),
+                    tolerance=0.005 if seconds < GENTLE else 0.02,
+                    weighs=False,
+                    prunes=False,
+                    enough=ENOUGH if seconds < GENTLE else 0.0,
+                )
+            )
+    return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
+
+
+def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
+    """Return the stages for windows of so many samples, whose starts are free."""
+    stages = [
+        Stage(
+            name=f"first {samples * share / rate:.2g} s of every window",
+            horizon=round(samples * share),
+            noise_inflation=noise_inflation,
+            robust=False,
+            offsets=offsets,
+            steps=min(12, steps),
+            tolerance=0.01,
+            weighs=True,
+            prunes=False,
+        )
+        for share, noise_inflation, offsets in WINDOWS
+    ]
+    return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
+
+
+def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, ...]:
+    whole = Stage(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
+    polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
+    return (whole, replace(polish, name="polish"), replace(polish, name="polish again"))
+
+
+def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> float:
+    """Return the s that a search may still take, told from what it took so far.
+
+    Parameters
+    ----------
+    stages
+        The whole plan.
+    stage, steps
+        Number of the stage under way, and how many steps of it are done.
+    spent
+        s so far.
+    """
+    costs = [min(one.steps, USUAL) * (one.horizon + PAUSE) for one in stages]
+    under_way = (
+        costs[stage] * min(steps / min(stages[stage].steps, USUAL), 1.0)
+        if stage < len(stages)
+        else 0
+    )
+    done = sum(costs[:stage]) + under_way
+    return spent * (sum(costs) - done) / done if done else float("nan")
+
+
+def plan(
+    method: str,
+    samples: int,
+    rate: float,
+    *,
+    windows: bool,
+    robust: bool,
+    steps: int,
+) -> tuple[Stage, ...]:
+    """Return the stages of a method.
+
+    Parameters
+    ----------
+    method
+        ``gradient``, ``cma`` or ``hybrid``: CMA-ES from far, then the slope.
+    samples, rate
+        Of the longest segment, at so many Hz.
+    windows
+        Whether segments are windows with free starts.
+    robust
+        Whether large residuals count linearly at the end.
+    steps
+        At most so many of a stage.
+    """
+    schedule = window_schedule if windows else schedule_of
+    stages = schedule(samples, rate, robust=robust, steps=steps)
+    if method == "gradient":
+        return stages
+    evolving = [
+        replace(stage, name=f"CMA-ES, {stage.name}", solver="cma", steps=min(GENERATIONS, steps))
+        for stage in stages
+        if windows or stage.horizon / rate in EVOLVED
+    ]
+    if method == "hybrid":
+        horizon = evolving[-1].horizon if evolving and not windows else 0
+        return (*evolving[:2], *(stage for stage in stages if stage.horizon >= horizon))
+    *_, polish, last = stages
+    final = replace(last, name="CMA-ES, whole length", solver="cma", steps=min(GENERATIONS, steps))
+    return (
+        *evolving[:2],
+        replace(final, noise_inflation=3.0, robust=False, prunes=False),
+        replace(polish, name="offsets", solver="offsets", prunes=False),
+        replace(final, name="CMA-ES, polish"),
+    )

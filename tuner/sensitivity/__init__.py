@@ -1,0 +1,1 @@
+"""What each coefficient does to each signal: locally by Jacobians, globally by Morris and Sobol."""

@@ -1,0 +1,80 @@
+"""Indices of global sensitivity, as ``global_sensitivity.json`` holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from tuner.config.yaml_file import write_text
+from tuner.examination.files import table
+from tuner.examination.knowledge import Part, read_part
+
+Method = Literal["morris", "sobol"]
+GLOBAL_FILE = "global_sensitivity.json"
+GLOBAL_TABLE = "global_sensitivity.csv"
+
+#: Method -> what `Index.main`, `Index.total` and `Index.spread` are.
+MEANING = {
+    "morris": ("mean effect μ", "mean absolute effect μ*", "standard deviation of the effect σ"),
+    "sobol": ("first-order index", "total index", "95 % confidence of the total index"),
+}
+
+
+class Index(Part):
+    """What one coefficient does to the logarithm of one RMSE; see `MEANING`.
+
+    ``flight`` and ``channel`` are empty for the mean over all of them.
+    """
+
+    coefficient: str
+    flight: str
+    channel: str
+    main: float
+    total: float
+    spread: float
+
+
+class GlobalIndices(Part):
+    """The content of ``global_sensitivity.json``.
+
+    Attributes
+    ----------
+    method
+        Whose indices.
+    bounds
+        Coefficient -> between which values it was varied.
+    simulations, crashed
+        How many vehicles were flown, and how many of them crashed on some flight.
+    indices
+        Coefficient by coefficient, output by output.
+    """
+
+    schema_version: int = 1
+    method: Method
+    bounds: dict[str, tuple[float, float]]
+    simulations: int
+    crashed: int
+    indices: list[Index]
+
+
+def write_global(found: GlobalIndices, folder: Path) -> None:
+    """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
+    write_text(folder / GLOBAL_FILE, found.model_dump_json(indent=1) + "\n")
+    header = ("coefficient", "flight", "channel", *(text for text in MEANING[found.method]))
+    rows = [
+        [
+            one.coefficient,
+            one.flight or "all",
+            one.channel or "all",
+            one.main,
+            one.total,
+            one.spread,
+        ]
+        for one in found.indices
+    ]
+    write_text(folder / GLOBAL_TABLE, table(header, rows))
+
+
+def read_global(folder: Path) -> GlobalIndices | None:
+    """Read ``global_sensitivity.json``; None where there is none."""
+    return read_part(GlobalIndices, folder / GLOBAL_FILE)

@@ -1,0 +1,170 @@
+"""Which coefficients matter anywhere between their bounds, not just around one point.
+
+Morris' elementary effects (Morris, "Factorial sampling plans for preliminary computational
+experiments", 1991) or Sobol's indices (Sobol, "Global sensitivity indices for nonlinear
+mathematical models and their Monte Carlo estimates", 2001; Saltelli et al., 2010), as SALib
+computes them, of the logarithm of each channel's RMSE.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients import Space
+from tuner.objective.batch import evaluate
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.sensitivity.global_files import GlobalIndices, Index, Method
+
+Array = NDArray[np.float64]
+
+LEVELS = 4
+"""Of Morris' grid."""
+FLOOR = 1e-3
+"""RMSE below this many standard deviations counts as this: nothing is met better than noise."""
+SAMPLES = {"morris": 16, "sobol": 64}
+"""Trajectories, or base points; a coefficient more costs so many simulations more."""
+
+
+def whole_range(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    *,
+    method: Method,
+    flights: Sequence[str],
+    bounds: Mapping[str, tuple[float, float]],
+    samples: int | None = None,
+    seed: int = 0,
+) -> GlobalIndices:
+    """Return each coefficient's index for every channel of every flight and over all.
+
+    Parameters
+    ----------
+    objective, point, criterion
+        The problem; of the point only the offsets matter.
+    method
+        ``morris`` or ``sobol``.
+    flights
+        Names by number.
+    bounds
+        Coefficient -> between which values it is varied.
+    samples
+        Trajectories of Morris, base points of Sobol (rounded up to a power of two).
+    seed
+        Of the sampling.
+    """
+    space = objective.space
+    problem = {
+        "num_vars": len(space),
+        "names": list(space.names),
+        "bounds": [[p.scaled(end) for end in bounds[p.name]] for p in space.parameters],
+    }
+    count = samples or SAMPLES[method]
+    places = _places(problem, method, count, seed)
+    vectors = np.stack([_vector(space, row) for row in places])
+    batch = evaluate(objective, vectors, point, criterion)
+    crashed = np.isfinite(np.asarray(batch.crash_time))
+    outputs, values = _outputs(objective, batch.squares, crashed, flights)
+    found = []
+    for (flight, channel), column in zip(outputs, values.T, strict=True):
+        found += _indices(problem, method, places, column, seed, flight=flight, channel=channel)
+    return GlobalIndices(
+        method=method,
+        bounds={name: bounds[name] for name in space.names},
+        simulations=len(places),
+        crashed=int(crashed.any(axis=1).sum()),
+        indices=found,
+    )
+
+
+def _places(problem: dict[str, Any], method: Method, count: int, seed: int) -> Array:
+    """Return the sampled scaled coordinates (S, K)."""
+    if method == "morris":
+        from SALib.sample import morris  # noqa: PLC0415 (pandas and scipy)
+
+        return np.asarray(morris.sample(problem, count, num_levels=LEVELS, seed=seed))
+    from SALib.sample import sobol  # noqa: PLC0415
+
+    power = 2 ** int(np.ceil(np.log2(max(count, 2))))
+    return np.asarray(sobol.sample(problem, power, calc_second_order=False, seed=seed))
+
+
+def _vector(space: Space, scaled: Array) -> Array:
+    values = {
+        name: space.from_scaled(index, float(x))
+        for index, (name, x) in enumerate(zip(space.names, scaled, strict=True))
+    }
+    return space.vector_of(values)
+
+
+def _outputs(
+    objective: Objective, squares: Any, crashed: NDArray[np.bool_], flights: Sequence[str]
+) -> tuple[list[tuple[str, str]], Array]:
+    """Return (flight, channel) of R outputs and the logarithm of their RMSE, (S, R).
+
+    A simulation that crashed on a flight counts as no better than the worst that flew it.
+    """
+    flight = np.asarray(objective.segments.flight)
+    names, columns = [], []
+    for number, name in enumerate(flights):
+        segments = np.flatnonzero(flight == number)
+        fell = crashed[:, segments].any(axis=1)
+        for channel, measured in objective.segments.measured.items():
+            count = int((np.asarray(measured.weight)[..., segments] > 0).sum())
+            if count == 0:
+                continue
+            total = np.asarray(squares[channel])[..., segments].sum(axis=(1, 2))
+            rms = np.sqrt(total / count)
+            usable = np.isfinite(rms)
+            worst = float(rms[usable & ~fell].max(initial=FLOOR))
+            rms = np.where(usable, rms, worst)
+            rms = np.where(fell, np.maximum(rms, worst), rms)
+            names.append((name, channel))
+            columns.append(np.log10(np.maximum(rms, FLOOR)))
+    table = np.stack(columns, axis=-1)
+    return [("", ""), *names], np.column_stack([table.mean(axis=1), table])
+
+
+def _indices(
+    problem: dict[str, Any],
+    method: Method,
+    places: Array,
+    values: Array,
+    seed: int,
+    *,
+    flight: str,
+    channel: str,
+) -> list[Index]:
+    if np.ptp(values) == 0.0:
+        nothing = np.zeros(len(problem["names"]))
+        main, total, spread = nothing, nothing, nothing
+    elif method == "morris":
+        from SALib.analyze import morris  # noqa: PLC0415
+
+        found = morris.analyze(problem, places, values, num_levels=LEVELS, seed=seed)
+        main, total, spread = found["mu"], found["mu_star"], found["sigma"]
+    else:
+        from SALib.analyze import sobol  # noqa: PLC0415
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # an output that hardly varies
+            # SALib takes a seed of 0 for none
+            found = sobol.analyze(problem, values, calc_second_order=False, seed=seed + 1)
+        main, total, spread = found["S1"], found["ST"], found["ST_conf"]
+    return [
+        Index(
+            coefficient=name,
+            flight=flight,
+            channel=channel,
+            main=float(np.nan_to_num(main[i])),
+            total=float(np.nan_to_num(total[i])),
+            spread=float(np.nan_to_num(spread[i])),
+        )
+        for i, name in enumerate(problem["names"])
+    ]

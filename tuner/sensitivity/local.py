@@ -1,0 +1,287 @@
+"""What each coefficient does: by how much, to which signal of which flight, and when."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.batch import evaluate
+from tuner.objective.criterion import Criterion, Jacobian, Point
+from tuner.objective.normal import Objective
+
+Array = NDArray[np.float64]
+
+SMALL = 0.01
+"""Change whose effect is told from the derivative."""
+LARGE = 0.1
+"""Change whose effect is simulated."""
+BINS = 40
+"""Stretches into which a flight is cut to tell when a coefficient acts."""
+
+#: Channel -> its axes, its unit, and that unit's size in the unit of the residuals.
+AXES = {
+    "position": (("x", "y", "z"), "m", 1.0),
+    "attitude": (("roll", "pitch", "yaw"), "deg", np.pi / 180.0),
+    "body_rate": (("x", "y", "z"), "rad/s", 1.0),
+    "rotor_speed": (("1", "2", "3", "4"), "rad/s", 1.0),
+    "command": (("1", "2", "3", "4"), "", 1.0),
+}
+
+
+@dataclass(frozen=True)
+class Output:
+    """One recorded signal: an axis of a channel of a flight.
+
+    Attributes
+    ----------
+    flight, channel, axis
+        Names. Attitude's axes are small rotations about the body's.
+    unit
+        Of everything said about it.
+    rmse
+        Simulated minus recorded.
+    """
+
+    flight: str
+    channel: str
+    axis: str
+    unit: str
+    rmse: float
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """What K coefficients do to R outputs of F flights.
+
+    Attributes
+    ----------
+    names
+        K coefficients; of a tie, the first of the group.
+    outputs
+        R outputs.
+    step
+        (K,) one hundred percent: of the value, or, on a linear scale, of the larger of the value
+        and the coefficient's usual uncertainty; in the coefficient's unit.
+    change
+        (K, R) RMS change of an output for +1 %, in its unit.
+    rmse_up, rmse_down
+        (K, R) RMSE for +10 % and −10 %, the others unchanged; NaN where the simulation crashed.
+    crashed
+        (K,) how many of the simulations with ±10 % crashed, over all flights.
+    flights
+        F names.
+    windowed
+        Whether flights were cut into windows, so that ``time`` counts from a window's start.
+    time
+        (F, B) s, middles of the stretches.
+    acts
+        (K, F, B) RMS change of all channels for +1 % during a stretch, in standard deviations.
+    """
+
+    names: tuple[str, ...]
+    outputs: tuple[Output, ...]
+    step: Array
+    change: Array
+    rmse_up: Array
+    rmse_down: Array
+    crashed: NDArray[np.int_]
+    flights: tuple[str, ...]
+    windowed: bool
+    time: Array
+    acts: Array
+
+    @staticmethod
+    def joined(parts: Sequence[Sensitivity]) -> Sensitivity:
+        """Return the sensitivity of flights of which each part holds the next ones."""
+        first = parts[0]
+
+        def beside(name: str, axis: int = -1) -> Array:
+            return np.concatenate([getattr(part, name) for part in parts], axis=axis)
+
+        return Sensitivity(
+            names=first.names,
+            outputs=tuple(output for part in parts for output in part.outputs),
+            step=first.step,
+            change=beside("change"),
+            rmse_up=beside("rmse_up"),
+            rmse_down=beside("rmse_down"),
+            crashed=np.sum([part.crashed for part in parts], axis=0),
+            flights=tuple(name for part in parts for name in part.flights),
+            windowed=any(part.windowed for part in parts),
+            time=beside("time", 0),
+            acts=beside("acts", 1),
+        )
+
+
+def sensitivity(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    jacobian: Jacobian,
+    *,
+    reference: Array,
+    flights: Sequence[str],
+) -> Sensitivity:
+    """Return what each coefficient does around a point.
+
+    Parameters
+    ----------
+    objective, point, criterion
+        The problem, and where it stands.
+    jacobian
+        There.
+    reference
+        (K,) change of the scaled coordinate that counts as one hundred percent.
+    flights
+        Names by number.
+    """
+    space = objective.space
+    vector = np.asarray(point.coefficients)
+    slope = space.slope(vector)
+    sigmas = _Sigmas(objective, flights)
+    moved = SMALL * reference / slope
+    change = []
+    for channel, flight, axis in sigmas.outputs:
+        segments = sigmas.segments(flight)
+        columns = np.asarray(jacobian.columns[channel])[: len(space)][:, :, axis][..., segments]
+        mean = (columns**2).sum(axis=(1, 2)) / sigmas.count(channel, axis, segments)
+        change.append(np.sqrt(mean) * moved * sigmas.unit(channel, axis, segments))
+    vectors, values = _steps(objective, vector, reference)
+    batch = evaluate(objective, np.concatenate([vector[None], *vectors]), point, criterion)
+    rmse = sigmas.rmse({name: np.asarray(s) for name, s in batch.squares.items()})
+    crashes = np.isfinite(np.asarray(batch.crash_time))
+    failed = np.array(
+        [
+            [crashes[s, sigmas.segments(f)].any() for _, f, _ in sigmas.outputs]
+            for s in range(len(rmse))
+        ]
+    )
+    rmse = np.where(failed, np.nan, rmse)
+    count = len(space)
+    time, acts = _when(objective, jacobian, criterion, moved, sigmas)
+    return Sensitivity(
+        names=space.names,
+        outputs=tuple(
+            Output(
+                flights[flight],
+                channel,
+                AXES[channel][0][axis],
+                AXES[channel][1],
+                float(rmse[0, row]),
+            )
+            for row, (channel, flight, axis) in enumerate(sigmas.outputs)
+        ),
+        step=values,
+        change=np.stack(change, axis=-1),
+        rmse_up=rmse[1 : 1 + count],
+        rmse_down=rmse[1 + count :],
+        crashed=crashes[1 : 1 + count].sum(axis=1) + crashes[1 + count :].sum(axis=1),
+        flights=tuple(flights),
+        windowed=objective.segments.count > len(flights),
+        time=time,
+        acts=acts,
+    )
+
+
+def _steps(
+    objective: Objective, vector: Array, reference: Array
+) -> tuple[tuple[Array, Array], Array]:
+    """Return the vectors (K, K) for +10 % and −10 %, and what one hundred percent is worth (K,)."""
+    space = objective.space
+    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    centre = [space.from_scaled(i, x) for i, x in enumerate(scaled)]
+    worth = np.array(
+        [
+            abs(value) if parameter.scale == "log" else size
+            for value, parameter, size in zip(centre, space.parameters, reference, strict=True)
+        ]
+    )
+    found = []
+    for sign in (1.0, -1.0):
+        rows = []
+        for index, parameter in enumerate(space.parameters):
+            value = np.clip(
+                centre[index] + sign * LARGE * worth[index], parameter.lower, parameter.upper
+            )
+            row = vector.copy()
+            at = dict(zip(space.names, centre, strict=True)) | {parameter.name: float(value)}
+            row[index] = space.vector_of(at)[index]
+            rows.append(row)
+        found.append(np.stack(rows))
+    return (found[0], found[1]), worth
+
+
+class _Sigmas:
+    """Which outputs hold data, and what a residual of one is worth in their units."""
+
+    def __init__(self, objective: Objective, flights: Sequence[str]) -> None:
+        self._flight = np.asarray(objective.segments.flight)
+        self._weight = {
+            name: np.asarray(measured.weight)
+            for name, measured in objective.segments.measured.items()
+        }
+        self.outputs = [
+            (channel, flight, axis)
+            for flight in range(len(flights))
+            for channel, weight in self._weight.items()
+            for axis in range(weight.shape[1])
+            if (weight[:, axis][:, self.segments(flight)] > 0).any()
+        ]
+
+    def segments(self, flight: int) -> NDArray[np.intp]:
+        return np.flatnonzero(self._flight == flight)
+
+    def count(self, channel: str, axis: int, segments: NDArray[np.intp]) -> int:
+        return int((self._weight[channel][:, axis][:, segments] > 0).sum())
+
+    def unit(self, channel: str, axis: int, segments: NDArray[np.intp]) -> float:
+        """Return how much of the output's unit one standard deviation is."""
+        weight = self._weight[channel][:, axis][:, segments].max()
+        return float(1.0 / weight / AXES[channel][2])
+
+    def rmse(self, squares: dict[str, Array]) -> Array:
+        """Return (S, R) RMSE in the outputs' units from sums of squares (S, k, F)."""
+        columns = []
+        for channel, flight, axis in self.outputs:
+            segments = self.segments(flight)
+            mean = squares[channel][:, axis][:, segments].sum(axis=-1)
+            mean = mean / self.count(channel, axis, segments)
+            columns.append(np.sqrt(mean) * self.unit(channel, axis, segments))
+        return np.stack(columns, axis=-1)
+
+
+def _when(
+    objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, sigmas: _Sigmas
+) -> tuple[Array, Array]:
+    """Return the middles (F, B) of stretches in s and what acts in them (K, F, B)."""
+    flights = int(np.asarray(objective.segments.flight).max()) + 1
+    squares = np.zeros((len(moved), flights, BINS))
+    counts = np.zeros((flights, BINS))
+    middles = np.zeros((flights, BINS))
+    begins = objective.segments.begins
+    for flight in range(flights):
+        segments = sigmas.segments(flight)
+        end = max(
+            float(np.max(np.asarray(m.time)[:, segments] + begins[segments], initial=0.0))
+            for m in objective.segments.measured.values()
+        )
+        middles[flight] = (np.arange(BINS) + 0.5) * end / BINS
+        for channel, measured in objective.segments.measured.items():
+            scale = np.asarray(criterion.scale[channel])
+            for segment in segments:
+                time = np.asarray(measured.time)[:, segment] + begins[segment]
+                weight = np.asarray(measured.weight)[..., segment]
+                which = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
+                rows = (
+                    np.asarray(jacobian.columns[channel])[: len(moved), ..., segment]
+                    / scale[flight]
+                )
+                power = (rows**2).sum(axis=2)
+                for index in range(len(moved)):
+                    squares[index, flight] += np.bincount(which, power[index], minlength=BINS)
+                counts[flight] += np.bincount(which, (weight > 0).sum(axis=1), minlength=BINS)
+    return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None, None]

@@ -1,0 +1,123 @@
+"""A fit's problem with every coefficient free, so that one Jacobian answers for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients import HABITS, Parameter, Space
+from tuner.objective.criterion import Point
+from tuner.objective.normal import Objective
+
+#: Extensions of the thrust curve that are no coefficients of most vehicles: only where they act.
+EXTENSIONS = ("input_offset", "quadratic")
+
+
+@dataclass(frozen=True)
+class AllFree:
+    """The same simulation at the same point, moved by every coefficient.
+
+    Attributes
+    ----------
+    objective, point
+        With K + L parameters: the fit's own K first, then the L fixed ones.
+    fitted, fixed
+        Their names.
+    own
+        The fit's own space.
+    """
+
+    objective: Objective
+    point: Point
+    fitted: tuple[str, ...]
+    fixed: tuple[str, ...]
+    own: Space
+
+    @property
+    def columns(self) -> int:
+        """How many parameters to differentiate by at a time: as the search did, if it had many.
+
+        What was compiled for the search then serves again.
+        """
+        few, all_of_them = len(self.own), len(self.objective.space)
+        return few if 2 * few >= all_of_them else all_of_them
+
+    def only(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
+        """Return the space of some parameters, and where they lie in the whole one."""
+        space = self.objective.space
+        places = np.array([space.names.index(name) for name in names])
+        if names == self.fitted:
+            return self.own, places  # so that what is compiled for it serves again
+        return Space([space.parameters[place] for place in places], {}), places
+
+
+def every_coefficient(objective: Objective, point: Point) -> AllFree:
+    """Free the coefficients that a fit left alone, each around the value that it was given."""
+    space = objective.space
+    values = {
+        name: float(value) for name, value in space.values(jnp.asarray(point.coefficients)).items()
+    }
+    fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
+    parameters = [*space.parameters, *(_parameter(name, value) for name, value in fixed.items())]
+    whole = Space(parameters, {})
+    vector = whole.vector_of(values | fixed)
+    vector[: len(space)] = np.asarray(point.coefficients)
+    return AllFree(
+        objective=with_space(objective, whole),
+        point=Point(jnp.asarray(vector), point.offsets),
+        fitted=space.names,
+        fixed=tuple(fixed),
+        own=space,
+    )
+
+
+def with_space(objective: Objective, space: Space) -> Objective:
+    """Return the same problem in other coordinates."""
+    return Objective(
+        model=objective.model,
+        segments=objective.segments,
+        space=space,
+        schedule=objective.schedule,
+        samples=objective.samples,
+        limits=objective.limits,
+        memory=objective.memory,
+    )
+
+
+def _fixed(objective: Objective) -> Mapping[str, float]:
+    """Return the fixed coefficients that can act in this simulation."""
+    fixed = dict(objective.space.fixed)
+    cutoff = objective.model.controller.filters.gyro_cutoff
+    fixed.pop("gyro_cutoff", None)
+    if cutoff is not None:
+        fixed["gyro_cutoff"] = float(cutoff)
+    return {
+        name: value
+        for name, value in fixed.items()
+        if not (name in EXTENSIONS and value == 0.0)
+        and not (HABITS[name].scale == "log" and value <= 0.0)
+    }
+
+
+def _parameter(name: str, value: float) -> Parameter:
+    habit = HABITS[name]
+    if isinstance(habit.reach, tuple):
+        lower, upper = min(habit.reach[0], value), max(habit.reach[1], value)
+    else:
+        lower, upper = value / habit.reach, value * habit.reach
+    return Parameter(
+        name=name,
+        ratios={name: 1.0},
+        initial=value,
+        lower=lower,
+        upper=upper,
+        scale=habit.scale,
+        prior_mean=float(np.log(value)) if habit.scale == "log" else value,
+        prior_sd=habit.sd,
+        prior_given=False,
+        unit_step=habit.unit_step,
+    )

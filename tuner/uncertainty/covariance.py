@@ -1,0 +1,126 @@
+"""How uncertain the fitted coefficients are, residuals that are not white noise included."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.uncertainty.information import FisherInformation
+
+Array = NDArray[np.float64]
+
+WIDE = 100.0
+"""Priors this many times wider than given leave the flights alone to speak."""
+MOST_LEVERAGE = 0.95
+"""A stretch that determines more of a direction than this is not corrected any further."""
+
+
+@dataclass(frozen=True)
+class Covariance:
+    """Of the scaled coordinates.
+
+    Attributes
+    ----------
+    matrix
+        (K, K), flights and priors together, inflated where residuals are correlated in time.
+    alone
+        (K, K), the same from the flights alone; huge where they say nothing.
+    inflation
+        (K,) standard error over that of independent residuals, at least 1.
+    beyond_noise
+        (K,) standard error over that of independent residuals as large as assumed.
+    """
+
+    matrix: Array
+    alone: Array
+    inflation: Array
+    beyond_noise: Array
+
+    @property
+    def error(self) -> Array:
+        """Standard errors (K,)."""
+        return np.asarray(np.sqrt(np.diag(self.matrix)))
+
+    @property
+    def data_error(self) -> Array:
+        """Standard errors (K,) from the flights alone."""
+        return np.asarray(np.sqrt(np.diag(self.alone)))
+
+    @property
+    def correlation(self) -> Array:
+        """Correlation matrix (K, K)."""
+        return np.asarray(self.matrix / np.outer(self.error, self.error))
+
+
+def covariance(information: FisherInformation) -> Covariance:
+    """Return the covariance of a fit.
+
+    With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
+    residuals' mean square. Model error is no white noise: stretches of a few seconds are summed up
+    and their scores' spread takes the place of B (the sandwich estimate), each score corrected for
+    the stretch's own leverage on the fit as in Bell and McCaffrey, "Bias reduction in standard
+    errors for linear regression with multi-stage samples", 2002. Few stretches make that estimate
+    erratic: it may widen an interval but never narrow it, and one standard deviation of what chance
+    does to white noise is taken off first.
+    """
+    total = information.total
+    unit = 1.0 / np.sqrt(np.diag(total))
+    inverse = _inverse(total, unit)
+    white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
+    quiet = information.prior + information.clock_prior
+    independent = inverse @ (white + quiet) @ inverse
+    clustered = inverse @ (_meat(information, unit) + quiet) @ inverse
+    ratio = np.diag(clustered) / np.diag(independent) - np.sqrt(
+        2.0 / _stretches(information, inverse)
+    )
+    inflation = np.sqrt(np.maximum(ratio, 1.0))
+    alone = information.data + information.prior / WIDE**2
+    alone_inverse = _inverse(alone, 1.0 / np.sqrt(np.diag(alone)))
+    matrix = independent * np.outer(inflation, inflation)
+    beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse))
+    return Covariance(
+        matrix=matrix,
+        alone=alone_inverse * np.outer(beyond_noise, beyond_noise),
+        inflation=inflation,
+        beyond_noise=beyond_noise,
+    )
+
+
+def _stretches(information: FisherInformation, inverse: Array) -> Array:
+    """Return from how many stretches (K,) each parameter is known, as if they spoke equally."""
+    along = inverse / np.diag(inverse)
+    by_stretch = np.einsum("pk,clbpq,qk->lbk", along, information.blocks, along, optimize=True)
+    by_stretch = by_stretch.reshape(-1, len(inverse))
+    squares = np.maximum((by_stretch**2).sum(axis=0), 1e-300)
+    return np.asarray(np.maximum(by_stretch.sum(axis=0) ** 2 / squares, 1.0))
+
+
+def _inverse(matrix: Array, unit: Array) -> Array:
+    """Invert a positive definite matrix whose diagonal spans many powers of ten."""
+    scaled = matrix * np.outer(unit, unit)
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(values, 1e-15 * values.max())
+    return np.asarray((vectors / values) @ vectors.T * np.outer(unit, unit))
+
+
+def _meat(information: FisherInformation, unit: Array) -> Array:
+    """Return the sum (K, K) over stretches of the corrected scores' outer products."""
+    total = information.total * np.outer(unit, unit)
+    factor = np.linalg.cholesky(total + 1e-13 * np.eye(len(total)))
+    blocks = information.blocks.sum(axis=0) * np.outer(unit, unit)
+    score = information.score.sum(axis=0) * unit
+    meat = np.zeros_like(total)
+    for segment in range(score.shape[0]):
+        for block in range(score.shape[1]):
+            if not np.any(blocks[segment, block]):
+                continue
+            leverage = np.linalg.solve(factor, blocks[segment, block])
+            leverage = np.linalg.solve(factor, leverage.T)
+            values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.T))
+            left = np.sqrt(1.0 - np.clip(values, 0.0, MOST_LEVERAGE))
+            white = vectors @ ((vectors.T @ np.linalg.solve(factor, score[segment, block])) / left)
+            corrected = factor @ white
+            meat += np.outer(corrected, corrected)
+    return np.asarray(meat / np.outer(unit, unit))

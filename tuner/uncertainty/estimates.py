@@ -1,0 +1,242 @@
+"""How well every coefficient is known, and from what."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients import HABITS, Parameter, Space
+from tuner.config import COEFFICIENTS
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.covariance import Covariance, covariance
+from tuner.uncertainty.directions import Direction, percent, weakest
+from tuner.uncertainty.information import FisherInformation, gather
+from tuner.uncertainty.verdict import Standing, Verdict, judge
+
+Array = NDArray[np.float64]
+
+QUANTILE = 1.959964
+"""Of the normal distribution, for 95 % intervals."""
+AT_BOUND = 2e-3
+"""A fit within this share of its range from a bound has ended there."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One coefficient.
+
+    Attributes
+    ----------
+    value, std_error, ci95
+        In the coefficient's unit; the interval is symmetric in the scaled coordinate (a factor for
+        logarithmic ones) and inside the bounds.
+    verdict, reason
+        How well it is known and why.
+    """
+
+    value: float
+    std_error: float
+    ci95: tuple[float, float]
+    verdict: Verdict
+    reason: str
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the flights determine it."""
+        return self.verdict is not Verdict.NOT_IDENTIFIABLE
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """How well a fit's coefficients are known.
+
+    Attributes
+    ----------
+    estimates
+        Coefficient -> estimate, tied ones each.
+    names
+        The K parameters, in the order of every array: for a tie, the first of the group.
+    correlation
+        (K, K) of the scaled coordinates.
+    covariance
+        See `Covariance`.
+    reference
+        (K,) change of the scaled coordinate that counts as one hundred percent: 1 for logarithms,
+        else the larger of the value and the coefficient's usual uncertainty.
+    channels, flights
+        Names in the order of the shares.
+    shares
+        (C, F, K): how much of what is known of each parameter came from each channel of each
+        flight; with ``prior_share`` they add up to 1.
+    prior_share
+        (K,).
+    directions
+        The worst-determined combinations, worst first.
+    """
+
+    estimates: Mapping[str, Estimate]
+    names: tuple[str, ...]
+    correlation: Array
+    covariance: Covariance
+    reference: Array
+    channels: tuple[str, ...]
+    flights: tuple[str, ...]
+    shares: Array
+    prior_share: Array
+    directions: tuple[Direction, ...]
+
+
+def uncertainty(
+    fitted: Fitted,
+    *,
+    flights: Sequence[str] | None = None,
+    clocks: NDArray[np.bool_] | None = None,
+) -> Uncertainty:
+    """Return how well a fit's coefficients are known.
+
+    Parameters
+    ----------
+    fitted
+        A search's result.
+    flights
+        Names of the fitted flights in the order of the objective; ``fitted.scales``' by default.
+    clocks
+        (offsets, N) which offsets were fitted; by default those that are not exactly zero.
+    """
+    information = gather(fitted.objective, fitted.point, fitted.criterion, clocks=clocks)
+    names = tuple(fitted.scales) if flights is None else tuple(flights)
+    return judged(fitted.objective.space, np.asarray(fitted.point.coefficients), information, names)
+
+
+def judged(
+    space: Space, vector: Array, information: FisherInformation, flights: Sequence[str]
+) -> Uncertainty:
+    """Return what the evidence at a search vector (K,) says."""
+    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    reference = references(space, vector)
+    found = covariance(information)
+    shares, prior_share = _shares(information, len(flights))
+    directions = weakest(found.alone, reference, space.names)
+    estimates = {}
+    for index, parameter in enumerate(space.parameters):
+        partner, correlation = _partner(found.correlation[index], index, space.names)
+        standing = Standing(
+            name=parameter.name,
+            interval=_half_width(parameter, QUANTILE * found.error[index]),
+            half_width=QUANTILE * found.error[index] / reference[index],
+            data_error=found.data_error[index] / reference[index],
+            prior_share=float(prior_share[index]),
+            prior_given=parameter.prior_given,
+            inflation=float(found.inflation[index]),
+            source=_source(shares[..., index], information.channels, flights),
+            bound=_bound(parameter, scaled[index]),
+            partner=partner,
+            correlation=correlation,
+        )
+        verdict, reason = judge(standing, directions)
+        error = found.error[index]
+        low, high = (
+            float(np.clip(scaled[index] + side * error, *_limits(parameter)))
+            for side in (-QUANTILE, QUANTILE)
+        )
+        value = space.from_scaled(index, scaled[index])
+        slope = value if parameter.scale == "log" else 1.0
+        for name, ratio in parameter.ratios.items():
+            estimates[name] = Estimate(
+                value=value * ratio,
+                std_error=float(abs(slope * error * ratio)),
+                ci95=(
+                    space.from_scaled(index, low) * ratio,
+                    space.from_scaled(index, high) * ratio,
+                ),
+                verdict=verdict,
+                reason=reason if name == parameter.name else f"tied to {parameter.name}: {reason}",
+            )
+    return Uncertainty(
+        estimates=estimates,
+        names=space.names,
+        correlation=found.correlation,
+        covariance=found,
+        reference=reference,
+        channels=information.channels,
+        flights=tuple(flights),
+        shares=shares,
+        prior_share=prior_share,
+        directions=directions,
+    )
+
+
+def references(space: Space, vector: Array) -> Array:
+    """Return the change (K,) of each scaled coordinate that counts as one hundred percent."""
+    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    return np.array([_reference(p, x) for p, x in zip(space.parameters, scaled, strict=True)])
+
+
+def _reference(parameter: Parameter, scaled: float) -> float:
+    if parameter.scale == "log":
+        return 1.0
+    habit = HABITS[parameter.name]
+    return max(abs(scaled), habit.sd if habit.scale == "linear" else 0.0) or 1.0
+
+
+def _half_width(parameter: Parameter, half: float) -> str:
+    if parameter.scale == "log":
+        return percent(half)
+    unit = COEFFICIENTS[parameter.name].unit
+    if unit == "s":
+        half, unit = 1e3 * half, "ms"
+    return f"{half:.2g} {unit}".strip()
+
+
+def _limits(parameter: Parameter) -> tuple[float, float]:
+    return parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
+
+
+def _bound(parameter: Parameter, scaled: float) -> str | None:
+    lower, upper = _limits(parameter)
+    share = (scaled - lower) / (upper - lower)
+    return "lower" if share < AT_BOUND else "upper" if share > 1 - AT_BOUND else None
+
+
+def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]:
+    """Split what is known of each parameter, others fitted beside it, over where it came from.
+
+    The inverse of a parameter's variance is dᵀHd, d its change with all others following along;
+    H is a sum over channels, flights and priors, and so is what is known.
+    """
+    inverse = np.linalg.inv(information.total)
+    along = inverse / np.diag(inverse)
+    whole = 1.0 / np.diag(inverse)
+    by_segment = information.blocks.sum(axis=2)
+    parts = np.einsum("pk,clpq,qk->clk", along, by_segment, along, optimize=True) / whole
+    shares = np.zeros((parts.shape[0], flights, parts.shape[2]))
+    for segment, flight in enumerate(information.flight):
+        shares[:, flight] += parts[:, segment]
+    prior = (
+        np.einsum("pk,pq,qk->k", along, information.prior + information.clock_prior, along) / whole
+    )
+    return shares, np.asarray(prior)
+
+
+def _partner(row: Array, index: int, names: Sequence[str]) -> tuple[str | None, float]:
+    """Return the parameter that one is correlated with most, and how much."""
+    if len(row) == 1:
+        return None, 0.0
+    others = np.where(np.arange(len(row)) == index, 0.0, row)
+    strongest = int(np.argmax(np.abs(others)))
+    return names[strongest], float(others[strongest])
+
+
+def _source(shares: Array, channels: Sequence[str], flights: Sequence[str]) -> str:
+    """Return where most of what is known comes from, in words."""
+    if shares.sum() <= 0:
+        return ""
+    by_channel, by_flight = shares.sum(axis=1), shares.sum(axis=0)
+    channel = channels[int(np.argmax(by_channel))].replace("_", " ")
+    flight = int(np.argmax(by_flight))
+    alone = len(flights) == 1 or by_flight[flight] < 0.4 * by_flight.sum()
+    return channel if alone else f"{channel}, {flights[flight]} above all"

@@ -1,0 +1,141 @@
+"""Profile likelihood: one coefficient held at a value, all the others fitted again.
+
+Where the fit's quadratic picture of itself is wrong, the profile shows it: a valley that does not
+rise on one side has no interval there (Raue et al., "Structural and practical identifiability
+analysis of partially observed dynamical models by exploiting the profile likelihood", 2009).
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.config import COEFFICIENTS
+from tuner.errors import InputError, did_you_mean
+from tuner.examination.examine import Examination
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.search.levenberg_marquardt import advance, begin, on_host
+from tuner.uncertainty.all_free import with_space
+from tuner.uncertainty.covariance import WIDE
+from tuner.uncertainty.profile_files import THRESHOLD, Profile
+
+Array = NDArray[np.float64]
+
+POINTS = 13
+"""Values of the coefficient, the middle one where it stands."""
+REACH = 3.5
+"""Standard errors either side."""
+WIDEST = 1.2
+"""Scaled coordinate either side at most: a factor of three."""
+STEPS = 12
+"""Iterations at most."""
+STILL = 0.01
+"""Change of any point's χ² below which no more is to be gained."""
+
+
+def profile(examination: Examination, criterion: Criterion, name: str) -> Profile:
+    """Return the profile of one coefficient, fitted or fixed.
+
+    Parameters
+    ----------
+    examination
+        Of the point where the coefficient stands.
+    criterion
+        In whose weights; priors are left out but for what keeps the others from running away.
+    name
+        The coefficient.
+
+    Raises
+    ------
+    InputError
+        There is no such coefficient in this simulation.
+    """
+    all_free = examination.all_free
+    names = all_free.objective.space.names
+    if name not in names:
+        raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
+    chosen = all_free.fitted if name in all_free.fitted else (*all_free.fitted, name)
+    space, places = all_free.only(chosen)
+    objective = with_space(all_free.objective, space)
+    found = examination.uncertainty if name in all_free.fitted else examination.freed[name]
+    index = space.names.index(name)
+    vector = np.asarray(all_free.point.coefficients)[places]
+    centre = np.asarray(space.scaled(jnp.asarray(vector)))
+    error = float(found.covariance.data_error[index])
+    reach = min(REACH * error, WIDEST * found.reference[index])
+    parameter = space.parameters[index]
+    low, high = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
+    grid = np.linspace(max(centre[index] - reach, low), min(centre[index] + reach, high), POINTS)
+    along = found.covariance.alone[:, index] / found.covariance.alone[index, index]
+    starts = np.stack([_moved(objective, centre, along, index, x) for x in grid])
+    chi = _refitted(objective, all_free.point, criterion, starts, index)
+    values = [space.from_scaled(index, float(x)) for x in grid]
+    # as the standard errors do, the likelihood allows for residuals that are not white noise
+    rise = (chi - chi.min()) / found.covariance.beyond_noise[index] ** 2
+    quadratic = ((grid - grid[int(np.argmin(chi))]) / error) ** 2
+    return Profile(
+        name=name,
+        unit=COEFFICIENTS[name].unit,
+        values=values,
+        rise=[float(one) if np.isfinite(one) else None for one in rise],
+        quadratic=quadratic.tolist(),
+        interval=_crossings(np.array(values), rise),
+    )
+
+
+def _moved(objective: Objective, centre: Array, along: Array, index: int, to: float) -> Array:
+    """Return the search vector (K,) where the others follow as the quadratic picture has it."""
+    space = objective.space
+    scaled = centre + along * (to - centre[index])
+    scaled[index] = to
+    limits = [(p.scaled(p.lower), p.scaled(p.upper)) for p in space.parameters]
+    inside = [float(np.clip(x, *limit)) for x, limit in zip(scaled, limits, strict=True)]
+    pairs = enumerate(zip(space.names, inside, strict=True))
+    return space.vector_of({name: space.from_scaled(i, x) for i, (name, x) in pairs})
+
+
+def _refitted(
+    objective: Objective, point: Point, criterion: Criterion, starts: Array, index: int
+) -> Array:
+    """Return χ² (S,) with one coordinate held and all others at their best."""
+    offsets = np.asarray(point.offsets)
+    count = len(objective.space)
+    free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
+    free[index] = 0.0
+    quiet = Criterion(
+        horizon=criterion.horizon,
+        scale=criterion.scale,
+        held=criterion.held,
+        huber=criterion.huber,
+        prior=jnp.asarray(1.0 / WIDE),
+        states=criterion.states,
+    )
+    points = Point(jnp.asarray(starts), jnp.asarray(np.repeat(offsets[None], len(starts), axis=0)))
+    step, before = begin(on_host(points), free), np.full(len(starts), np.inf)
+    for _ in range(STEPS):
+        step = advance(objective, step, on_host(quiet), free)
+        assert step.sums is not None
+        compared = sum(np.asarray(n)[0].sum() for n in step.sums.counts.values())
+        now = 2.0 * np.asarray(step.loss) * compared
+        if np.all(before - now < STILL):
+            break
+        before = now
+    return np.asarray(now)
+
+
+def _crossings(values: Array, rise: Array) -> tuple[float | None, float | None]:
+    """Return where the profile passes the threshold below and above its lowest point."""
+    lowest = int(np.argmin(rise))
+    below = _crossing(values[lowest::-1], rise[lowest::-1])
+    return below, _crossing(values[lowest:], rise[lowest:])
+
+
+def _crossing(values: Array, rise: Array) -> float | None:
+    beyond = np.flatnonzero(rise > THRESHOLD)
+    if len(beyond) == 0:
+        return None
+    outer = int(beyond[0])
+    share = (THRESHOLD - rise[outer - 1]) / (rise[outer] - rise[outer - 1])
+    return float(values[outer - 1] + share * (values[outer] - values[outer - 1]))

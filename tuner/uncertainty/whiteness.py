@@ -1,0 +1,106 @@
+"""Whether the residuals are white noise: if not, the model misses something."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.criterion import Criterion, Jacobian
+from tuner.objective.normal import Objective
+
+Array = NDArray[np.float64]
+
+LAGS = 50
+"""Samples over which a residual is compared with its own past."""
+FEWEST = 4 * LAGS
+"""Samples below which that is not told."""
+
+
+@dataclass(frozen=True)
+class Residual:
+    """The residuals of one channel of one flight.
+
+    Attributes
+    ----------
+    flight, channel
+        Names.
+    rms
+        In standard deviations of the measurement noise.
+    lag
+        (L,) s.
+    autocorrelation
+        (L,) mean over the axes; 1 at lag 0.
+    limit
+        Half the band within which 95 % of the lags of white noise lie.
+    memory
+        s after which the residual has forgotten itself: the integral of the autocorrelation's
+        square, on either side of 0; a sample's spacing for white noise.
+    outside
+        Share of the lags beyond ``limit``.
+    """
+
+    flight: str
+    channel: str
+    rms: float
+    lag: Array
+    autocorrelation: Array
+    limit: float
+    memory: float
+    outside: float
+
+    @property
+    def white(self) -> bool:
+        """Whether no more lags than twice chance's share lie outside the band."""
+        return self.outside <= 0.1
+
+
+def whiteness(
+    objective: Objective, jacobian: Jacobian, criterion: Criterion, flights: Sequence[str]
+) -> tuple[Residual, ...]:
+    """Return every flight's and channel's residuals, told by their own past."""
+    found = []
+    seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
+    segment_flight = np.asarray(objective.segments.flight)
+    for number, name in enumerate(flights):
+        segments = np.flatnonzero(segment_flight == number)  # windows follow each other
+        for channel, measured in objective.segments.measured.items():
+            weight = np.concatenate(np.moveaxis(np.asarray(measured.weight)[..., segments], -1, 0))
+            own = np.asarray(measured.time)[:, segments]
+            time = (own + objective.segments.begins[segments]).T.ravel()
+            used = (weight > 0).any(axis=1) & (own.T.ravel() < seconds)
+            if used.sum() < FEWEST:
+                continue
+            residuals = np.asarray(jacobian.residuals[channel])[..., segments]
+            error = np.concatenate(np.moveaxis(residuals, -1, 0))[used]
+            axes = (weight[used] > 0).all(axis=0)
+            if axes.any():
+                found.append(_residual(name, channel, time[used], error[:, axes]))
+    return tuple(found)
+
+
+def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:
+    spacing = float(np.median(np.diff(time)))
+    centred = error - error.mean(axis=0)
+    power = np.maximum((centred**2).sum(axis=0), 1e-300)
+    count = len(time)
+    correlation = np.array(
+        [1.0]
+        + [
+            float(np.mean((centred[lag:] * centred[:-lag]).sum(axis=0) / power))
+            for lag in range(1, LAGS)
+        ]
+    )
+    limit = 1.96 / np.sqrt(count * error.shape[1])
+    return Residual(
+        flight=flight,
+        channel=channel,
+        rms=float(np.sqrt(np.mean(error**2))),
+        lag=np.asarray(spacing * np.arange(LAGS)),
+        autocorrelation=correlation,
+        limit=float(limit),
+        memory=float(spacing * (1.0 + 2.0 * (correlation[1:] ** 2).sum())),
+        outside=float(np.mean(np.abs(correlation[1:]) > limit)),
+    )
