@@ -5,27 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from tuner.config import COEFFICIENTS, VehicleFile, read_vehicle
-from tuner.config.model import config_error
-from tuner.config.yaml_file import Document, write_text
-from tuner.errors import ConfigError, InputError
+from tuner.errors import InputError
+from tuner.files import Part, read_json, write_text
 
 SCHEMA_VERSION = 1
-MAX_BYTES = 50_000_000
 
 RESULT_FILE = "result.json"
 BEST_FIT_FILE = "best_fit.yaml"
+REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
 
-class _Part(BaseModel):
-    """A part of the result; keys that a later version adds are passed over."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class CoefficientResult(_Part):
+class CoefficientResult(Part):
     """One coefficient: where it started, where it ended, how sure that is.
 
     Attributes
@@ -58,7 +51,7 @@ class CoefficientResult(_Part):
     note: str = ""
 
 
-class AxesRmse(_Part):
+class AxesRmse(Part):
     """The thesis's six: position along world x, y, z in m; roll, pitch, yaw in degrees.
 
     None stands for a flight that crashed or an axis that was not recorded.
@@ -72,7 +65,7 @@ class AxesRmse(_Part):
     yaw: float | None
 
 
-class FlightResult(_Part):
+class FlightResult(Part):
     """One recording: what it was used for and how closely it is met.
 
     ``duration`` in s; ``time_offset`` in s by which its clock is late; RMSE with the initial and
@@ -89,7 +82,7 @@ class FlightResult(_Part):
     rmse_best: AxesRmse
 
 
-class SearchResult(_Part):
+class SearchResult(Part):
     """How the minimum was found; ``wall_time`` in s."""
 
     method: str
@@ -102,7 +95,7 @@ class SearchResult(_Part):
     message: str
 
 
-class RunResult(_Part):
+class RunResult(Part):
     """The content of ``result.json``."""
 
     schema_version: int
@@ -142,37 +135,14 @@ def read_run(folder: str | Path) -> Run:
     Raises
     ------
     InputError
-        It is no result folder, or was written by a newer version, or its two files disagree.
+        It is no result folder, or is of another schema version, or its two files disagree.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "is no folder", "give the result folder of a run")
     path = folder / RESULT_FILE
-    result = _read_result(path)
-    if result.schema_version > SCHEMA_VERSION:
-        raise InputError(
-            path,
-            f"has schema version {result.schema_version}, newer than {SCHEMA_VERSION}",
-            "update tune",
-        )
+    result = read_json(RunResult, path, version=SCHEMA_VERSION, remedy=REMEDY)
     for name in result.coefficients:
         if name not in COEFFICIENTS:
             raise InputError(path, f"unknown coefficient '{name}'", "was it edited?")
     return Run(folder=folder, result=result, vehicle=read_vehicle(folder / BEST_FIT_FILE))
-
-
-def _read_result(path: Path) -> RunResult:
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(
-            path, f"cannot be read ({error.strerror})", "give the result folder of a finished run"
-        ) from None
-    if len(raw) > MAX_BYTES:
-        raise InputError(path, "is larger than 50 MB", "give the result folder of a run")
-    try:
-        return RunResult.model_validate_json(raw)
-    except ValidationError as error:
-        wrong: ConfigError = config_error(error, Document(path, {}, {}))
-        raise InputError(path, wrong.what, wrong.remedy) from None

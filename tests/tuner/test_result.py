@@ -25,7 +25,7 @@ def test_keys_of_later_versions_are_passed_over(make_run):  # noqa: F811
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"schema_version": 2}, "newer than 1"),
+        ({"schema_version": 3}, "has schema version 3, and this tune reads version 1"),
         ({"seed": "x"}, "seed is 'x'"),
         (
             {"coefficients": {"mas": {"unit": "", "initial": 1, "best": 1, "fitted": False}}},

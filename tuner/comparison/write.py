@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tuner.comparison.table import UNITS, Row, Table
-from tuner.config.yaml_file import write_text
 from tuner.errors import InputError
+from tuner.files import write_text
 
 SCHEMA_VERSION = 1
 TEMPLATE = Path(__file__).parent / "comparison.html.jinja"

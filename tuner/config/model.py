@@ -8,10 +8,11 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 from annotated_types import Ge, Gt
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Strict, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic_core import PydanticCustomError
 
-from tuner.config.yaml_file import Document, Place, read_yaml
-from tuner.errors import ConfigError, did_you_mean
+from tuner.config.yaml_file import read_yaml
+from tuner.errors import did_you_mean
+from tuner.validation import config_error
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Gt(0)]
@@ -69,7 +70,7 @@ def read_model(kind: type[M], path: str | Path) -> M:
     try:
         return kind.model_validate(document.data)
     except ValidationError as error:
-        raise config_error(error, document) from None
+        raise config_error(error, document.path, document.lines) from None
 
 
 def build(kind: type[M], values: Mapping[str, object], where: str) -> M:
@@ -83,53 +84,4 @@ def build(kind: type[M], values: Mapping[str, object], where: str) -> M:
     try:
         return kind.model_validate(values)
     except ValidationError as error:
-        raise config_error(error, Document(Path(where), {}, {})) from None
-
-
-def config_error(error: ValidationError, document: Document) -> ConfigError:
-    """Turn the first of pydantic's findings into one line."""
-    details = error.errors(include_url=False)
-    what, remedy = _sentence(details[0])
-    place: Place = details[0]["loc"]
-    if details[0]["type"] == "unknown_key":
-        place = (*place, details[0]["ctx"]["key"])
-    while place and place not in document.lines:
-        place = place[:-1]
-    line = f"line {document.lines[place]}: " if place in document.lines else ""
-    more = f" ({len(details) - 1} more after this)" if len(details) > 1 else ""
-    return ConfigError(document.path, line + what, remedy + more)
-
-
-def _sentence(detail: ErrorDetails) -> tuple[str, str]:
-    key = dotted(detail["loc"]) or "the file"
-    context = detail.get("ctx", {})
-    match detail["type"]:
-        case "unknown_key":
-            return f"unknown key '{dotted((*detail['loc'], context['key']))}'", context["remedy"]
-        case "refused":
-            return context["what"], context["remedy"]
-        case "missing":
-            return f"key '{key}' is missing", "add it"
-        case "model_type" | "model_attributes_type" | "dict_type":
-            return f"{key} is {_short(detail['input'])}", "it should be a mapping of keys to values"
-        case _:
-            message = detail["msg"].removeprefix("Value error, ")
-            return (
-                f"{key} is {_short(detail['input'])}",
-                message.replace("Input should be", "it should be").replace(
-                    "Input should", "it should"
-                ),
-            )
-
-
-def dotted(place: Place) -> str:
-    """Return ``rotors[0].spin`` for ``("rotors", 0, "spin")``."""
-    text = ""
-    for part in place:
-        text += f"[{part}]" if isinstance(part, int) else f".{part}"
-    return text.removeprefix(".")
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        raise config_error(error, Path(where)) from None

@@ -14,12 +14,11 @@ from pydantic import ValidationError
 from tuner.config.coefficient_names import check_names, with_values
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import JobFile, Method, read_job
-from tuner.config.model import config_error
 from tuner.config.shipped import Kind, find_config
 from tuner.config.vehicle import VehicleFile, read_vehicle
-from tuner.config.yaml_file import Document
 from tuner.errors import ConfigError, InputError, did_you_mean
 from tuner.flights.paths import find_flights
+from tuner.validation import config_error
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"
@@ -120,7 +119,7 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     try:
         job = _override(job, options, holdout)
     except ValidationError as error:
-        raise config_error(error, Document(Path("command line"), {}, {})) from None
+        raise config_error(error, Path("command line")) from None
 
     vehicle, origin["vehicle"] = _choose(VEHICLES, options.vehicle, job.vehicle, job_path)
     controller, origin["controller"] = _choose(

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from tuner.config.coefficient_names import COEFFICIENTS
 from tuner.config.vehicle import VehicleFile
-from tuner.config.yaml_file import commented, dump_yaml, write_text
+from tuner.config.yaml_file import commented, dump_yaml
+from tuner.files import write_text
 
 UNIT_COLUMN = 44
 

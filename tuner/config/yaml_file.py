@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +11,11 @@ from pathlib import Path
 import yaml
 
 from tuner.errors import ConfigError
+from tuner.files import read_bytes, write_text
+from tuner.validation import Place
 
 MAX_BYTES = 1_000_000
 MAX_NODES = 100_000
-
-Place = tuple[str | int, ...]
 
 
 @dataclass(frozen=True)
@@ -126,30 +124,6 @@ def commented(text: str) -> str:
     return "".join(f"# {line}".rstrip() + "\n" for line in text.splitlines())
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all.
-
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written to.
-    """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise ConfigError(
-            path, f"cannot be written ({error.strerror})", "check the folder"
-        ) from None
-
-
 def dump_yaml(data: object) -> str:
     """Return a document as YAML text, floats by their repr."""
     root = _Dumper(io.StringIO(), sort_keys=False).represent_data(data)
@@ -166,16 +140,9 @@ def _set_style(node: yaml.Node, depth: int) -> None:
 
 
 def _read_text(path: Path) -> str:
-    try:
-        if not path.is_file():
-            what = "is a folder" if path.is_dir() else "does not exist"
-            raise ConfigError(path, what, "give the path of a YAML file")
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise ConfigError(path, f"cannot be read ({error.strerror})", "check its rights") from None
-    if len(raw) > MAX_BYTES:
-        raise ConfigError(path, "is larger than 1 MB", "give a configuration file")
+    if path.is_dir():
+        raise ConfigError(path, "is a folder", "give the path of a YAML file")
+    raw = read_bytes(path, most=MAX_BYTES, remedy="give the path of a YAML file")
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:

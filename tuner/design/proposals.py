@@ -8,9 +8,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.config.yaml_file import write_text
-from tuner.examination.files import table
-from tuner.examination.knowledge import Part, read_part
+from tuner.files import Part, csv_text, read_optional, write_text
 
 NEXT_FILE = "next_flight.json"
 NEXT_TABLE = "next_flight.csv"
@@ -131,9 +129,9 @@ def write_proposals(proposals: Proposals, folder: Path) -> None:
         [one.name, one.mean, one.volume, *(one.shrinks[name] for name in proposals.targets)]
         for one in proposals.flights
     ]
-    write_text(folder / NEXT_TABLE, table(header, rows))
+    write_text(folder / NEXT_TABLE, csv_text(header, rows))
 
 
 def read_proposals(folder: Path) -> Proposals | None:
     """Read ``next_flight.json``; None where there is none."""
-    return read_part(Proposals, folder / NEXT_FILE)
+    return read_optional(Proposals, folder / NEXT_FILE)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from tuner.config.yaml_file import write_text
 from tuner.examination.knowledge import Knowledge, write_knowledge
+from tuner.files import csv_text, write_text
 
 SENSITIVITY_FILE = "sensitivity.csv"
 SHARES_FILE = "information_shares.csv"
@@ -45,13 +43,13 @@ def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
     """
     write_knowledge(knowledge, folder)
     texts = {
-        SENSITIVITY_FILE: table(COLUMNS, _sensitivity(knowledge)),
-        SHARES_FILE: table(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
+        SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(knowledge)),
+        SHARES_FILE: csv_text(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
     }
     for name in MATRICES:
         rows = zip(knowledge.names, getattr(knowledge, name), strict=True)
         header = ("coefficient", *knowledge.names)
-        texts[f"{name}.csv"] = table(header, ([one, *row] for one, row in rows))
+        texts[f"{name}.csv"] = csv_text(header, ([one, *row] for one, row in rows))
     for name, text in texts.items():
         write_text(folder / name, text)
     return tuple(folder / name for name in texts)
@@ -85,13 +83,3 @@ def _shares(knowledge: Knowledge) -> Iterable[Sequence[object]]:
             for flight, share in flights.items():
                 yield [name, flight, channel, share]
         yield [name, "", "prior", known.prior_share]
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Return CSV text, numbers in full precision and nothing for None."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
-    for row in rows:
-        writer.writerow(["" if v is None else repr(v) if isinstance(v, float) else v for v in row])
-    return text.getvalue()

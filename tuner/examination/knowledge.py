@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
 
-from tuner.config.model import config_error
-from tuner.config.yaml_file import Document, write_text
-from tuner.errors import ConfigError, InputError
+from tuner.files import Part, read_optional, write_text
 
 SCHEMA_VERSION = 1
-P = TypeVar("P", bound=BaseModel)
 KNOWLEDGE_FILE = "sensitivity.json"
-MAX_BYTES = 50_000_000
 
 Number = float | None
 """None stands for what cannot be told: a simulation that crashed, an interval without end."""
-
-
-class Part(BaseModel):
-    """A part of what was found; keys that a later version adds are passed over."""
-
-    model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class Known(Part):
@@ -194,35 +182,6 @@ def read_knowledge(folder: Path) -> Knowledge | None:
     Raises
     ------
     InputError
-        It cannot be read, or was written by a newer version.
+        It cannot be read, or is of another schema version.
     """
-    return read_part(Knowledge, folder / KNOWLEDGE_FILE)
-
-
-def read_part(kind: type[P], path: Path) -> P | None:
-    """Read one file of a result folder; None where there is none.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, is no such file, or was written by a newer version.
-    """
-    if not path.exists():
-        return None
-    try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "check the file") from None
-    if len(raw) > MAX_BYTES:
-        raise InputError(path, "is larger than 50 MB", "was it edited?")
-    try:
-        part = kind.model_validate_json(raw)
-    except ValidationError as error:
-        wrong: ConfigError = config_error(error, Document(path, {}, {}))
-        raise InputError(path, wrong.what, wrong.remedy) from None
-    version = getattr(part, "schema_version", SCHEMA_VERSION)
-    if version > SCHEMA_VERSION:
-        newer = f"has schema version {version}, newer than {SCHEMA_VERSION}"
-        raise InputError(path, newer, "update tune")
-    return part
+    return read_optional(Knowledge, folder / KNOWLEDGE_FILE, version=SCHEMA_VERSION)

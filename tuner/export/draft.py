@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tuner.config import VehicleFile, values_of
-from tuner.config.yaml_file import write_text
 from tuner.errors import ConfigError, ExportError
+from tuner.files import read_bytes, write_text
 
 MAX_BYTES = 10_000_000
 #: Numbers are written with twelve digits; mass and inertia may go through sums of links.
@@ -79,12 +79,8 @@ def read_file(path: Path) -> str:
         It is missing, too large, or no text.
     """
     try:
-        with path.open("rb") as file:
-            raw = file.read(MAX_BYTES + 1)
-        if len(raw) > MAX_BYTES:
-            raise ExportError(path, "is larger than 10 MB", "give a model file")
-        return raw.decode("utf-8")
-    except OSError as error:
-        raise ExportError(path, f"cannot be read ({error.strerror})", "check the path") from None
+        return read_bytes(path, most=MAX_BYTES, remedy="give a model file").decode("utf-8")
+    except ConfigError as error:
+        raise ExportError(path, error.what, error.remedy) from None
     except UnicodeDecodeError:
         raise ExportError(path, "is not UTF-8 text", "give a model file") from None

@@ -14,8 +14,8 @@ import numpy as np
 
 from tuner.comparison.layout import Layout
 from tuner.config import with_values
-from tuner.config.yaml_file import write_text
 from tuner.errors import ConfigError, RecordingError
+from tuner.files import write_text
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.results import best_values, controller_flown, offsets_of

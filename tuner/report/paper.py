@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tuner.config.yaml_file import write_text
+from tuner.files import write_text
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
 if TYPE_CHECKING:

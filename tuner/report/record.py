@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import JsonValue
 
-from tuner.config.yaml_file import write_text
-from tuner.examination.knowledge import Part, read_part
+from tuner.files import Part, read_optional, write_text
 from tuner.result import AxesRmse
 
 if TYPE_CHECKING:
@@ -97,7 +96,7 @@ def write_about(folder: Path, about: About) -> None:
 
 def read_about(folder: Path) -> About | None:
     """Read ``about.json``; None where there is none."""
-    return read_part(About, folder / ABOUT_FILE)
+    return read_optional(About, folder / ABOUT_FILE)
 
 
 def write_search(folder: Path, fitted: Fitted) -> None:
@@ -146,9 +145,9 @@ def write_laps(
 
 def read_search(folder: Path) -> SearchRecord | None:
     """Read ``search.json``; None where there is none."""
-    return read_part(SearchRecord, folder / SEARCH_FILE)
+    return read_optional(SearchRecord, folder / SEARCH_FILE)
 
 
 def read_laps(folder: Path) -> LapTable | None:
     """Read ``laps.json``; None where there is none."""
-    return read_part(LapTable, folder / LAPS_FILE)
+    return read_optional(LapTable, folder / LAPS_FILE)

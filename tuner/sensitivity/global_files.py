@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from tuner.config.yaml_file import write_text
-from tuner.examination.files import table
-from tuner.examination.knowledge import Part, read_part
+from tuner.files import Part, csv_text, read_optional, write_text
 
 Method = Literal["morris", "sobol"]
 GLOBAL_FILE = "global_sensitivity.json"
@@ -72,9 +70,9 @@ def write_global(found: GlobalIndices, folder: Path) -> None:
         ]
         for one in found.indices
     ]
-    write_text(folder / GLOBAL_TABLE, table(header, rows))
+    write_text(folder / GLOBAL_TABLE, csv_text(header, rows))
 
 
 def read_global(folder: Path) -> GlobalIndices | None:
     """Read ``global_sensitivity.json``; None where there is none."""
-    return read_part(GlobalIndices, folder / GLOBAL_FILE)
+    return read_optional(GlobalIndices, folder / GLOBAL_FILE)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from tuner.config.yaml_file import write_text
-from tuner.examination.files import table
-from tuner.examination.knowledge import Part, read_part
+from tuner.files import Part, csv_text, read_optional, write_text
 
 PROFILES_FILE = "profiles.json"
 PROFILES_TABLE = "profiles.csv"
@@ -58,9 +56,9 @@ def write_profiles(found: Sequence[Profile], folder: Path) -> None:
         for value, rise, quadratic in zip(one.values, one.rise, one.quadratic, strict=True)
     ]
     header = ("coefficient", "value", "chi_square_rise", "quadratic")
-    write_text(folder / PROFILES_TABLE, table(header, rows))
+    write_text(folder / PROFILES_TABLE, csv_text(header, rows))
 
 
 def read_profiles(folder: Path) -> Profiles | None:
     """Read ``profiles.json``; None where there is none."""
-    return read_part(Profiles, folder / PROFILES_FILE)
+    return read_optional(Profiles, folder / PROFILES_FILE)
