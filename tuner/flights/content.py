@@ -10,6 +10,7 @@ import numpy as np
 
 from tuner.errors import RecordingError
 from tuner.flights.clean import clean
+from tuner.flights.damage import Damage
 from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Note, Series
 from tuner.flights.frames import correct_frames
@@ -64,6 +65,8 @@ class Content:
         What was flown.
     notes
         What was dropped, repaired or doubted.
+    damage
+        What the file has lost, with times as those of `series`.
     """
 
     recording: Recording
@@ -74,6 +77,7 @@ class Content:
     epoch: int
     missions: tuple[Mission, ...]
     notes: tuple[Note, ...]
+    damage: tuple[Damage, ...]
 
 
 def read_content(
@@ -111,13 +115,18 @@ def read_content(
     chosen = choose_map(recording, candidates)
     places, notes = locate(recording, chosen, strict=given is not None)
     require_pose(recording, chosen, places)
-    raw, samples, noticed = extract(recording, places, chosen.clocks)
+    raw, contents, noticed = extract(recording, places, chosen.clocks)
     said = [
         Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
         *notes,
+        *contents.notes,
         *noticed,
     ]
     series, epoch = _clean(path, raw, said)
+    # From the recorder's clock to that of the stamps, in which the series are.
+    arrival = contents.samples[raw["position"].topic].receive
+    later = float(np.median(raw["position"].time)) - float(np.median(arrival)) - epoch
+    damage = tuple(part.later(later * 1e-9) for part in contents.damage)
     topics_of = {signal: data.topic for signal, data in raw.items()}
     series, noticed = align_pose(series, topics_of)
     said.extend(noticed)
@@ -125,7 +134,17 @@ def read_content(
     said.extend(noticed)
     said.extend(_unmeasured(series, topics_of))
     missions = _missions(series, sidecar)
-    return Content(recording, chosen, places, samples, series, epoch, missions, tuple(said))
+    return Content(
+        recording,
+        chosen,
+        places,
+        contents.samples,
+        series,
+        epoch,
+        missions,
+        tuple(said),
+        damage,
+    )
 
 
 def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | None:

@@ -77,6 +77,7 @@ def _without_flight(recording: Recording, problem: RecordingError) -> Inspection
         clock={},
         battery=None,
         notes=(),
+        damage=(),
     )
 
 
@@ -113,6 +114,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
         clock=_clock(content),
         battery=((float(voltage.values[0, 0]), float(voltage.values[-1, 0])) if voltage else None),
         notes=tuple(dataclasses.asdict(note) for note in content.notes),
+        damage=content.damage,
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from tuner.flights.flight import SIGNALS, Array, Note
 from tuner.flights.locate import Place
-from tuner.flights.recording import Clock, Nanoseconds, Recording, Request, Samples
+from tuner.flights.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
 from tuner.flights.stamps import believe
 from tuner.flights.units import to_enu_flu, to_si
 
@@ -38,13 +38,13 @@ class Raw:
 
 def extract(
     recording: Recording, places: Mapping[str, Place], clocks: tuple[Clock, ...] = ()
-) -> tuple[dict[str, Raw], Mapping[str, Samples], tuple[Note, ...]]:
+) -> tuple[dict[str, Raw], Contents, tuple[Note, ...]]:
     """Read every located signal.
 
     Returns
     -------
     tuple
-        Signal -> its raw values, topic -> the messages they come from, and what was noticed.
+        Signal -> its raw values, the messages they come from, and what was noticed.
     """
     wanted: dict[str, list[str]] = {}
     for place in places.values():
@@ -69,7 +69,7 @@ def extract(
             time, values = time[there], values[there]
         if len(time):
             signals[signal] = Raw(place.topic, time, values)
-    return signals, contents.samples, (*contents.notes, *notes)
+    return signals, contents, notes
 
 
 def _values(samples: Samples, signal: str, place: Place) -> Array:

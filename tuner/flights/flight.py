@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tuner.flights.damage import Damage
 
 Array = NDArray[np.float64]
 
@@ -131,6 +133,8 @@ class Flight:
         Name and parameters of the trajectory from a side-car, where no reference was recorded.
     notes
         What was dropped, repaired or doubted.
+    damage
+        What the file has lost, if it is broken; the flight is what was salvaged.
     """
 
     name: str
@@ -143,7 +147,8 @@ class Flight:
     initial: InitialState
     yaw_rate_setpoint: float | None = None
     trajectory: Mapping[str, object] | None = None
-    notes: tuple[Note, ...] = field(default=())
+    notes: tuple[Note, ...] = ()
+    damage: tuple[Damage, ...] = ()
 
     @property
     def duration(self) -> float:

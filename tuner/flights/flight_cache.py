@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.flight import Array, Flight, InitialState, Note, Series
 
 logger = logging.getLogger(__name__)
@@ -87,6 +88,7 @@ def _about(flight: Flight) -> dict[str, Any]:
         "yaw_rate_setpoint": flight.yaw_rate_setpoint,
         "trajectory": flight.trajectory,
         "notes": [dataclasses.asdict(note) for note in flight.notes],
+        "damage": [dataclasses.asdict(damage) for damage in flight.damage],
     }
 
 
@@ -107,4 +109,7 @@ def _flight(
         yaw_rate_setpoint=about["yaw_rate_setpoint"],
         trajectory=about["trajectory"],
         notes=tuple(Note(**note) for note in about["notes"]),
+        damage=tuple(
+            Damage(**{**damage, "cause": Cause(damage["cause"])}) for damage in about["damage"]
+        ),
     )

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from tuner.errors import InputError, RecordingError
 from tuner.flights.cache import cached, digest, load, store
+from tuner.flights.damage import Cause, Damage
 
 if TYPE_CHECKING:
     from tuner.flights.topics import TopicMap
 
 #: Of the JSON that `as_json` writes.
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -167,6 +168,8 @@ class Inspection:
         V at the start and at the end, None where it was not recorded.
     notes
         What was dropped, repaired or doubted: kind, topic, text and count.
+    damage
+        What the file has lost, with times in s since the first pose.
     """
 
     path: str
@@ -184,6 +187,7 @@ class Inspection:
     clock: Mapping[str, float]
     battery: tuple[float, float] | None
     notes: tuple[Mapping[str, Any], ...]
+    damage: tuple[Damage, ...]
 
 
 def inspect_recordings(
@@ -278,6 +282,7 @@ def from_json(content: bytes) -> Inspection | None:
                 "coefficients": tuple(Informed(**c) for c in raw["coefficients"]),
                 "battery": tuple(raw["battery"]) if raw["battery"] else None,
                 "notes": tuple(raw["notes"]),
+                "damage": tuple(Damage(**{**d, "cause": Cause(d["cause"])}) for d in raw["damage"]),
             }
         )
     except (ValueError, TypeError, KeyError):

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tuner.flights.inspection import Inspection, MissionReport
+from tuner.wording.damage import damage_sentence
 
 _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 
@@ -26,6 +27,7 @@ def _one(one: Inspection) -> list[RenderableType]:
     parts: list[RenderableType] = [Text(), Text(one.path, "bold"), Text(" · ".join(about))]
     if one.problem:
         parts.append(Text(one.problem, "red"))
+    parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in one.damage]
     parts.append(_topics(one))
     if one.missions:
         parts.append(_missions(one))

@@ -77,6 +77,7 @@ def make_flight(
         yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
         trajectory=sidecar.trajectory.model_dump() if sidecar.trajectory else None,
         notes=tuple(notes),
+        damage=tuple(part.later(-start) for part in content.damage),
     )
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.flights.damage import Damage
 from tuner.flights.flight import Array, Note
 
 Nanoseconds = NDArray[np.int64]
@@ -97,11 +98,14 @@ class Contents:
     samples
         Topic -> its messages.
     notes
-        What was lost while reading.
+        What was left out while reading.
+    damage
+        What the recording has lost, with times in s since 1970 by the recorder's clock.
     """
 
     samples: Mapping[str, Samples]
-    notes: tuple[Note, ...] = field(default=())
+    notes: tuple[Note, ...] = ()
+    damage: tuple[Damage, ...] = ()
 
 
 class Recording(Protocol):

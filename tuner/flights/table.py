@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.errors import RecordingError
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.flight import Array, Note
 from tuner.flights.recording import (
     NANOSECONDS,
@@ -88,15 +89,14 @@ class Table:
         time = _nanoseconds(table.column(clock.field), clock)
         fields = {name: _numbers(table.column(name)) for name in request.fields}
         notes = []
-        if self._skipped:
-            text = f"{self._skipped} lines with too few or too many cells left out"
-            notes.append(Note("warning", ROWS, text, self._skipped))
+        damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
         kept = time != _NEVER
         if not kept.all():
             lost = int((~kept).sum())
             notes.append(Note("warning", ROWS, f"{lost} rows without a time left out", lost))
         fields = {name: values[kept] for name, values in fields.items()}
-        return Contents({ROWS: Samples(time[kept], time[kept], fields)}, tuple(notes))
+        samples = Samples(time[kept], time[kept], fields)
+        return Contents({ROWS: samples}, tuple(notes), tuple(damage))
 
     def _csv_columns(self) -> list[str]:
         with self.path.open("rb") as stream:

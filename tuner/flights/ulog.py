@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.px4 import USUAL
 from tuner.flights.recording import NANOSECONDS, Clock, Contents, Request, Samples, Topic, Usual
 
@@ -43,7 +43,7 @@ class ULogRecording:
         if path.stat().st_size > LARGEST:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
         self._formats, self._data_start = _formats(path)
-        counts, ids = _count(path, self._data_start)
+        counts, ids, self._behind = _count(path, self._data_start)
         self.topics = tuple(
             sorted(
                 (Topic(name, ids[number], count) for number, (name, count) in counts.items()),
@@ -73,14 +73,25 @@ class ULogRecording:
             topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
             if topic in wanted:
                 samples[topic] = self._samples(topic, data.data, wanted[topic])
-        notes = []
+        damage = []
         if log.dropouts:
-            lost = sum(dropout.duration for dropout in log.dropouts)
-            text = f"the logger dropped messages {len(log.dropouts)} times, {lost} ms in all"
-            notes.append(Note("warning", "", text, len(log.dropouts)))
+            starts = [dropout.timestamp * 1e-6 for dropout in log.dropouts]
+            end = starts[-1] + log.dropouts[-1].duration * 1e-3
+            damage.append(
+                Damage(
+                    Cause.LOGGER_DROPOUTS,
+                    occurrences=len(starts),
+                    seconds_lost=1e-3 * sum(dropout.duration for dropout in log.dropouts),
+                    start=starts[0],
+                    end=end,
+                )
+            )
         if log.file_corruption or said:
-            notes.append(Note("warning", "", "parts of the log are damaged and were left out", 1))
-        return Contents(samples, tuple(notes))
+            damage.append(Damage(Cause.LOG_DAMAGED))
+        if self._behind:
+            last = log.last_timestamp * 1e-6
+            damage.append(Damage(Cause.END_MISSING, bytes_lost=self._behind, start=last))
+        return Contents(samples, damage=tuple(damage))
 
     def _samples(self, topic: str, data: Mapping[str, Any], request: Request) -> Samples:
         if "timestamp" not in data:
@@ -165,12 +176,13 @@ def _size(formats: Mapping[str, list[tuple[str, int, str]]], name: str, depth: i
     return total
 
 
-def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int, str]]:
-    """Count the messages of each subscription."""
+def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int, str], int]:
+    """Count the messages of each subscription, and the bytes behind the last whole record."""
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: dict[int, int] = {}
     data, added = ord("D"), ord("A")
+    reached = start
     for kind, buffer, at, end in _records(path, start):
         if kind == data and end - at >= 2:
             number = buffer[at] | buffer[at + 1] << 8
@@ -179,7 +191,9 @@ def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int
             instance, number = struct.unpack_from("<BH", buffer, at)
             kinds[number] = buffer[at + 3 : end].decode(errors="replace")
             names[number] = kinds[number] if instance == 0 else f"{kinds[number]}[{instance}]"
-    return {number: (name, counts.get(number, 0)) for number, name in names.items()}, kinds
+        reached += 3 + end - at
+    counted = {number: (name, counts.get(number, 0)) for number, name in names.items()}
+    return counted, kinds, path.stat().st_size - reached
 
 
 def _parse(path: Path, names: list[str]) -> tuple[Any, str]:

@@ -13,6 +13,7 @@ from tuner.objective.inlets import NEEDS, sparse
 from tuner.search.fitted import Finding
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
+from tuner.wording.damage import damage_sentence
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""
@@ -56,6 +57,12 @@ def _recordings(job: Job) -> list[Finding]:
             Finding("warning", flight.name, f"{note.topic}: {note.text}")
             for note in flight.notes
             if note.kind == "warning"
+        ]
+        found += [
+            Finding(
+                "warning", flight.name, damage_sentence(damage), "record it again if it matters"
+            )
+            for damage in flight.damage
         ]
         missing = [name for name in ("body_rate", "rotor_speed", "command") if not flight.has(name)]
         if missing:

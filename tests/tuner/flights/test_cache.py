@@ -32,6 +32,7 @@ def assert_equal(a: Flight, b: Flight) -> None:
         assert np.array_equal(value, getattr(b.initial, name), equal_nan=True), name
     assert np.array_equal(a.time, b.time)
     assert a.notes == b.notes
+    assert a.damage == b.damage
     assert (a.name, a.sha256, a.rate) == (b.name, b.sha256, b.rate)
 
 

@@ -13,6 +13,8 @@ import pytest
 from tests.tuner.flights import making
 from tuner.errors import RecordingError
 from tuner.flights import Flight, load_flight, load_flights
+from tuner.flights.damage import Cause
+from tuner.wording.damage import damage_sentence
 
 POSE = "/optitrack/pose"
 GYRO = "/mavros/imu/data"
@@ -222,7 +224,15 @@ def test_bag_cut_off_in_the_middle(short: Path, tmp_path: Path, clean: Flight) -
     got = load_flight(path)
     near(got, clean, position=1e-5)
     assert 6 < got.duration < 10
-    assert told(got, "salvaged") > 4000
+    (damage,) = got.damage
+    assert damage.cause is Cause.END_MISSING
+    assert damage.salvaged is not None
+    assert 4000 < damage.salvaged < 8000
+    assert damage.bytes_lost is not None
+    assert damage.bytes_lost < 1000
+    assert damage.start == pytest.approx(got.duration, abs=0.1)
+    assert "the end of the file is missing" in damage_sentence(damage)
+    assert load_flight(path).damage == got.damage  # from the cache
 
 
 def test_bag_that_was_never_closed(short: Path, tmp_path: Path, clean: Flight) -> None:
@@ -233,7 +243,11 @@ def test_bag_that_was_never_closed(short: Path, tmp_path: Path, clean: Flight) -
     got = load_flight(path)
     near(got, clean, position=1e-5)
     assert got.duration == clean.duration
-    assert told(got, "never closed") > 8000
+    (damage,) = got.damage
+    assert damage.cause is Cause.NOT_CLOSED
+    assert damage.salvaged is not None
+    assert damage.salvaged > 8000
+    assert damage.bytes_lost == 0
 
 
 def test_damaged_chunk_costs_that_chunk_only(short: Path, tmp_path: Path, clean: Flight) -> None:
@@ -244,7 +258,14 @@ def test_damaged_chunk_costs_that_chunk_only(short: Path, tmp_path: Path, clean:
     path.write_bytes(raw)
     got = load_flight(path)
     near(got, clean, position=1e-5)
-    assert told(got, "chunks are damaged") == 1
+    (damage,) = got.damage
+    assert (damage.cause, damage.occurrences) == (Cause.CHUNKS_DAMAGED, 1)
+    assert damage.bytes_lost == pytest.approx(1 << 16, rel=0.1)
+    assert damage.lost is not None
+    assert 50 < damage.lost < 500
+    assert damage.start is not None
+    assert damage.end is not None
+    assert 0 < damage.start < damage.end < got.duration
 
 
 @pytest.mark.parametrize("storage", making.StoragePlugin, ids=lambda storage: storage.name)
@@ -255,7 +276,9 @@ def test_ros2_cut_off(storage: Any, short: Path, tmp_path: Path, clean: Flight) 
     cut.write_bytes(file.read_bytes()[: int(file.stat().st_size * 0.7)])
     got = load_flight(cut)
     near(got, clean, position=1e-5)
-    assert [n for n in got.notes if n.kind == "warning"]
+    (damage,) = got.damage
+    assert damage.cause in (Cause.END_MISSING, Cause.DATABASE_DAMAGED)
+    assert damage.start == pytest.approx(got.duration, abs=0.2)
 
 
 def test_namespace_is_suggested_and_works(short: Path, tmp_path: Path, clean: Flight) -> None:

@@ -11,6 +11,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from tests.tuner.flights import making
 from tuner.errors import RecordingError
 from tuner.flights import Flight, load_flight
+from tuner.flights.damage import Cause
 from tuner.flights.opening import open_recording
 from tuner.flights.recording import Request
 
@@ -76,7 +77,7 @@ def test_bare_file_and_folder_without_metadata(
     assert_same(load_flight(bare), circle)
     got = load_flight(folder)
     assert_same(got, circle)
-    assert any("metadata.yaml is missing" in note.text for note in got.notes)
+    assert [damage.cause for damage in got.damage] == [Cause.METADATA_MISSING]
 
 
 @pytest.mark.parametrize("compression", ["none", "bz2", "lz4"])

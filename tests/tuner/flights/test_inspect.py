@@ -81,7 +81,7 @@ def test_inlets_and_coefficients(circle: Inspection) -> None:
 
 def test_json_and_table_tell_the_same(circle: Inspection) -> None:
     content = json.loads(as_json([circle]))
-    assert content["schema_version"] == 1
+    assert content["schema_version"] == 2
     (recording,) = content["recordings"]
     assert recording["missions"][0]["laps"] == 7
     stream = io.StringIO()

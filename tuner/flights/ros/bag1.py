@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import (
     LARGEST_CHUNK,
     NEAR,
@@ -41,13 +41,29 @@ LONGEST_DATA = 1 << 24
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A chunk: where its data lie, how they are packed, and which connections it holds."""
+    """A chunk.
+
+    Attributes
+    ----------
+    position, packed
+        Where its data lie in the file, and how many bytes they are.
+    size
+        Bytes of its data when unpacked.
+    compression
+        How they are packed.
+    counts
+        Connection -> messages in the chunk.
+    start, end
+        s since 1970 of the first and the last message; None where no index says so.
+    """
 
     position: int
     packed: int
     size: int
     compression: str
     counts: dict[int, int]
+    start: float | None = None
+    end: float | None = None
 
 
 @dataclass
@@ -63,7 +79,7 @@ class Bag1:
     path: Path
     aligned: bool = False
     connections: dict[int, Connection] = field(default_factory=dict)
-    notes: list[Note] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
     _chunks: list[_Chunk] = field(default_factory=list)
     _indexed: bool = True
 
@@ -77,13 +93,13 @@ class Bag1:
             try:
                 self._read_index(stream)
             except DamagedError as err:
-                self._walk(stream, first, str(err))
+                self._walk(stream, first, err.cause)
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, chunk by chunk."""
-        lost = 0
+        lost: list[_Chunk] = []
         with self.path.open("rb") as stream:
             for chunk in self._chunks:
                 present = [number for number in wanted if chunk.counts.get(number)]
@@ -92,12 +108,20 @@ class Bag1:
                 try:
                     located = self._locate(stream, chunk, present)
                 except DamagedError:
-                    lost += 1
+                    lost.append(chunk)
                     continue
                 yield from located
         if lost:
-            text = f"{lost} of {len(self._chunks)} chunks are damaged, their messages lost"
-            self.notes.append(Note("warning", "", text, lost))
+            self.damage.append(
+                Damage(
+                    Cause.CHUNKS_DAMAGED,
+                    lost=sum(chunk.counts.get(number, 0) for chunk in lost for number in wanted),
+                    bytes_lost=sum(chunk.packed for chunk in lost),
+                    occurrences=len(lost),
+                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
+                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
+                )
+            )
 
     def _read_index(self, stream: BinaryIO) -> None:
         """Learn connections and chunks from the end of the bag."""
@@ -107,33 +131,34 @@ class Bag1:
         chunks = _number(header, b"chunk_count", 4)
         size = self.path.stat().st_size
         if start == 0:
-            raise DamagedError("it was never closed and has no index")
+            raise DamagedError("it has no index", Cause.NOT_CLOSED)
         if start >= size or connections > size // 20 or chunks > size // 20:
-            raise DamagedError("its end is missing")
+            raise DamagedError("its end is missing", Cause.END_MISSING)
         stream.seek(start)
         found = [_connection(*_record(stream, CONNECTION)) for _ in range(connections)]
         infos = [_chunk_info(*_record(stream, CHUNK_INFO)) for _ in range(chunks)]
         counts: dict[int, int] = {}
-        for position, held in infos:
+        for position, info in infos:
             stream.seek(position)
             header = _header(stream, CHUNK)
             (packed,) = struct.unpack("<I", _read(stream, 4))
-            self._chunks.append(_chunk(header, stream.tell(), packed, held))
-            for number, count in held.items():
+            self._chunks.append(replace(_chunk(header, stream.tell(), packed), **info))
+            for number, count in info["counts"].items():
                 counts[number] = counts.get(number, 0) + count
         self.connections = {
             number: Connection(number, topic, kind, text, counts.get(number, 0))
             for number, topic, kind, text in found
         }
 
-    def _walk(self, stream: BinaryIO, first: int, why: str) -> None:
+    def _walk(self, stream: BinaryIO, first: int, cause: Cause) -> None:
         """Learn connections and chunks from front to end, as far as records can be followed."""
         self._indexed = False
         self._chunks, self.connections = [], {}
         counts: dict[int, int] = {}
         size = self.path.stat().st_size
         stream.seek(first)
-        reached = first
+        reached, unread = first, 0
+        last = None
         while reached < size:
             try:
                 header = _header(stream, None)
@@ -142,32 +167,35 @@ class Bag1:
                 break
             position = stream.tell()
             if header.get(b"op") == bytes([CHUNK]):
-                chunk = _chunk(header, position, min(length, size - position), {})
+                chunk = _chunk(header, position, min(length, size - position))
                 try:
-                    held = self._scan(self._content(stream, chunk))
+                    chunk, read = self._scan(self._content(stream, chunk), chunk)
                 except DamagedError:
-                    held = {}
-                self._chunks.append(_Chunk(**{**vars(chunk), "counts": held}))
-                for number, count in held.items():
+                    read = 0
+                unread += chunk.packed - read if chunk.compression in ("none", "") else 0
+                last = last if chunk.end is None else max(last or 0.0, chunk.end)
+                self._chunks.append(chunk)
+                for number, count in chunk.counts.items():
                     counts[number] = counts.get(number, 0) + count
-            if position + length > size:
-                reached = position
-                break
-            stream.seek(position + length)
-            reached = position + length
+            reached = min(position + length, size)
+            stream.seek(reached)
         self.connections = {
             number: Connection(number, c.topic, c.type, c.definition, counts.get(number, 0))
             for number, c in self.connections.items()
         }
-        total = sum(counts.values())
-        text = f"{why}; {total} messages salvaged from {len(self._chunks)} chunks"
-        if reached < size:
-            text += f", the last {size - reached} bytes could not be followed"
-        self.notes.append(Note("warning", "", text, total))
+        self.damage.append(
+            Damage(
+                cause,
+                salvaged=sum(counts.values()),
+                bytes_lost=size - reached + unread,
+                start=last,
+            )
+        )
 
-    def _scan(self, content: Bytes) -> dict[int, int]:
-        """Learn the connections inside a chunk and count their messages."""
+    def _scan(self, content: Bytes, chunk: _Chunk) -> tuple[_Chunk, int]:
+        """Learn connections and count messages inside a chunk; return it and the bytes read."""
         counts: dict[int, int] = {}
+        last, read = None, 0
         for header, start, end in _inside(content):
             op = header.get(b"op")
             if op == bytes([CONNECTION]):
@@ -177,7 +205,9 @@ class Bag1:
             elif op == bytes([MESSAGE]):
                 number = _number(header, b"conn", 4)
                 counts[number] = counts.get(number, 0) + 1
-        return counts
+                last = max(last or 0, _time(header.get(b"time", b"")))
+            read = end
+        return replace(chunk, counts=counts, end=None if last is None else last * 1e-9), read
 
     def _content(self, stream: BinaryIO, chunk: _Chunk) -> Bytes:
         if chunk.packed > LARGEST_CHUNK:
@@ -294,17 +324,18 @@ def _connection(header: dict[bytes, bytes], data: bytes) -> tuple[int, str, str,
     return _number(header, b"conn", 4), "/" + topic.strip("/"), kind, definition
 
 
-def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[int, int]]:
+def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[str, Any]]:
+    """Return where a chunk lies, and its counts, start and end as the index has them."""
     if len(data) % 8:
         raise DamagedError("a chunk's entry in the index makes no sense")
-    return _number(header, b"chunk_pos", 8), dict(struct.iter_unpack("<II", data))
+    start, end = (_time(header.get(name, b"")) * 1e-9 for name in (b"start_time", b"end_time"))
+    counts = dict(struct.iter_unpack("<II", data))
+    return _number(header, b"chunk_pos", 8), {"counts": counts, "start": start, "end": end}
 
 
-def _chunk(
-    header: dict[bytes, bytes], position: int, packed: int, counts: dict[int, int]
-) -> _Chunk:
+def _chunk(header: dict[bytes, bytes], position: int, packed: int) -> _Chunk:
     compression = header.get(b"compression", b"").decode(errors="replace")
-    return _Chunk(position, packed, _number(header, b"size", 4), compression, counts)
+    return _Chunk(position, packed, _number(header, b"size", 4), compression, {})
 
 
 def _index(stream: BinaryIO) -> tuple[int, Index, Index]:

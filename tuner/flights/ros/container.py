@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 from rosbags.interfaces import MessageDefinition
 
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.wire import Block, Bytes, Index
 
 #: The largest chunk that is unpacked: cameras and lidars stay far below it.
@@ -45,7 +45,7 @@ class Container(Protocol):
         ...
 
     @property
-    def notes(self) -> Sequence[Note]:
+    def damage(self) -> Sequence[Damage]:
         """What could not be read so far."""
         ...
 
@@ -55,7 +55,19 @@ class Container(Protocol):
 
 
 class DamagedError(Exception):
-    """The container's structure cannot be followed here."""
+    """The container's structure cannot be followed here.
+
+    Parameters
+    ----------
+    text
+        Why.
+    cause
+        What that says of the recording, where the error ends the use of its index.
+    """
+
+    def __init__(self, text: str, cause: Cause = Cause.INDEX_DAMAGED) -> None:
+        super().__init__(text)
+        self.cause = cause
 
 
 def unpack(compression: str, packed: bytes, size: int) -> bytes:

@@ -12,7 +12,7 @@ from urllib.parse import quote
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import LARGEST_CHUNK, Connection, joined
 from tuner.flights.ros.wire import Block
 
@@ -42,7 +42,7 @@ class Db3:
     path: Path
     aligned: bool = True
     connections: dict[int, Connection] = field(default_factory=dict)
-    notes: list[Note] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         try:
@@ -89,7 +89,8 @@ class Db3:
         Where a page of the database is damaged, reading goes on some rows later, each time twice
         as many.
         """
-        done, attempts, said = 0, 0, ""
+        done, attempts = 0, 0
+        reached: float | None = None
         while attempts < ATTEMPTS:
             try:
                 with _opened(self.path) as database:
@@ -97,15 +98,15 @@ class Db3:
                         f"SELECT id, {query} id > ? ORDER BY id", (*values, done)
                     ):
                         done = row[0]
+                        if not attempts and isinstance(row[2], int):
+                            reached = row[2] * 1e-9
                         yield row[1:]
                 break
-            except BROKEN as err:
-                said = str(err) or "out of memory"
+            except BROKEN:
                 attempts += 1
                 done += 1 << attempts
-        if said and not self.notes:
-            text = f"the database is damaged ({said}); what lies around the damage is lost"
-            self.notes.append(Note("warning", "", text, attempts))
+        if attempts and not self.damage:
+            self.damage.append(Damage(Cause.DATABASE_DAMAGED, occurrences=attempts, start=reached))
 
     def _counts(self, database: sqlite3.Connection) -> dict[int, int]:
         """Count the messages of each connection; row by row where the database is damaged."""
@@ -117,7 +118,7 @@ class Db3:
             )
         except BROKEN:
             counts: dict[int, int] = {}
-            for (number,) in self._rows("topic_id FROM messages WHERE", ()):
+            for number, _ in self._rows("topic_id, timestamp FROM messages WHERE", ()):
                 counts[number] = counts.get(number, 0) + 1
             return counts
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from tuner.config.yaml_file import read_yaml
 from tuner.errors import ConfigError, RecordingError
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import (
     LARGEST_CHUNK,
     Connection,
@@ -43,7 +43,7 @@ class Folder:
     path: Path
     aligned: bool = True
     connections: dict[int, Connection] = field(default_factory=dict)
-    _found: list[Note] = field(default_factory=list)
+    _left_out: list[Damage] = field(default_factory=list)
     _files: list[Container] = field(default_factory=list)
     _numbers: dict[int, tuple[int, int]] = field(default_factory=dict)
     _compressed: bool = False
@@ -56,16 +56,16 @@ class Folder:
         for name in names:
             path = self.path / Path(name).name
             try:
-                if path.suffix == ".zstd":
-                    path = self._unpack(path)
-                self._files.append(open_file(path))
+                self._files.append(
+                    open_file(self._unpack(path) if path.suffix == ".zstd" else path)
+                )
             except (RecordingError, DamagedError, OSError) as err:
                 errors.append(str(err))
+                size = path.stat().st_size if path.is_file() else None
+                self._left_out.append(Damage(Cause.FILE_UNREADABLE, path.name, bytes_lost=size))
         if not self._files:
             said = errors[0] if errors else "holds no .db3 or .mcap file"
             raise RecordingError(self.path, said, "give the folder with metadata.yaml")
-        for text in errors:
-            self._found.append(Note("warning", "", f"left out: {text}", 1))
         for i, container in enumerate(self._files):
             for connection in container.connections.values():
                 number = len(self._numbers)
@@ -74,9 +74,9 @@ class Folder:
         self._share_definitions()
 
     @property
-    def notes(self) -> list[Note]:
+    def damage(self) -> list[Damage]:
         """What could not be read so far, of the folder and its files."""
-        return [*self._found, *(note for file in self._files for note in file.notes)]
+        return [*self._left_out, *(damage for file in self._files for damage in file.damage)]
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, file by file."""
@@ -102,9 +102,7 @@ class Folder:
                 for file in self.path.iterdir()
                 if file.suffix in (".db3", ".mcap") or file.name.endswith(".db3.zstd")
             )
-            said = "cannot be understood" if path.exists() else "is missing"
-            text = f"metadata.yaml {said}; the {len(names)} data files beside it are read"
-            self._found.append(Note("warning", "", text, len(names)))
+            self._left_out.append(Damage(Cause.METADATA_MISSING, path.name))
             return names, ""
 
     def _unpack(self, path: Path) -> Path:

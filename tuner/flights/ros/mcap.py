@@ -18,7 +18,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import (
     LARGEST_CHUNK,
     NEAR,
@@ -48,11 +48,23 @@ _FORMATS = {
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A chunk: where its record lies, and where the index of each of its channels does."""
+    """A chunk.
+
+    Attributes
+    ----------
+    position, length
+        Where its record lies in the file, and the bytes of its content.
+    indexes
+        Channel -> where the index of its messages lies; 0 where there is none.
+    start, end
+        s since 1970 of the first and the last message; None where no index says so.
+    """
 
     position: int
     length: int
     indexes: dict[int, int]
+    start: float | None = None
+    end: float | None = None
 
 
 @dataclass
@@ -67,7 +79,7 @@ class Mcap:
 
     path: Path
     connections: dict[int, Connection] = field(default_factory=dict)
-    notes: list[Note] = field(default_factory=list)
+    damage: list[Damage] = field(default_factory=list)
     aligned: bool = True
     _chunks: list[_Chunk] = field(default_factory=list)
     _loose: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
@@ -80,13 +92,13 @@ class Mcap:
             try:
                 self._read_summary(stream)
             except DamagedError as err:
-                self._walk(stream, str(err))
+                self._walk(stream, err.cause)
         if not self.connections:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, chunk by chunk."""
-        lost = 0
+        lost: list[_Chunk] = []
         with self.path.open("rb") as stream:
             for chunk in self._chunks:
                 present = [number for number in wanted if number in chunk.indexes]
@@ -95,15 +107,22 @@ class Mcap:
                 try:
                     located = list(self._locate(stream, chunk, present))
                 except DamagedError:
-                    lost += 1
+                    lost.append(chunk)
                     continue
                 yield from located
             for number in wanted:
                 if self._loose.get(number):
                     yield from self._loose_blocks(stream, number)
         if lost:
-            text = f"{lost} of {len(self._chunks)} chunks are damaged, their messages lost"
-            self.notes.append(Note("warning", "", text, lost))
+            self.damage.append(
+                Damage(
+                    Cause.CHUNKS_DAMAGED,
+                    bytes_lost=sum(chunk.length for chunk in lost),
+                    occurrences=len(lost),
+                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
+                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
+                )
+            )
 
     def _read_summary(self, stream: BinaryIO) -> None:
         """Learn channels and chunks from the end of the file."""
@@ -111,10 +130,10 @@ class Mcap:
         stream.seek(max(0, size - 37))
         footer = stream.read(37)
         if len(footer) != 37 or footer[-8:] != MAGIC or footer[:9] != b"\x02\x14" + bytes(7):
-            raise DamagedError("its end is missing")
+            raise DamagedError("its end is missing", Cause.END_MISSING)
         (start,) = struct.unpack_from("<Q", footer, 9)
         if not 0 < start <= size - 37:
-            raise DamagedError("it has no summary")
+            raise DamagedError("it has no summary", Cause.NOT_CLOSED)
         if size - start > LARGEST_CHUNK:
             raise DamagedError("its summary is absurdly long")
         stream.seek(start)
@@ -132,12 +151,13 @@ class Mcap:
             raise DamagedError("its summary names no chunks")
         self._count(counts)
 
-    def _walk(self, stream: BinaryIO, why: str) -> None:
+    def _walk(self, stream: BinaryIO, cause: Cause) -> None:
         """Learn channels and messages from front to end, as far as records can be followed."""
         self._chunks, self.connections = [], {}
         counts: dict[int, int] = {}
         size = self.path.stat().st_size
-        at = len(MAGIC)
+        at, unread = len(MAGIC), 0
+        last: float | None = None
         while at + 9 <= size:
             stream.seek(at)
             op, length = struct.unpack("<BQ", stream.read(9))
@@ -145,41 +165,53 @@ class Mcap:
             if op in (FOOTER, DATA_END) or op == 0 or (end > size and op != CHUNK):
                 break
             if op == CHUNK:
-                chunk = _Chunk(at, min(length, size - at - 9), {})
-                held = self._scan(stream, chunk)
-                self._chunks.append(replace(chunk, indexes=dict.fromkeys(held, 0)))
-                for number, count in held.items():
+                chunk, found, missed = self._scan(
+                    stream, _Chunk(at, min(length, size - at - 9), {})
+                )
+                unread += missed
+                last = last if chunk.end is None else max(last or 0.0, chunk.end)
+                self._chunks.append(chunk)
+                for number, count in found.items():
                     counts[number] = counts.get(number, 0) + count
             elif op == MESSAGE and length >= 22:
                 number, _, time = struct.unpack("<HIQ", stream.read(14))
                 self._loose.setdefault(number, []).append((at, end, time))
+                last = max(last or 0.0, time * 1e-9)
                 counts[number] = counts.get(number, 0) + 1
             elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
                 with contextlib.suppress(DamagedError):
                     self._learn(op, stream.read(length))
             at = end
         self._count(counts)
-        total = sum(counts.values())
-        text = f"{why}; {total} messages salvaged"
-        if at > size:
-            text += ", the last chunk is cut"
-        self.notes.append(Note("warning", "", text, total))
+        self.damage.append(
+            Damage(
+                cause,
+                salvaged=sum(counts.values()),
+                bytes_lost=max(size - at, 0) + unread,
+                start=last,
+            )
+        )
 
-    def _scan(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, int]:
-        """Learn the channels inside a chunk and count their messages."""
+    def _scan(self, stream: BinaryIO, chunk: _Chunk) -> tuple[_Chunk, dict[int, int], int]:
+        """Learn the channels inside a chunk; return also its messages and the bytes not read."""
         try:
             content = self._content(stream, chunk)
         except DamagedError:
-            return {}
+            return chunk, {}, chunk.length
         counts: dict[int, int] = {}
+        last, read = None, 0
         for op, at, end in _records(content):
+            read = end
             if op == MESSAGE and end - at >= 22:
-                (number,) = struct.unpack_from("<H", content, at)
+                number, _, time = struct.unpack_from("<HIQ", content, at)
                 counts[number] = counts.get(number, 0) + 1
+                last = max(last or 0, time)
             elif op in (SCHEMA, CHANNEL):
                 with contextlib.suppress(DamagedError):
                     self._learn(op, content[at:end])
-        return counts
+        known = dict.fromkeys(counts, 0)
+        seconds = None if last is None else last * 1e-9
+        return replace(chunk, indexes=known, end=seconds), counts, len(content) - read
 
     def _learn(self, op: int, content: bytes) -> None:
         """Take in a schema or a channel."""
@@ -281,14 +313,14 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
 
 def _chunk_index(content: bytes, size: int) -> _Chunk:
     try:
-        _, _, position, length, indexes = struct.unpack_from("<QQQQI", content)
+        start, end, position, length, indexes = struct.unpack_from("<QQQQI", content)
         pairs = content[36 : 36 + indexes]
         found = dict(struct.iter_unpack("<HQ", pairs))
     except struct.error:
         raise DamagedError("its summary makes no sense") from None
     if position + length > size or length < 9 or any(at >= size for at in found.values()):
         raise DamagedError("its summary points nowhere")
-    return _Chunk(position, length - 9, found)
+    return _Chunk(position, length - 9, found, start * 1e-9, end * 1e-9)
 
 
 def _counts(content: bytes) -> dict[int, int]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tuner.errors import RecordingError
 from tuner.flights import px4
-from tuner.flights.flight import Note
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.recording import (
     NANOSECONDS,
     Clock,
@@ -62,9 +62,9 @@ class RosRecording:
         )
 
     @property
-    def notes(self) -> tuple[Note, ...]:
+    def damage(self) -> tuple[Damage, ...]:
         """What of the container could not be read so far."""
-        return tuple(self._container.notes)
+        return tuple(self._container.damage)
 
     def usual(self, topic: str, signal: str) -> Usual | None:
         """Return where messages of this topic's type hold a signal."""
@@ -104,13 +104,13 @@ class RosRecording:
             topic = self._container.connections[number].topic
             broken[topic] += int(len(whole) - whole.sum())
             parts[topic].append(_samples(columns, whole, block.time, clock))
-        notes = [
-            Note("warning", topic, f"{count} messages are cut or damaged and were left out", count)
+        cut = [
+            Damage(Cause.MESSAGES_DAMAGED, topic, lost=count)
             for topic, count in broken.items()
             if count
         ]
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
-        return Contents(samples, (*self.notes, *notes))
+        return Contents(samples, damage=(*self.damage, *cut))
 
     def _has(self, kind: str, path: str) -> bool:
         return not missing_fields(self._definitions, kind, (path,))
