@@ -76,6 +76,8 @@ def print_run(folder: Path, result: RunResult) -> None:
 
 def print_examined(found: Examined) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    from tuner.wording.verdicts import direction_in_words, judgement_in_words
+
     screen = console()
     table = Table(box=None, title="Coefficients", title_justify="left")
     table.add_column("coefficient")
@@ -86,13 +88,13 @@ def print_examined(found: Examined) -> None:
     for name, one in found.knowledge.coefficients.items():
         error = "" if one.std_error is None else f"{one.std_error:.2g}"
         label = name if one.fitted else f"{name} (fixed)"
-        told = f"{one.verdict}: {one.reason}"
+        told = judgement_in_words(one.verdict, one.reason)
         table.add_row(label, f"{one.value:.5g}", error, one.unit, _moves(found, name), told)
     screen.print(table)
     for finding in found.findings:
         screen.print(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
     for direction in found.knowledge.directions[:1]:
-        screen.print(f"Worst determined: {direction.text}")
+        screen.print(f"Worst determined: {direction_in_words(direction)}")
     for sentence in found.proposals.sentences if found.proposals else ():
         screen.print(sentence)
     screen.print(f"written to {found.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from tuner.files import Part, csv_text, read_optional, write_text
+from tuner.wording.phrases import listed
 
 NEXT_FILE = "next_flight.json"
 NEXT_TABLE = "next_flight.csv"
@@ -114,11 +115,6 @@ def _does(share: float, target: str) -> str:
     if share < HALVED[0]:
         return f"narrow the interval of {target} to {share:.0%} of what it is"
     return f"narrow the interval of {target} by {1 - share:.0%}"
-
-
-def listed(parts: Sequence[str]) -> str:
-    """Return words with commas and a last "and"."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
 def write_proposals(proposals: Proposals, folder: Path) -> None:

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.files import Part, read_optional, write_text
+from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.verdict import Reason, Verdict
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 KNOWLEDGE_FILE = "sensitivity.json"
 
 Number = float | None
@@ -45,8 +47,8 @@ class Known(Part):
     value: float
     std_error: Number
     ci95: tuple[Number, Number]
-    verdict: str
-    reason: str
+    verdict: Verdict
+    reason: Reason
     step: float
     shares: dict[str, dict[str, float]]
     prior_share: float
@@ -102,15 +104,6 @@ class Acting(Part):
     span: dict[str, tuple[float, float]]
 
 
-class Combination(Part):
-    """A direction of the fitted coefficients, see `tuner.uncertainty.directions.Direction`."""
-
-    text: str
-    moves: dict[str, float]
-    error: float
-    null: bool
-
-
 class ResidualColour(Part):
     """Whether residuals are white noise, see `tuner.uncertainty.whiteness.Residual`."""
 
@@ -153,7 +146,7 @@ class Knowledge(Part):
     outputs: list[OutputChange]
     acting: list[Acting]
     residuals: list[ResidualColour]
-    directions: list[Combination]
+    directions: list[Direction]
     names: list[str]
     correlation: list[list[float]]
     covariance: list[list[float]]

@@ -13,7 +13,6 @@ from tuner.config import COEFFICIENTS
 from tuner.examination.examine import Examination
 from tuner.examination.knowledge import (
     Acting,
-    Combination,
     Knowledge,
     Known,
     OutputChange,
@@ -59,10 +58,7 @@ def tell(examination: Examination, space: Space, point: Point) -> Knowledge:
             )
             for one in examination.residuals
         ],
-        directions=[
-            Combination(text=one.text, moves=dict(one.moves), error=one.error, null=one.null)
-            for one in found.directions
-        ],
+        directions=list(found.directions),
         names=list(found.names),
         correlation=found.correlation.tolist(),
         covariance=(found.covariance.matrix * np.outer(worth, worth)).tolist(),
@@ -114,7 +110,7 @@ def _known(
         value=estimate.value,
         std_error=error,
         ci95=(low, high),
-        verdict=estimate.verdict.value,
+        verdict=estimate.verdict,
         reason=estimate.reason,
         step=step,
         shares={

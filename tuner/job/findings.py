@@ -11,7 +11,7 @@ from tuner.config import COEFFICIENTS
 from tuner.job.prepare import Job
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.fitted import Finding
-from tuner.uncertainty import Uncertainty
+from tuner.uncertainty.estimates import Uncertainty
 
 UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""

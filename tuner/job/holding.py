@@ -21,7 +21,7 @@ from tuner.job.search import free_offsets
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.progress import Free, Progress
-from tuner.uncertainty import Uncertainty
+from tuner.uncertainty.estimates import Uncertainty
 
 FIRST_HELD = ("mass", "input_scaling", "zero_position_armed", "actuator_latency")
 """Of coefficients that trade off, the one to hold: what is weighed or set rather than flown."""

@@ -39,8 +39,14 @@ from tuner.result import (
     write_result,
 )
 from tuner.search.fitted import Fitted
-from tuner.uncertainty import Uncertainty
-from tuner.uncertainty.estimates import Estimate
+from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.verdict import (
+    NOT_FITTED,
+    Verdict,
+    judge_after_holding,
+    judge_impossible_inertia,
+)
+from tuner.wording.verdicts import judgement_in_words
 
 INERTIA = ("inertia_xx", "inertia_yy", "inertia_zz")
 METRICS_FILE = "metrics.csv"
@@ -205,12 +211,21 @@ def _coefficients(
     for name, value in start.items():
         unit = COEFFICIENTS[name].unit
         if name not in best:
+            note = judgement_in_words(Verdict.FIXED, NOT_FITTED)
             found[name] = CoefficientResult(
-                unit=unit, initial=value, best=value, fitted=False, note="kept as given"
+                unit=unit, initial=value, best=value, fitted=False, note=note
             )
             continue
         low, high = bounds[name]
         estimate = uncertainty.estimates[name]
+        if name in kept:
+            judgement = judge_impossible_inertia(float(raw[name]))
+        elif name in undetermined:
+            judgement = judge_after_holding(
+                name, estimate.verdict, estimate.reason, undetermined[name]
+            )
+        else:
+            judgement = estimate.verdict, estimate.reason
         found[name] = CoefficientResult(
             unit=unit,
             initial=value,
@@ -220,26 +235,10 @@ def _coefficients(
             upper=high,
             std_error=_finite(estimate.std_error),
             ci95=_interval(estimate.ci95),
-            identifiable=estimate.identifiable and name not in kept and name not in undetermined,
-            note=(
-                f"kept as given: fitted to {float(raw[name]):.4g}, which with the other moments no "
-                "rigid body has"
-                if name in kept
-                else _note(name, estimate, undetermined.get(name))
-            ),
+            identifiable=judgement[1].identifiable,
+            note=judgement_in_words(*judgement),
         )
     return found
-
-
-def _note(name: str, estimate: Estimate, held: str | None) -> str:
-    if held is None:
-        return f"{estimate.verdict.value}: {estimate.reason}"
-    undetermined = f"not identifiable: {estimate.reason}"
-    if estimate.identifiable:
-        undetermined = "not identifiable with all others free"
-    if held == name:
-        return f"{undetermined}; kept as given"
-    return f"{undetermined}; the value goes with {held} as given"
 
 
 def _finite(value: float) -> float | None:

@@ -6,9 +6,10 @@ from collections import Counter
 
 import numpy as np
 
-from tuner.design.proposals import listed
 from tuner.report.contents import Contents
 from tuner.result import RunResult
+from tuner.wording.phrases import listed
+from tuner.wording.verdicts import verdict_in_words
 
 
 def summary(contents: Contents) -> list[str]:
@@ -18,10 +19,10 @@ def summary(contents: Contents) -> list[str]:
         said.append(of_run(contents.run.result))
     if contents.knowledge is not None:
         known = [one for one in contents.knowledge.coefficients.values() if one.fitted]
-        counts = Counter(one.verdict for one in known)
+        counts = Counter(verdict_in_words(one.verdict) for one in known)
         parts = [f"{count} {'is' if count == 1 else 'are'} {v}" for v, count in counts.items()]
         if len(parts) == 1 and len(known) > 1:
-            parts = [f"all {len(known)} are {known[0].verdict}"]
+            parts = [f"all {len(known)} are {next(iter(counts))}"]
         verdicts = listed(parts)
         if contents.run is None:
             flights = len(contents.knowledge.flights)

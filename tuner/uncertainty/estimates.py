@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,14 +14,12 @@ from tuner.coefficients import HABITS, Parameter, Space
 from tuner.config import COEFFICIENTS
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance
-from tuner.uncertainty.directions import Direction, percent, weakest
+from tuner.uncertainty.directions import Direction, weakest
 from tuner.uncertainty.information import FisherInformation, gather
-from tuner.uncertainty.verdict import Standing, Verdict, judge
+from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judge
 
 Array = NDArray[np.float64]
 
-QUANTILE = 1.959964
-"""Of the normal distribution, for 95 % intervals."""
 AT_BOUND = 2e-3
 """A fit within this share of its range from a bound has ended there."""
 
@@ -42,12 +41,12 @@ class Estimate:
     std_error: float
     ci95: tuple[float, float]
     verdict: Verdict
-    reason: str
+    reason: Reason
 
     @property
     def identifiable(self) -> bool:
         """Whether the flights determine it."""
-        return self.verdict is not Verdict.NOT_IDENTIFIABLE
+        return self.reason.identifiable
 
 
 @dataclass(frozen=True)
@@ -124,20 +123,25 @@ def judged(
     estimates = {}
     for index, parameter in enumerate(space.parameters):
         partner, correlation = _partner(found.correlation[index], index, space.names)
-        standing = Standing(
+        channel, flight = _source(shares[..., index], information.channels, flights)
+        half_width = float(QUANTILE * found.error[index])
+        precision = Precision(
             name=parameter.name,
-            interval=_half_width(parameter, QUANTILE * found.error[index]),
-            half_width=QUANTILE * found.error[index] / reference[index],
-            data_error=found.data_error[index] / reference[index],
+            half_width=half_width,
+            unit=None if parameter.scale == "log" else COEFFICIENTS[parameter.name].unit,
+            relative_half_width=half_width / reference[index],
+            data_error=float(found.data_error[index] / reference[index]),
             prior_share=float(prior_share[index]),
             prior_given=parameter.prior_given,
             inflation=float(found.inflation[index]),
-            source=_source(shares[..., index], information.channels, flights),
-            bound=_bound(parameter, scaled[index]),
             partner=partner,
             correlation=correlation,
+            channel=channel,
+            flight=flight,
+            bound=_bound(parameter, scaled[index]),
         )
-        verdict, reason = judge(standing, directions)
+        verdict, reason = judge(precision, directions)
+        tied = reason.model_copy(update={"tied_to": parameter.name})
         error = found.error[index]
         low, high = (
             float(np.clip(scaled[index] + side * error, *_limits(parameter)))
@@ -153,8 +157,8 @@ def judged(
                     space.from_scaled(index, low) * ratio,
                     space.from_scaled(index, high) * ratio,
                 ),
-                verdict=verdict,
-                reason=reason if name == parameter.name else f"tied to {parameter.name}: {reason}",
+                verdict=verdict if name == parameter.name else Verdict.TIED,
+                reason=reason if name == parameter.name else tied,
             )
     return Uncertainty(
         estimates=estimates,
@@ -183,20 +187,11 @@ def _reference(parameter: Parameter, scaled: float) -> float:
     return max(abs(scaled), habit.sd if habit.scale == "linear" else 0.0) or 1.0
 
 
-def _half_width(parameter: Parameter, half: float) -> str:
-    if parameter.scale == "log":
-        return percent(half)
-    unit = COEFFICIENTS[parameter.name].unit
-    if unit == "s":
-        half, unit = 1e3 * half, "ms"
-    return f"{half:.2g} {unit}".strip()
-
-
 def _limits(parameter: Parameter) -> tuple[float, float]:
     return parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
 
 
-def _bound(parameter: Parameter, scaled: float) -> str | None:
+def _bound(parameter: Parameter, scaled: float) -> Literal["lower", "upper"] | None:
     lower, upper = _limits(parameter)
     share = (scaled - lower) / (upper - lower)
     return "lower" if share < AT_BOUND else "upper" if share > 1 - AT_BOUND else None
@@ -231,12 +226,22 @@ def _partner(row: Array, index: int, names: Sequence[str]) -> tuple[str | None, 
     return names[strongest], float(others[strongest])
 
 
-def _source(shares: Array, channels: Sequence[str], flights: Sequence[str]) -> str:
-    """Return where most of what is known comes from, in words."""
+def _source(
+    shares: Array, channels: Sequence[str], flights: Sequence[str]
+) -> tuple[str | None, str | None]:
+    """Return the channel, and the flight if one stands out, that most of the information is from.
+
+    Parameters
+    ----------
+    shares
+        (C, F) of the information.
+    channels, flights
+        Their names.
+    """
     if shares.sum() <= 0:
-        return ""
-    by_channel, by_flight = shares.sum(axis=1), shares.sum(axis=0)
-    channel = channels[int(np.argmax(by_channel))].replace("_", " ")
-    flight = int(np.argmax(by_flight))
-    alone = len(flights) == 1 or by_flight[flight] < 0.4 * by_flight.sum()
-    return channel if alone else f"{channel}, {flights[flight]} above all"
+        return None, None
+    channel = channels[int(np.argmax(shares.sum(axis=1)))]
+    by_flight = shares.sum(axis=0)
+    largest = int(np.argmax(by_flight))
+    alike = len(flights) == 1 or by_flight[largest] < 0.4 * by_flight.sum()
+    return channel, None if alike else flights[largest]

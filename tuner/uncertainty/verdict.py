@@ -1,111 +1,229 @@
-"""Well known, weakly known or not identifiable, and why."""
+"""How well each coefficient is known, and why: codes and numbers, no prose.
+
+Sentences are made from them in `tuner.wording.verdicts`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum
+from typing import Literal
 
-from tuner.uncertainty.directions import Direction, percent
+from tuner.files import Part
+from tuner.uncertainty.directions import Direction
 
+QUANTILE = 1.959964
+"""Of the normal distribution, for 95 % intervals."""
 WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
 IDENTIFIABLE_ERROR = 0.25
 """Relative standard error from the flights alone above which they do not determine it."""
+NO_EFFECT_ERROR = 10.0
+"""Relative standard error from the flights alone above which they show no effect of it at all."""
 PRIOR_SHARE = 0.5
-"""Share of what is known above which a coefficient's interval is its prior's work."""
+"""Share of the information above which a coefficient's interval is its prior's work."""
 CONFUSED = 0.9
-"""Correlation above which two coefficients are called hard to tell apart."""
+"""Correlation above which two coefficients are called hard to distinguish."""
 INFLATED = 2.0
 """Inflation of the standard error above which the reason mentions model error."""
 
 
-class Verdict(Enum):
-    """How well a coefficient is known."""
+class Verdict(StrEnum):
+    """How well a coefficient is known, or why it was not asked."""
 
-    WELL_KNOWN = "well known"
-    WEAKLY_KNOWN = "weakly known"
-    NOT_IDENTIFIABLE = "not identifiable"
+    WELL_KNOWN = "well_known"
+    WEAKLY_KNOWN = "weakly_known"
+    NOT_IDENTIFIABLE = "not_identifiable"
+    FIXED = "fixed"
+    """Not fitted, as the settings say."""
+    HELD = "held"
+    """Kept at its initial value because the flights do not identify it."""
+    TIED = "tied"
+    """A constant multiple of another coefficient, as the job file says."""
+
+
+class ReasonCode(StrEnum):
+    """What a verdict rests on."""
+
+    INTERVAL = "interval"
+    """The flights determine it, to ``half_width``."""
+    NULL_DIRECTION = "null_direction"
+    """It takes part in ``direction``, along which nothing that was recorded changes."""
+    NO_EFFECT = "no_effect"
+    """Nothing that was recorded depends on it."""
+    WIDE_INTERVAL = "wide_interval"
+    """The flights alone determine it no better than ``half_width``."""
+    PRIOR_DOMINATES = "prior_dominates"
+    """``prior_share`` of the information about it comes from its prior."""
+    NOT_WITH_ALL_FREE = "not_with_all_free"
+    """Not identifiable before others were held, although it would be now."""
+    IMPOSSIBLE_INERTIA = "impossible_inertia"
+    """``fitted_value`` and the other moments of inertia are those of no rigid body."""
+    NOT_FITTED = "not_fitted"
+    """It is fixed."""
+
+
+class Reason(Part):
+    """Why a verdict was given; what does not bear on it is None.
+
+    Attributes
+    ----------
+    code
+        The main reason, which says which numbers are given.
+    half_width, unit
+        Half the 95 % interval in ``unit``; as a share of the value where ``unit`` is None.
+    channel, flight
+        Where most of the information comes from; ``flight`` only where one contributes more than
+        the others.
+    correlated_with, correlation
+        The coefficient that it is hard to distinguish from.
+    noise_inflation
+        Factor by which residuals that are no white noise widen the interval.
+    bound
+        At which bound the fit ended.
+    prior_share, prior_given
+        Share of the prior in the information, and whether the user gave the prior.
+    direction
+        The combination of coefficients that the flights do not determine.
+    tied_to
+        The coefficient that it is a constant multiple of; all else is said of that one.
+    given_held
+        The coefficient held at its initial value, given which alone this one was fitted.
+    fitted_value
+        Where the fit ended, for one that was set back from there.
+    """
+
+    code: ReasonCode
+    half_width: float | None = None
+    unit: str | None = None
+    channel: str | None = None
+    flight: str | None = None
+    correlated_with: str | None = None
+    correlation: float | None = None
+    noise_inflation: float | None = None
+    bound: Literal["lower", "upper"] | None = None
+    prior_share: float | None = None
+    prior_given: bool | None = None
+    direction: Direction | None = None
+    tied_to: str | None = None
+    given_held: str | None = None
+    fitted_value: float | None = None
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the flights determine the coefficient."""
+        return self.code is ReasonCode.INTERVAL and self.given_held is None
+
+
+NOT_FITTED = Reason(code=ReasonCode.NOT_FITTED)
+"""Why a coefficient is `Verdict.FIXED`."""
 
 
 @dataclass(frozen=True)
-class Standing:
-    """What a verdict rests on.
+class Precision:
+    """What is known about one coefficient, and from where.
 
     Attributes
     ----------
     name
         The coefficient.
-    interval
-        Half the 95 % interval for people: a percentage or with its unit.
-    half_width
-        Half the 95 % interval over the reference.
+    half_width, unit
+        Half the 95 % interval, as in `Reason`.
+    relative_half_width
+        The same over the coefficient's reference.
     data_error
         Standard error from the flights alone over the reference.
-    prior_share
-        Share of the prior in what is known, 0 to 1.
-    prior_given
-        Whether the user gave the prior.
+    prior_share, prior_given
+        As in `Reason`.
     inflation
-        Of the standard error by residuals that are correlated in time.
+        Factor on the standard error for residuals that are correlated in time.
     partner, correlation
-        The coefficient it is confused with most.
-    source
-        Where most of what is known comes from, in words; empty if from nowhere.
+        The coefficient that it is correlated with most.
+    channel, flight
+        As in `Reason`.
     bound
-        ``lower`` or ``upper`` if the fit ended there.
+        At which bound the fit ended.
     """
 
     name: str
-    interval: str
     half_width: float
+    unit: str | None
+    relative_half_width: float
     data_error: float
     prior_share: float
     prior_given: bool
     inflation: float
     partner: str | None
     correlation: float
-    source: str
-    bound: str | None
+    channel: str | None
+    flight: str | None
+    bound: Literal["lower", "upper"] | None
 
 
-def judge(standing: Standing, directions: Sequence[Direction]) -> tuple[Verdict, str]:
-    """Return the verdict and its reason, a phrase for people."""
-    if standing.data_error > IDENTIFIABLE_ERROR or standing.prior_share > PRIOR_SHARE:
-        return Verdict.NOT_IDENTIFIABLE, _why_not(standing, directions) + _at_bound(standing)
-    well = standing.half_width < WELL_KNOWN and standing.bound is None
-    reason = f"±{standing.interval} (95 %)"
-    if standing.source:
-        reason += f", mostly from {standing.source}"
-    if not well and standing.partner and abs(standing.correlation) > CONFUSED:
-        reason += (
-            f"; hard to tell from {standing.partner} (correlation {standing.correlation:+.2f})"
-        )
-    if standing.inflation > INFLATED:
-        reason += (
-            f"; residuals are not white noise, which widens the interval {standing.inflation:.1f} "
-            "times"
-        )
-    return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, reason + _at_bound(standing)
+def judge(precision: Precision, directions: Sequence[Direction]) -> tuple[Verdict, Reason]:
+    """Return the verdict on a fitted coefficient, and its reason."""
+    if precision.data_error > IDENTIFIABLE_ERROR or precision.prior_share > PRIOR_SHARE:
+        return Verdict.NOT_IDENTIFIABLE, _not_identifiable(precision, directions)
+    well = precision.relative_half_width < WELL_KNOWN and precision.bound is None
+    confused = not well and precision.partner and abs(precision.correlation) > CONFUSED
+    return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, Reason(
+        code=ReasonCode.INTERVAL,
+        half_width=precision.half_width,
+        unit=precision.unit,
+        channel=precision.channel,
+        flight=precision.flight,
+        correlated_with=precision.partner if confused else None,
+        correlation=precision.correlation if confused else None,
+        noise_inflation=precision.inflation if precision.inflation > INFLATED else None,
+        bound=precision.bound,
+    )
 
 
-def _why_not(standing: Standing, directions: Sequence[Direction]) -> str:
-    prior = "the prior that was given" if standing.prior_given else "the default prior"
+def _not_identifiable(precision: Precision, directions: Sequence[Direction]) -> Reason:
+    given, bound = precision.prior_given, precision.bound
     for direction in directions:
-        if direction.null and standing.name in direction.moves:
-            others = len(direction.moves) > 1
-            reason = f"the flights cannot tell it: {direction.text}" if others else ""
-            if reason:
-                return f"{reason} The interval is {prior}'s."
-    if standing.data_error > IDENTIFIABLE_ERROR:
-        said = (
-            f"the flights alone leave it open to ±{percent(1.96 * standing.data_error)}"
-            if standing.data_error < 10
-            else "it leaves no trace in the flights"
-        )
-        return f"{said}; the interval is {prior}'s"
-    return f"{standing.prior_share:.0%} of what is known comes from {prior}"
+        if direction.null and precision.name in direction.moves and len(direction.moves) > 1:
+            code = ReasonCode.NULL_DIRECTION
+            return Reason(code=code, direction=direction, prior_given=given, bound=bound)
+    if precision.data_error >= NO_EFFECT_ERROR:
+        return Reason(code=ReasonCode.NO_EFFECT, prior_given=given, bound=bound)
+    if precision.data_error > IDENTIFIABLE_ERROR:
+        half_width = QUANTILE * precision.data_error
+        code = ReasonCode.WIDE_INTERVAL
+        return Reason(code=code, half_width=half_width, prior_given=given, bound=bound)
+    return Reason(
+        code=ReasonCode.PRIOR_DOMINATES,
+        prior_share=precision.prior_share,
+        prior_given=given,
+        bound=bound,
+    )
 
 
-def _at_bound(standing: Standing) -> str:
-    return f"; the fit ended at its {standing.bound} bound" if standing.bound else ""
+def judge_after_holding(
+    name: str, verdict: Verdict, reason: Reason, stand_in: str
+) -> tuple[Verdict, Reason]:
+    """Return the judgement on a coefficient that the flights did not identify with all free.
+
+    Parameters
+    ----------
+    name
+        The coefficient.
+    verdict, reason
+        Of the examination after the fit with the stand-ins held.
+    stand_in
+        The coefficient held at its initial value: itself, or one that it trades off against.
+    """
+    if reason.identifiable:
+        reason = Reason(code=ReasonCode.NOT_WITH_ALL_FREE, tied_to=reason.tied_to)
+    if stand_in not in {name, reason.tied_to}:
+        reason = reason.model_copy(update={"given_held": stand_in})
+    if verdict is Verdict.TIED:
+        return verdict, reason
+    return Verdict.HELD if stand_in == name else Verdict.NOT_IDENTIFIABLE, reason
+
+
+def judge_impossible_inertia(fitted_value: float) -> tuple[Verdict, Reason]:
+    """Return the judgement on a moment of inertia that was set back, kg m²."""
+    code = ReasonCode.IMPOSSIBLE_INERTIA
+    return Verdict.HELD, Reason(code=code, fitted_value=fitted_value)

@@ -48,7 +48,7 @@ def test_the_report_says_that_nothing_was_fitted(examined):
 def test_what_matters_is_known_and_what_does_not_is_not(examined):
     known = examined.knowledge.coefficients
     assert known["motor_constant"].fitted
-    assert known["motor_constant"].verdict == "well known"
+    assert known["motor_constant"].verdict == "well_known"
     assert not known["rolling_moment_coefficient"].fitted
     changes = {
         name: max(o.change[name] for o in examined.knowledge.outputs if o.channel == "position")

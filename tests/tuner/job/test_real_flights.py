@@ -30,6 +30,6 @@ def test_held_out_flights_are_met_twice_as_well_as_by_the_unfitted_vehicle(tmp_p
         for axis, before in flight.rmse_initial:
             assert getattr(flight.rmse_best, axis) < 0.5 * before, (flight.name, axis)
     assert result.coefficients["motor_constant"].identifiable is False
-    assert "input_scaling as given" in result.coefficients["motor_constant"].note
+    assert "fitted with input_scaling held" in result.coefficients["motor_constant"].note
     assert 0 < result.settings["window_starts"]["trim"] < 0.1
     assert (folder / "report.html").exists()

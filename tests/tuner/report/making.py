@@ -27,6 +27,7 @@ from tuner.result import (
     SearchResult,
     write_result,
 )
+from tuner.wording.verdicts import judgement_in_words
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
 
@@ -108,7 +109,7 @@ def _result(
         estimate = found.uncertainty.estimates.get(name)
         unit = COEFFICIENTS[name].unit
         if estimate is None:
-            note = "kept as given"
+            note = "fixed"
             coefficients[name] = CoefficientResult(
                 unit=unit, initial=value, best=value, fitted=False, note=note
             )
@@ -121,7 +122,7 @@ def _result(
             std_error=estimate.std_error,
             ci95=estimate.ci95,
             identifiable=estimate.identifiable,
-            note=f"{estimate.verdict.value}: {estimate.reason}",
+            note=judgement_in_words(estimate.verdict, estimate.reason),
         )
     flights = tuple(
         FlightResult(

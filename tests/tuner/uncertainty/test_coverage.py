@@ -8,7 +8,7 @@ from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.progress import Free, beginning, point_of
 from tuner.search.stages import plan
-from tuner.uncertainty import uncertainty
+from tuner.uncertainty.estimates import uncertainty
 
 FREE = (
     "inertia_xx",

@@ -10,7 +10,7 @@ from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
-from tuner.uncertainty import uncertainty
+from tuner.uncertainty.estimates import uncertainty
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
 REFITS = 50

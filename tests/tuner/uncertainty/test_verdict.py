@@ -5,61 +5,89 @@ from __future__ import annotations
 from dataclasses import replace
 
 from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.verdict import Standing, Verdict, judge
+from tuner.uncertainty.verdict import (
+    Precision,
+    Reason,
+    ReasonCode,
+    Verdict,
+    judge,
+    judge_after_holding,
+)
 
-GOOD = Standing(
+GOOD = Precision(
     name="inertia_xx",
-    interval="1.2 %",
     half_width=0.012,
+    unit=None,
+    relative_half_width=0.012,
     data_error=0.006,
     prior_share=0.001,
     prior_given=False,
     inflation=1.1,
     partner="estimate_latency",
     correlation=0.95,
-    source="attitude, circle above all",
+    channel="attitude",
+    flight="circle",
     bound=None,
 )
+INTERVAL = Reason(code=ReasonCode.INTERVAL, half_width=0.012, channel="attitude", flight="circle")
 
 
 def test_well_known() -> None:
-    assert judge(GOOD, ()) == (
-        Verdict.WELL_KNOWN,
-        "±1.2 % (95 %), mostly from attitude, circle above all",
-    )
+    assert judge(GOOD, ()) == (Verdict.WELL_KNOWN, INTERVAL)
 
 
 def test_weakly_known_names_what_it_is_confused_with() -> None:
-    verdict, reason = judge(replace(GOOD, half_width=0.2, interval="20 %", data_error=0.1), ())
+    verdict, reason = judge(replace(GOOD, relative_half_width=0.2, data_error=0.1), ())
     assert verdict is Verdict.WEAKLY_KNOWN
-    assert "hard to tell from estimate_latency (correlation +0.95)" in reason
+    assert (reason.correlated_with, reason.correlation) == ("estimate_latency", 0.95)
 
 
 def test_an_interval_that_the_prior_made_is_not_identifiable() -> None:
-    verdict, reason = judge(replace(GOOD, data_error=0.8, half_width=0.03), ())
+    verdict, reason = judge(replace(GOOD, data_error=0.8, relative_half_width=0.03), ())
     assert verdict is Verdict.NOT_IDENTIFIABLE
-    assert (
-        reason == "the flights alone leave it open to ±157 %; the interval is the default prior's"
-    )
+    assert reason.code is ReasonCode.WIDE_INTERVAL
+    assert f"{reason.half_width:.2f}" == "1.57"
     verdict, reason = judge(replace(GOOD, prior_share=0.7, prior_given=True), ())
     assert verdict is Verdict.NOT_IDENTIFIABLE
-    assert reason == "70% of what is known comes from the prior that was given"
+    assert reason == Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
 
 
 def test_a_coefficient_without_effect() -> None:
     _, reason = judge(replace(GOOD, data_error=50.0), ())
-    assert "no trace in the flights" in reason
+    assert reason.code is ReasonCode.NO_EFFECT
 
 
 def test_a_null_direction_is_the_reason() -> None:
-    null = Direction({"mass": 1.0, "inertia_xx": 1.0}, 30.0, True, "They scale together.")
+    moves = {"mass": 1.0, "inertia_xx": 1.0}
+    null = Direction(moves=moves, error=30.0, null=True, common_scale=True)
     verdict, reason = judge(replace(GOOD, data_error=30.0), (null,))
     assert verdict is Verdict.NOT_IDENTIFIABLE
-    assert "They scale together." in reason
+    assert reason == Reason(code=ReasonCode.NULL_DIRECTION, direction=null, prior_given=False)
 
 
-def test_a_bound_and_model_error_are_said() -> None:
+def test_a_bound_and_model_error_are_reported() -> None:
     verdict, reason = judge(replace(GOOD, bound="lower", inflation=5.0), ())
     assert verdict is Verdict.WEAKLY_KNOWN
-    assert "the fit ended at its lower bound" in reason
-    assert "widens the interval 5.0 times" in reason
+    assert (reason.bound, reason.noise_inflation) == ("lower", 5.0)
+
+
+def test_a_held_coefficient_is_distinguished_from_one_that_is_fitted_beside_it() -> None:
+    verdict, reason = judge_after_holding("mass", Verdict.WELL_KNOWN, INTERVAL, "mass")
+    assert verdict is Verdict.HELD
+    assert reason == Reason(code=ReasonCode.NOT_WITH_ALL_FREE)
+    verdict, reason = judge_after_holding("inertia_xx", Verdict.WELL_KNOWN, INTERVAL, "mass")
+    assert verdict is Verdict.NOT_IDENTIFIABLE
+    assert reason == Reason(code=ReasonCode.NOT_WITH_ALL_FREE, given_held="mass")
+    assert not reason.identifiable
+
+
+def test_a_tied_coefficient_stays_tied_when_its_group_is_held() -> None:
+    tied = INTERVAL.model_copy(update={"tied_to": "inertia_xx"})
+    verdict, reason = judge_after_holding("inertia_yy", Verdict.TIED, tied, "inertia_xx")
+    assert verdict is Verdict.TIED
+    assert reason == Reason(code=ReasonCode.NOT_WITH_ALL_FREE, tied_to="inertia_xx")
+
+
+def test_a_reason_survives_json() -> None:
+    _, reason = judge(replace(GOOD, bound="upper", inflation=3.0), ())
+    assert Reason.model_validate_json(reason.model_dump_json()) == reason

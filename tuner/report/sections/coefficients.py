@@ -10,13 +10,17 @@ from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.result import CoefficientResult
+from tuner.uncertainty.verdict import Verdict
+from tuner.wording.verdicts import judgement_in_words, reason_in_words, verdict_in_words
 
 #: Verdict -> class of its badge, sign before it and colour of its bar.
 VERDICTS = {
-    "well known": ("well", "●", PALETTE[2]),
-    "weakly known": ("weak", "◐", PALETTE[4]),
-    "not identifiable": ("not", "○", PALETTE[1]),
-    "kept as given": ("kept", "–", GREY),
+    Verdict.WELL_KNOWN: ("well", "●", PALETTE[2]),
+    Verdict.WEAKLY_KNOWN: ("weak", "◐", PALETTE[4]),
+    Verdict.NOT_IDENTIFIABLE: ("not", "○", PALETTE[1]),
+    Verdict.HELD: ("not", "○", PALETTE[1]),
+    Verdict.TIED: ("kept", "=", GREY),
+    Verdict.FIXED: ("kept", "–", GREY),
 }
 
 
@@ -53,18 +57,18 @@ def coefficients(contents: Contents) -> Section | None:
 
 
 def _fitted(name: str, one: CoefficientResult, known: Known | None) -> Row:
-    verdict, colon, reason = one.note.partition(": ")
-    if verdict not in VERDICTS:
-        verdict, reason = "kept as given", one.note
-    elif not colon:
-        reason = ""
+    words, _, reason = one.note.partition(": ")
+    verdict = next((v for v in Verdict if verdict_in_words(v) == words), Verdict.FIXED)
     if not one.fitted and known is not None:
-        reason = f"were it fitted with the others: {known.verdict}: {known.reason}"
+        judgement = judgement_in_words(known.verdict, known.reason)
+        reason = f"were it fitted with the others: {judgement}"
     return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (verdict, reason))
 
 
 def _known(name: str, one: Known) -> Row:
-    reason = one.reason if one.fitted else f"were it fitted with the others: {one.reason}"
+    reason = reason_in_words(one.reason)
+    if not one.fitted:
+        reason = f"were it fitted with the others: {reason}"
     return _row(name, (None, one.value), (one.std_error, one.ci95), (one.verdict, reason))
 
 
@@ -72,11 +76,12 @@ def _row(
     name: str,
     values: tuple[float | None, float],
     spread: tuple[float | None, tuple[float | None, float | None] | None],
-    judged: tuple[str, str],
+    judged: tuple[Verdict, str],
 ) -> Row:
-    badge, sign, _ = VERDICTS[judged[0]]
-    about = COEFFICIENTS[name]
-    return Row(name, about.meaning, about.unit, *values, *spread, judged[0], badge, sign, judged[1])
+    verdict, reason = judged
+    badge, sign, _ = VERDICTS[verdict]
+    about, words = COEFFICIENTS[name], verdict_in_words(verdict)
+    return Row(name, about.meaning, about.unit, *values, *spread, words, badge, sign, reason)
 
 
 def _intervals(known: dict[str, Known]) -> list[Chart]:
@@ -93,9 +98,12 @@ def _intervals(known: dict[str, Known]) -> list[Chart]:
     for verdict, (_, sign, colour) in VERDICTS.items():
         own = [wide[name] if known[name].verdict == verdict else None for name in order]
         if any(value is not None for value in own):
-            texts = [f"{name}: ±{wide[name]:.2g} %, {known[name].verdict}" for name in order]
+            texts = [
+                f"{name}: ±{wide[name]:.2g} %, {verdict_in_words(known[name].verdict)}"
+                for name in order
+            ]
             labels = [name if known[name].fitted else f"{name} (fixed)" for name in order]
-            bars.append(Bars(f"{sign} {verdict}", labels, own, colour, texts))
+            bars.append(Bars(f"{sign} {verdict_in_words(verdict)}", labels, own, colour, texts))
     return [
         Chart(
             key="intervals",

@@ -8,6 +8,7 @@ from tuner.examination.knowledge import Knowledge
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.wording.verdicts import direction_in_words
 
 NOTICED = 0.05
 """Percent of bias for each percent of a fixed coefficient below which it is not told."""
@@ -30,7 +31,8 @@ def information(contents: Contents) -> Section | None:
     knowledge = contents.knowledge
     if knowledge is None:
         return None
-    values = {"directions": knowledge.directions, "biases": _biases(knowledge)}
+    directions = [(one.null, direction_in_words(one)) for one in knowledge.directions]
+    values = {"directions": directions, "biases": _biases(knowledge)}
     charts = [_by_channel(knowledge), _by_flight(knowledge)]
     if len(knowledge.names) > 1:
         charts.append(_correlation(knowledge))

@@ -1,0 +1,97 @@
+"""Verdicts, their reasons and badly determined directions as sentences."""
+
+from __future__ import annotations
+
+from tuner.uncertainty.directions import SCALE_GROUP, Direction
+from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
+from tuner.wording.phrases import listed, percent, quantity
+
+
+def verdict_in_words(verdict: Verdict) -> str:
+    """Return a verdict as it stands in a table."""
+    return "held at its initial value" if verdict is Verdict.HELD else verdict.replace("_", " ")
+
+
+def judgement_in_words(verdict: Verdict, reason: Reason) -> str:
+    """Return a verdict and its reason, as a phrase."""
+    because = reason_in_words(reason)
+    return f"{verdict_in_words(verdict)}: {because}" if because else verdict_in_words(verdict)
+
+
+def reason_in_words(reason: Reason) -> str:
+    """Return why a verdict was given; empty if there is nothing to say."""
+    phrase = _main_clause(reason)
+    if reason.tied_to is not None:
+        phrase = f"tied to {reason.tied_to}: {phrase}"
+    if reason.correlated_with is not None:
+        phrase += (
+            f"; hard to distinguish from {reason.correlated_with} "
+            f"(correlation {reason.correlation:+.2f})"
+        )
+    if reason.noise_inflation is not None:
+        phrase += (
+            "; residuals are not white noise, which widens the interval "
+            f"{reason.noise_inflation:.1f} times"
+        )
+    if reason.bound is not None:
+        phrase += f"; the fit ended at its {reason.bound} bound"
+    if reason.given_held is not None:
+        phrase += f"; fitted with {reason.given_held} held at its initial value"
+    return phrase
+
+
+def _main_clause(reason: Reason) -> str:
+    prior = f"the {'given' if reason.prior_given else 'default'} prior"
+    source = "" if reason.channel is None else f", mostly from {_source(reason)}"
+    direction = reason.direction
+    return {
+        ReasonCode.INTERVAL: f"±{_half_width(reason)} (95 %){source}",
+        ReasonCode.NULL_DIRECTION: "the flights do not identify it: "
+        f"{'' if direction is None else direction_in_words(direction)} "
+        f"The interval is that of {prior}",
+        ReasonCode.NO_EFFECT: "it has no effect on anything recorded; "
+        f"the interval is that of {prior}",
+        ReasonCode.WIDE_INTERVAL: f"the flights alone determine it only to ±{_half_width(reason)}; "
+        f"the interval is that of {prior}",
+        ReasonCode.PRIOR_DOMINATES: f"{reason.prior_share or 0.0:.0%} of the information about it "
+        f"is that of {prior}",
+        ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",
+        ReasonCode.IMPOSSIBLE_INERTIA: f"fitted to {reason.fitted_value or 0.0:.4g}, which no "
+        "rigid body has together with the other moments of inertia",
+        ReasonCode.NOT_FITTED: "",
+    }[reason.code]
+
+
+def _half_width(reason: Reason) -> str:
+    return "" if reason.half_width is None else quantity(reason.half_width, reason.unit)
+
+
+def _source(reason: Reason) -> str:
+    channel = str(reason.channel).replace("_", " ")
+    return channel if reason.flight is None else f"{channel}, {reason.flight} above all"
+
+
+def direction_in_words(direction: Direction) -> str:
+    """Return one sentence on a combination of coefficients and how well it is determined."""
+    moves = direction.moves
+    known = (
+        "is not identifiable"
+        if direction.null
+        else f"is known to ±{percent(1.96 * direction.error)}"
+    )
+    if direction.common_scale:
+        group = listed([name for name in moves if name in SCALE_GROUP])
+        return (
+            f"{group} scale together: multiplied by one factor, every motion stays the same; "
+            f"that factor {known}. Weigh the mass and fix it."
+        )
+    if len(moves) == 1:
+        return f"{next(iter(moves))} alone: it {known}."
+    rising = [name for name, move in moves.items() if move > 0]
+    falling = [name for name, move in moves.items() if move < 0]
+    proportion = ", ".join(f"{name} {move:+.0%}" for name, move in moves.items())
+    if falling:
+        verb = f"trade{'s' if len(rising) == 1 else ''} off against {listed(falling)}"
+    else:
+        verb = "rise and fall together"
+    return f"{listed(rising)} {verb} (in the proportion {proportion}): their combination {known}."
