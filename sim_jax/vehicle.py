@@ -92,3 +92,5 @@ class Vehicle(eqx.Module):
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup
+    effects: dict[str, Scalar] = eqx.field(default_factory=dict)
+    """Coefficients of terms beyond the base model by name; a term without them does not act."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -20,12 +21,8 @@ from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
-from tuner.config import ControllerFile, VehicleFile
-
-LONGEST_ESTIMATE_LATENCY = 0.1
-"""s; the delay line of a fit reaches this far back, and so does the coefficient's bound."""
-LONGEST_ACTUATOR_LATENCY = 0.04
-"""s."""
+from tuner.coefficients import COEFFICIENTS, Coefficient
+from tuner.config import ControllerFile, VehicleFile, initial_values
 
 
 class Model(eqx.Module):
@@ -35,42 +32,21 @@ class Model(eqx.Module):
     controller: Controller
 
 
-#: Coefficient name -> where it lives in a `Model`.
-_PLACES: Mapping[str, tuple[str, ...]] = {
-    "mass": ("vehicle", "body", "mass"),
-    "inertia_xx": ("vehicle", "body", "inertia_xx"),
-    "inertia_yy": ("vehicle", "body", "inertia_yy"),
-    "inertia_zz": ("vehicle", "body", "inertia_zz"),
-    "input_scaling": ("vehicle", "motor", "input_scaling"),
-    "zero_position_armed": ("vehicle", "motor", "zero_position_armed"),
-    "input_offset": ("vehicle", "motor", "input_offset"),
-    "quadratic": ("vehicle", "motor", "quadratic"),
-    "time_constant_up": ("vehicle", "motor", "time_constant_up"),
-    "time_constant_down": ("vehicle", "motor", "time_constant_down"),
-    "motor_constant": ("vehicle", "aerodynamics", "motor_constant"),
-    "moment_constant": ("vehicle", "aerodynamics", "moment_constant"),
-    "rotor_drag_coefficient": ("vehicle", "aerodynamics", "rotor_drag_coefficient"),
-    "rolling_moment_coefficient": ("vehicle", "aerodynamics", "rolling_moment_coefficient"),
-    "max_relative_airspeed": ("vehicle", "aerodynamics", "max_relative_airspeed"),
-    "estimate_latency": ("vehicle", "setup", "estimate_latency"),
-    "actuator_latency": ("vehicle", "setup", "actuator_latency"),
-    "gyro_cutoff": ("controller", "filters", "gyro_cutoff"),
-}
-
-
 def coefficients_in(model: Model) -> dict[str, Scalar]:
     """Return every coefficient that a model has; one that is left out, as a filter may be, is not.
 
     The order is always the same.
     """
-    found = {name: _leaf(model, name) for name in _PLACES}
-    return {name: value for name, value in found.items() if value is not None}
+    leaves = {name: _leaf(model, coefficient) for name, coefficient in COEFFICIENTS.items()}
+    return {name: value for name, value in leaves.items() if value is not None}
 
 
-def _leaf(model: Model, name: str) -> Scalar | None:
+def _leaf(model: Model, coefficient: Coefficient) -> Scalar | None:
+    if coefficient.is_effect:
+        return model.vehicle.effects.get(coefficient.name)
     node: Any = model
-    for part in _PLACES[name]:
-        node = getattr(node, part)
+    for attribute in coefficient.leaf_path:
+        node = getattr(node, attribute)
     leaf: Scalar | None = node
     return leaf
 
@@ -78,19 +54,26 @@ def _leaf(model: Model, name: str) -> Scalar | None:
 def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     """Return the model with coefficients replaced; values broadcast over the batch.
 
+    A coefficient of a term that the model leaves out brings the term in.
+
     Raises
     ------
     KeyError
         A name is no coefficient's.
     """
-    names = list(values)
+    rows = [COEFFICIENTS[name] for name in values]
+    replaced = [row for row in rows if not row.is_effect]
     changed: Model = eqx.tree_at(
-        lambda tree: [_leaf(tree, name) for name in names],
+        lambda tree: [_leaf(tree, row) for row in replaced],
         model,
-        [values[name] for name in names],
+        [values[row.name] for row in replaced],
         is_leaf=lambda leaf: leaf is None,
     )
-    return changed
+    effects = {row.name: values[row.name] for row in rows if row.is_effect}
+    if not effects:
+        return changed
+    vehicle = replace(changed.vehicle, effects=changed.vehicle.effects | effects)
+    return Model(vehicle, changed.controller)
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
@@ -104,35 +87,23 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
             *map(jnp.asarray, (file.mass, file.inertia.xx, file.inertia.yy, file.inertia.zz))
         ),
         rotors=(first, second, third, fourth),
-        motor=Motor(
-            input_scaling=jnp.asarray(file.motor.input_scaling),
-            zero_position_armed=jnp.asarray(file.motor.zero_position_armed),
-            max_rotor_velocity=jnp.asarray(file.motor.max_rotor_velocity),
-            time_constant_up=jnp.asarray(file.motor.time_constant_up),
-            time_constant_down=jnp.asarray(file.motor.time_constant_down),
-            input_offset=jnp.asarray(file.motor.input_offset),
-            quadratic=jnp.asarray(file.motor.quadratic),
-        ),
+        motor=Motor(**{key: jnp.asarray(value) for key, value in file.motor}),
         aerodynamics=Aerodynamics(
-            motor_constant=jnp.asarray(aerodynamics.motor_constant),
-            moment_constant=jnp.asarray(aerodynamics.moment_constant),
-            rotor_drag_coefficient=jnp.asarray(aerodynamics.rotor_drag_coefficient),
-            rolling_moment_coefficient=jnp.asarray(aerodynamics.rolling_moment_coefficient),
-            max_relative_airspeed=jnp.asarray(aerodynamics.max_relative_airspeed),
+            **{k: jnp.asarray(v) for k, v in aerodynamics if k != "reaction_torque"},
             reaction_torque=aerodynamics.reaction_torque,
         ),
         setup=Setup(
             jnp.asarray(file.setup.estimate_latency), jnp.asarray(file.setup.actuator_latency)
         ),
+        effects={name: jnp.asarray(value) for name, value in file.effects.items()},
     )
 
 
-def controller_of(file: ControllerFile, gyro_cutoff: float | None = None) -> Controller:
-    """Return the simulator's controller; a cutoff in Hz given here wins over the file's."""
+def controller_of(file: ControllerFile) -> Controller:
+    """Return the simulator's controller."""
     roll, pitch, yaw = file.rate.roll, file.rate.pitch, file.rate.yaw
     limit = file.rate.integrator_limit
-    cutoff = file.filters.gyro_cutoff if gyro_cutoff is None else gyro_cutoff
-    dgyro = file.filters.dgyro_cutoff
+    gyro, dgyro = file.filters.gyro_cutoff, file.filters.dgyro_cutoff
     return Controller(
         position=PositionGains(
             kp=_vector(file.position.kp),
@@ -157,7 +128,7 @@ def controller_of(file: ControllerFile, gyro_cutoff: float | None = None) -> Con
             saturation_feedback=jnp.asarray(1.0 if file.mixer.saturation_feedback else 0.0),
         ),
         filters=Filters(
-            gyro_cutoff=None if cutoff is None else jnp.asarray(float(cutoff)),
+            gyro_cutoff=None if gyro is None else jnp.asarray(float(gyro)),
             dgyro_cutoff=None if dgyro is None else jnp.asarray(float(dgyro)),
         ),
         mixer=MixerSettings(
@@ -169,10 +140,11 @@ def controller_of(file: ControllerFile, gyro_cutoff: float | None = None) -> Con
 
 
 def model_of(vehicle: VehicleFile, controller: ControllerFile) -> Model:
-    """Return both files as one value to fly."""
-    return Model(
-        vehicle_of(vehicle), controller_of(controller, gyro_cutoff=vehicle.setup.gyro_cutoff)
-    )
+    """Return both files as one value to fly; of what both give, the vehicle file's holds."""
+    model = Model(vehicle_of(vehicle), controller_of(controller))
+    values = initial_values(vehicle, controller)
+    shared = {name for name, row in COEFFICIENTS.items() if row.fallback and name in values}
+    return with_coefficients(model, {name: jnp.asarray(values[name]) for name in shared})
 
 
 def schedule_of(file: ControllerFile, *, log_rate: int | None = None) -> Schedule:
@@ -193,9 +165,16 @@ def schedule_of(file: ControllerFile, *, log_rate: int | None = None) -> Schedul
         log_rate=physics if log_rate is None else log_rate,
         integrator=file.physics.integrator,
         pose_rate=file.sensing.pose_rate,
-        longest_estimate_latency=LONGEST_ESTIMATE_LATENCY,
-        longest_actuator_latency=LONGEST_ACTUATOR_LATENCY,
+        longest_estimate_latency=_longest("estimate_latency"),
+        longest_actuator_latency=_longest("actuator_latency"),
     )
+
+
+def _longest(latency: str) -> float:
+    """Return the s that the delay line of a fit reaches back, as far as the latency's bound."""
+    bounds = COEFFICIENTS[latency].bounds
+    assert isinstance(bounds, tuple)
+    return bounds[1]
 
 
 def _vector(values: tuple[float, float, float]) -> Vec3:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.crash import AIRBORNE
-from tuner.coefficients import Space
+from tuner.coefficients.space import Space
 from tuner.comparison.errors import FlightErrors, joined, laps_of, simulated_minus_recorded
 from tuner.config import ControllerFile, VehicleFile
 from tuner.flights.flight import Array, Flight

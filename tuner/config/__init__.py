@@ -1,10 +1,11 @@
 """Vehicle, controller and job files: validated in one line, plain numbers, no simulator."""
 
-from tuner.config.coefficient_names import COEFFICIENTS, check_names, values_of, with_values
+from tuner.coefficients import COEFFICIENTS
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import CHANNELS, JobFile, TrajectorySettings, read_job
 from tuner.config.settings import Options, Settings, find_job_file, settle
 from tuner.config.shipped import configs_folder, find_config
+from tuner.config.values import check_names, initial_values, values_of, with_values
 from tuner.config.vehicle import VehicleFile, read_vehicle
 from tuner.config.vehicle_writer import vehicle_text, write_vehicle
 
@@ -21,6 +22,7 @@ __all__ = [
     "configs_folder",
     "find_config",
     "find_job_file",
+    "initial_values",
     "read_controller",
     "read_job",
     "read_vehicle",

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
-from tuner.config.coefficient_names import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.config.model import (
     Flag,
     Number,

@@ -11,10 +11,10 @@ from typing import Generic, TypeVar
 
 from pydantic import ValidationError
 
-from tuner.config.coefficient_names import check_names, with_values
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import JobFile, Method, read_job
 from tuner.config.shipped import Kind, find_config
+from tuner.config.values import check_names, with_values
 from tuner.config.vehicle import VehicleFile, read_vehicle
 from tuner.errors import ConfigError, InputError, did_you_mean
 from tuner.flights.paths import find_flights

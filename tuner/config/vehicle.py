@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, JsonValue, model_validator
+from pydantic import AfterValidator, Field, JsonValue, model_validator
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.config.model import (
     NonNegative,
     Number,
@@ -16,6 +17,7 @@ from tuner.config.model import (
     read_model,
     refuse,
 )
+from tuner.errors import did_you_mean
 
 #: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
 QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))
@@ -128,6 +130,14 @@ class Setup(Section):
     gyro_cutoff: Positive | None = None
 
 
+def _of_the_registry(effects: dict[str, float]) -> dict[str, float]:
+    known = [name for name, coefficient in COEFFICIENTS.items() if coefficient.is_effect]
+    for name in effects:
+        if name not in known:
+            raise refuse(f"unknown key 'effects.{name}'", did_you_mean(name, known))
+    return effects
+
+
 class VehicleFile(Section):
     """One multirotor.
 
@@ -143,6 +153,9 @@ class VehicleFile(Section):
         Four, in PX4's motor order (front right, rear left, front left, rear right).
     motor, aerodynamics, setup
         See there.
+    effects
+        Coefficients of terms beyond Gazebo's motor model, name -> value in the unit of the
+        registry (`tuner.coefficients`). A term whose coefficients are left out does not act.
     source
         Where the numbers come from: free text and numbers, kept as they are.
     """
@@ -154,6 +167,9 @@ class VehicleFile(Section):
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup = Setup()
+    effects: Annotated[dict[str, Number], AfterValidator(_of_the_registry)] = Field(
+        default_factory=dict
+    )
     source: dict[str, JsonValue] = Field(default_factory=dict)
 
     @model_validator(mode="after")

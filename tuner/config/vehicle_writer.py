@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.config.coefficient_names import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.config.vehicle import VehicleFile
 from tuner.config.yaml_file import commented, dump_yaml
 from tuner.files import write_text
@@ -35,8 +35,9 @@ def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -
 def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
     """Return the text of a vehicle file, as `write_vehicle` writes it."""
     data = vehicle.model_dump(mode="json", exclude_none=True)
-    if not vehicle.source:
-        del data["source"]
+    for section in ("effects", "source"):
+        if not data[section]:
+            del data[section]
     return commented(header) + _with_units(dump_yaml(data))
 
 

@@ -23,6 +23,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
+from tuner.coefficients import COEFFICIENTS
 from tuner.design.candidates import Arena, Candidate, candidates
 from tuner.design.proposals import Proposal, Proposals, in_words
 from tuner.examination.examine import Examination
@@ -36,8 +37,6 @@ from tuner.uncertainty.verdict import Verdict
 
 Array = NDArray[np.float64]
 
-WEIGHED = ("mass",)
-"""Fixed because it is weighed: nobody flies for it."""
 LOG_RATE = 100
 """Hz, at least, at which candidates are logged."""
 SAMPLE_RATE = 100.0
@@ -111,7 +110,11 @@ def _ranked(
     verdicts |= {name: one.estimates[name].verdict for name, one in examination.freed.items()}
     weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
     free = [name for name in weak if name in fitted.names]
-    fixed = [name for name in weak if name in examination.freed and name not in WEIGHED]
+    fixed = [
+        name
+        for name in weak
+        if name in examination.freed and COEFFICIENTS[name].informed_by != "weighing"
+    ]
     targets = free or fixed or list(fitted.names)
     rows = [
         Proposal(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import Space
+from tuner.coefficients.space import Space
 from tuner.config import COEFFICIENTS
 from tuner.examination.examine import Examination
 from tuner.examination.knowledge import (

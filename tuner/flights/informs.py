@@ -1,7 +1,7 @@
-"""Which inlets a recording can be fed in at, and which coefficients it could inform.
+"""Which inlets a recording can be fed in at, and which coefficients it could show.
 
-These are rules of thumb from what was recorded and how hard it was flown; what a fit really
-learned stands in its own report.
+These are rules of thumb from what was recorded and how hard it was flown; what a fit identified
+stands in its own report.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.flights.flight import Array, Series
 from tuner.flights.inspection import Informed, Inlet, MissionReport
 
-#: Below these a motion says little of a coefficient, and below a third of them nothing.
+#: Below these a motion shows little of a coefficient, and below a third of them nothing.
 ROLL_PITCH_RATE = 0.2
 YAW_RATE = 0.4
 SPEED = 1.5
@@ -60,7 +61,7 @@ def informed(
     measured: Mapping[str, tuple[int, ...]],
     missions: Sequence[MissionReport],
 ) -> tuple[Informed, ...]:
-    """Return what a recording could say of each coefficient.
+    """Return how well a recording could show each coefficient, by the rule that its row names.
 
     Parameters
     ----------
@@ -89,7 +90,6 @@ def informed(
             return "no", "nothing recorded drives the simulation"
         return _graded(float(rates[axis]), limit, f"{name} rate varies by {rates[axis]:.2f} rad/s")
 
-    yaw = turning(2, YAW_RATE, "yaw")
     curve = (
         ("yes", "commands and rotor speed show the curve")
         if tachometer and commands and command > COMMAND_SPREAD
@@ -101,36 +101,37 @@ def informed(
         else ("weakly", "through the body rates only" if driven else "no rotor speed")
     )
     loop = {"reference_position"} <= has and "rate_setpoint" in has
-    findings = {
-        "mass": ("no", "weigh it: forces and inertias scale with it"),
-        "inertia_xx": turning(0, ROLL_PITCH_RATE, "roll"),
-        "inertia_yy": turning(1, ROLL_PITCH_RATE, "pitch"),
-        "inertia_zz": yaw,
-        "input_scaling": curve,
-        "zero_position_armed": curve,
-        "time_constant_up": lag,
-        "time_constant_down": lag,
-        "motor_constant": (
+    rules = {
+        "weighing": ("no", "weigh it: forces and inertias scale with it"),
+        "nothing": ("no", "such flights do not show it"),
+        "roll": turning(0, ROLL_PITCH_RATE, "roll"),
+        "pitch": turning(1, ROLL_PITCH_RATE, "pitch"),
+        "yaw": turning(2, YAW_RATE, "yaw"),
+        "thrust curve": curve,
+        "rotor lag": lag,
+        "thrust": (
             ("yes", "rotor speed against the weight")
             if tachometer
             else ("weakly", "only together with the RPM curve")
         ),
-        "moment_constant": yaw,
-        "rotor_drag_coefficient": _graded(speed, SPEED, f"flown at up to {speed:.1f} m/s"),
-        "rolling_moment_coefficient": ("no", "such flights do not show it"),
-        "max_relative_airspeed": _graded(climb, VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
-        "estimate_latency": (
+        "speed": _graded(speed, SPEED, f"flown at up to {speed:.1f} m/s"),
+        "climb": _graded(climb, VERTICAL_SPEED, f"climbs at {climb:.1f} m/s"),
+        "closed loop": (
             ("yes", "reference and set-points close the loop")
             if loop
             else ("no", "the loop's reference or set-points are missing")
         ),
-        "actuator_latency": (
+        "commands and rotor speed": (
             ("yes", "commands and rotor speed recorded")
             if tachometer and commands
             else ("weakly", "no commands beside rotor speeds")
         ),
     }
-    return tuple(Informed(name, how, why) for name, (how, why) in findings.items())
+    return tuple(
+        Informed(name, *rules[coefficient.informed_by])
+        for name, coefficient in COEFFICIENTS.items()
+        if coefficient.informed_by is not None
+    )
 
 
 def _graded(value: float, limit: float, why: str) -> tuple[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.inlets import NEEDS, sparse
@@ -29,12 +30,6 @@ TURNS = 0.5
 """rad/s of yaw rate below which yaw is not excited."""
 GAP = 0.25
 """s without a pose inside a mission that a user should know of."""
-
-_PLAUSIBLE = {
-    "time_constant_up": (0.001, 1.0),
-    "time_constant_down": (0.001, 1.0),
-    "moment_constant": (0.001, 0.5),
-}
 
 
 def check(job: Job) -> tuple[Finding, ...]:
@@ -153,7 +148,7 @@ def _spread(flight: Flight, axis: str) -> float:
 def _bounds(job: Job) -> list[Finding]:
     found = []
     for parameter in job.space.parameters:
-        low, high = _PLAUSIBLE.get(parameter.name, (-np.inf, np.inf))
+        low, high = COEFFICIENTS[parameter.name].plausible or (-np.inf, np.inf)
         if parameter.upper < low or parameter.lower > high:
             found.append(
                 Finding(

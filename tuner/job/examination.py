@@ -13,7 +13,7 @@ from sim_jax.inlet import ReferenceInlet
 from tuner.comparison.compare import flights_of, offset_of
 from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
-from tuner.config import Options, Settings, check_names, settle, values_of
+from tuner.config import Options, Settings, check_names, initial_values, settle
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.design.next_flight import Habits, next_flights
 from tuner.design.proposals import Proposals, write_proposals
@@ -214,7 +214,8 @@ def as_it_is(job: Job) -> Fitted:
     Where rotors were clipped low, whether the rate integrator then stops is tried both ways.
     """
     space, said = job.space, job.settings.controller.mixer.saturation_feedback
-    vector = space.vector_of(values_of(job.settings.vehicle))
+    start = initial_values(job.settings.vehicle, job.settings.controller, space.free)
+    vector = space.vector_of(start)
     tried = {
         feedback: _met(with_feedback(job.objective, float(feedback)), vector)
         for feedback in ((said, not said) if job.clipped else (said,))

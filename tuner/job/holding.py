@@ -7,6 +7,7 @@ others follow.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,6 +15,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.examination.examine import Examination, examine
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
@@ -23,8 +25,6 @@ from tuner.search.fitted import Fitted
 from tuner.search.progress import Free, Progress
 from tuner.uncertainty.estimates import Uncertainty
 
-FIRST_HELD = ("mass", "input_scaling", "zero_position_armed", "actuator_latency")
-"""Of coefficients that trade off, the one to hold: what is weighed or set rather than flown."""
 MOST_ROUNDS = 3
 """What is held may leave something else undetermined; this often, at most."""
 
@@ -64,9 +64,9 @@ def held_by(uncertainty: Uncertainty) -> dict[str, str]:
     return held | {name: name for name in open_ones if name not in held}
 
 
-def _rank(name: str, moves: Mapping[str, float]) -> tuple[int, float]:
-    first = FIRST_HELD.index(name) if name in FIRST_HELD else len(FIRST_HELD)
-    return first, -abs(moves[name])
+def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
+    rank = COEFFICIENTS[name].hold_rank
+    return math.inf if rank is None else rank, -abs(moves[name])
 
 
 def hold(

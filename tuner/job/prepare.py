@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim_jax.crash import AIRBORNE, Limits
-from tuner.coefficients import Space, space_of
+from tuner.coefficients.space import Space, space_of
 from tuner.comparison.compare import flights_of
 from tuner.comparison.errors import limits_of
 from tuner.comparison.layout import said_inlet
@@ -99,7 +99,7 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
     noise = noise_of(fitted, channels)
-    space = space_of(settings.vehicle, job)
+    space = space_of(settings.vehicle, settings.controller, job)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
     inlets = _inlets(settings, fitted)

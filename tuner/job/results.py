@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
 from tuner.config import (
-    COEFFICIENTS,
     ControllerFile,
     VehicleFile,
-    values_of,
+    initial_values,
     with_values,
     write_vehicle,
 )
@@ -48,7 +48,6 @@ from tuner.uncertainty.verdict import (
 )
 from tuner.wording.verdicts import judgement_in_words
 
-INERTIA = ("inertia_xx", "inertia_yy", "inertia_zz")
 METRICS_FILE = "metrics.csv"
 LIBRARIES = ("multirotor-tune", "jax", "jaxlib", "equinox", "optimistix", "numpy", "rosbags")
 UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
@@ -71,10 +70,14 @@ def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
 
 def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
     """Return the coefficients that are reported: the fitted ones, but for those that are held."""
-    start = values_of(job.settings.vehicle)
+    start = _initial(job)
     found = job.space.values(fitted.point.coefficients)
     kept = {*impossible(job, fitted), *_held(job, fitted)}
     return {name: start[name] if name in kept else float(value) for name, value in found.items()}
+
+
+def _initial(job: Job) -> dict[str, float]:
+    return initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
 
 
 def _held(job: Job, fitted: Fitted) -> frozenset[str]:
@@ -87,11 +90,12 @@ def _held(job: Job, fitted: Fitted) -> frozenset[str]:
 def impossible(job: Job, fitted: Fitted) -> tuple[str, ...]:
     """Return the fitted moments of inertia, if together they are no rigid body's."""
     found = job.space.values(fitted.point.coefficients)
-    start = values_of(job.settings.vehicle)
-    moments = {name: float(found.get(name, start[name])) for name in INERTIA}
+    start = _initial(job)
+    inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
+    moments = {name: float(found.get(name, start[name])) for name in inertia}
     if 2 * max(moments.values()) <= sum(moments.values()):
         return ()
-    return tuple(name for name in INERTIA if name in found)
+    return tuple(name for name in inertia if name in found)
 
 
 def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
@@ -190,10 +194,7 @@ def result_of(
 def _coefficients(
     job: Job, fitted: Fitted, uncertainty: Uncertainty
 ) -> dict[str, CoefficientResult]:
-    start = values_of(job.settings.vehicle)
-    cutoff = job.settings.controller.filters.gyro_cutoff
-    if cutoff is not None:
-        start.setdefault("gyro_cutoff", float(cutoff))
+    start = _initial(job)
     best = best_values(job, fitted)
     raw, kept = job.space.values(fitted.point.coefficients), impossible(job, fitted)
     undetermined = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import Parameter
+from tuner.coefficients.space import Parameter
 from tuner.job.prepare import Job
 
 INSIDE = 0.02

@@ -24,21 +24,17 @@ from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
+from tuner.coefficients import of_scope
 
-#: What a start consists of: name -> (how many numbers, standard deviation of the smoothed one).
-#: m, m/s, rad about the body's axes, rad/s, share of the rotor's speed, rate controller's output.
-#: The trim is no state: rotors differ and the mass is never quite in the middle, so that what was
-#: recorded of the motors holds a steady torque about each axis that the model has no use for. In
-#: closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
 STATES: Mapping[str, tuple[int, float]] = {
-    "position": (3, 0.01),
-    "velocity": (3, 0.1),
-    "attitude": (3, 0.03),
-    "body_rate": (3, 0.3),
-    "rotor_speed": (4, 0.05),
-    "rate_integral": (3, 0.05),
-    "trim": (3, 0.02),
+    name: (row.count, row.prior_sd) for name, row in of_scope("window").items()
 }
+"""What a start consists of: name -> how many numbers, standard deviation of the smoothed one.
+
+The trim is no state: rotors differ and the mass is never quite in the middle, so that what was
+recorded of the motors holds a steady torque about each axis that the model has no use for. In
+closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
+"""
 COUNT = sum(count for count, _ in STATES.values())
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
-from tuner.coefficients import Space
+from tuner.coefficients.space import Space
 from tuner.model import Model, with_coefficients
 from tuner.objective.criterion import (
     OFFSET_UNIT,

@@ -17,6 +17,7 @@ from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
+from tuner.coefficients import of_scope
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, InitialState
 from tuner.objective.initial_conditions import freedom_of
@@ -26,7 +27,7 @@ from tuner.objective.windows import windows_of
 from tuner.padding import padded_size
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
-CLOCKS = ("pose", "flight_controller")
+CLOCKS = tuple(name for name, row in of_scope("flight").items() if row.unit == "s")
 CLOCK_OF = {
     "position": 0,
     "attitude": 0,
@@ -36,7 +37,7 @@ CLOCK_OF = {
 }
 
 #: What a recording may get wrong by a constant: its clocks, in s, and its gyro, in rad/s.
-OFFSETS = (*CLOCKS, "gyro_x", "gyro_y", "gyro_z")
+OFFSETS = tuple(of_scope("flight"))
 
 #: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1

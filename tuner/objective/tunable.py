@@ -9,7 +9,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
-from tuner.coefficients import Coordinates, Space
+from tuner.coefficients.space import Coordinates, Space
 from tuner.model import Model, coefficients_in, with_coefficients
 
 

@@ -13,8 +13,9 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from tuner.coefficients import Coordinates, Space
-from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.coefficients import of_scope
+from tuner.coefficients.space import Coordinates, Space
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 
 _Before: TypeAlias = tuple[Point, Any, SegmentSums]
@@ -94,7 +95,7 @@ def total(
     return loss / compared, gradient / compared, hessian / compared
 
 
-OFFSET_SD = 2.0
+(OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in of_scope("flight").values()}
 """Prior of an offset, in its unit of 10 ms or 0.01 rad/s: likelier small than large."""
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import Space
+from tuner.coefficients.space import Space
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective

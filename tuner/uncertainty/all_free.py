@@ -9,12 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import HABITS, Parameter, Space
+from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.space import Parameter, Space
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-
-#: Extensions of the thrust curve that are no coefficients of most vehicles: only where they act.
-EXTENSIONS = ("input_offset", "quadratic")
 
 
 @dataclass(frozen=True)
@@ -89,35 +87,27 @@ def with_space(objective: Objective, space: Space) -> Objective:
 
 
 def _fixed(objective: Objective) -> Mapping[str, float]:
-    """Return the fixed coefficients that can act in this simulation."""
-    fixed = dict(objective.space.fixed)
-    cutoff = objective.model.controller.filters.gyro_cutoff
-    fixed.pop("gyro_cutoff", None)
-    if cutoff is not None:
-        fixed["gyro_cutoff"] = float(cutoff)
+    """Return the fixed coefficients that act in this simulation, and have a logarithm if needed."""
     return {
         name: value
-        for name, value in fixed.items()
-        if not (name in EXTENSIONS and value == 0.0)
-        and not (HABITS[name].scale == "log" and value <= 0.0)
+        for name, value in objective.space.fixed.items()
+        if not (COEFFICIENTS[name].is_optional and value == COEFFICIENTS[name].neutral)
+        and not (COEFFICIENTS[name].scale == "log" and value <= 0.0)
     }
 
 
 def _parameter(name: str, value: float) -> Parameter:
-    habit = HABITS[name]
-    if isinstance(habit.reach, tuple):
-        lower, upper = min(habit.reach[0], value), max(habit.reach[1], value)
-    else:
-        lower, upper = value / habit.reach, value * habit.reach
+    row = COEFFICIENTS[name]
+    lower, upper = row.limits(value)
     return Parameter(
         name=name,
         ratios={name: 1.0},
         initial=value,
-        lower=lower,
-        upper=upper,
-        scale=habit.scale,
-        prior_mean=float(np.log(value)) if habit.scale == "log" else value,
-        prior_sd=habit.sd,
+        lower=min(lower, value),
+        upper=max(upper, value),
+        scale=row.scale,
+        prior_mean=float(np.log(value)) if row.scale == "log" else value,
+        prior_sd=row.prior_sd,
         prior_given=False,
-        unit_step=habit.unit_step,
+        unit_step=row.step,
     )

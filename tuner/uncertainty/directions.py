@@ -7,22 +7,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.coefficients import scale_group
 from tuner.files import Part
 
 Array = NDArray[np.float64]
 
 NAMED = 0.3
 """A coefficient takes part in a direction if it moves at least this much of the largest."""
-SCALE_GROUP = (
-    "mass",
-    "inertia_xx",
-    "inertia_yy",
-    "inertia_zz",
-    "motor_constant",
-    "rotor_drag_coefficient",
-    "rolling_moment_coefficient",
-)
-"""Multiply all of these by one factor and every motion stays the same."""
 ALIKE = 0.1
 """How closely the moves of a direction must agree with a common factor to be called one."""
 UNDETERMINED = 1.0
@@ -87,7 +78,7 @@ def weakest(
 
 def is_common_scale(moves: Mapping[str, float]) -> bool:
     """Return whether a direction multiplies masses and forces by one factor."""
-    group = [name for name in SCALE_GROUP if name in moves]
+    group = [name for name in scale_group() if name in moves]
     others = [abs(move) for name, move in moves.items() if name not in group]
     alike = [abs(moves[name] - 1.0) < ALIKE for name in group]
     return "mass" in group and all(alike) and max(others, default=0.0) < ALIKE

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import HABITS, Parameter, Space
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.space import Parameter, Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance
 from tuner.uncertainty.directions import Direction, weakest
@@ -183,8 +183,8 @@ def references(space: Space, vector: Array) -> Array:
 def _reference(parameter: Parameter, scaled: float) -> float:
     if parameter.scale == "log":
         return 1.0
-    habit = HABITS[parameter.name]
-    return max(abs(scaled), habit.sd if habit.scale == "linear" else 0.0) or 1.0
+    row = COEFFICIENTS[parameter.name]
+    return max(abs(scaled), row.prior_sd if row.scale == "linear" else 0.0) or 1.0
 
 
 def _limits(parameter: Parameter) -> tuple[float, float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tuner.uncertainty.directions import SCALE_GROUP, Direction
+from tuner.coefficients import scale_group
+from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
 from tuner.wording.phrases import listed, percent, quantity
 
@@ -80,7 +81,7 @@ def direction_in_words(direction: Direction) -> str:
         else f"is known to ±{percent(1.96 * direction.error)}"
     )
     if direction.common_scale:
-        group = listed([name for name in moves if name in SCALE_GROUP])
+        group = listed([name for name in moves if name in scale_group()])
         return (
             f"{group} scale together: multiplied by one factor, every motion stays the same; "
             f"that factor {known}. Weigh the mass and fix it."

@@ -4,6 +4,7 @@ from hypothesis import strategies as st
 
 from tuner.config import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
 from tuner.config.shipped import configs_folder
+from tuner.config.vehicle import Aerodynamics, Inertia, Motor, Setup
 from tuner.errors import ConfigError
 
 SHIPPED = sorted((configs_folder() / "vehicles").glob("*.yaml"))
@@ -153,9 +154,39 @@ def test_with_values_refuses_what_is_no_vehicle():
 
 
 def test_every_coefficient_has_a_place_of_its_own():
-    vehicle = with_values(read_vehicle(ORIGINAL), {"gyro_cutoff": 30.0})
+    vehicle = with_values(read_vehicle(ORIGINAL), {"gyro_cutoff": 30.0, "fuselage_drag": 0.01})
     assert set(values_of(vehicle)) == set(COEFFICIENTS)
     assert len({coefficient.place for coefficient in COEFFICIENTS.values()}) == len(COEFFICIENTS)
     for name, value in values_of(vehicle).items():
         if not name.startswith("inertia"):
             assert values_of(with_values(vehicle, {name: value + 1}))[name] == value + 1
+
+
+def test_every_number_of_a_vehicle_file_is_a_coefficient_or_known_not_to_be():
+    sections = {"inertia": Inertia, "motor": Motor, "aerodynamics": Aerodynamics, "setup": Setup}
+    places = {(name, key) for name, model in sections.items() for key in model.model_fields}
+    places |= {("", "mass")}
+    registered = {row.place for row in COEFFICIENTS.values() if not row.is_effect}
+    assert registered < places
+    assert places - registered == {
+        ("motor", "max_rotor_velocity"),
+        ("aerodynamics", "reaction_torque"),
+    }
+
+
+def test_effects_are_optional_numbers_under_names_of_the_registry(vehicle_text, tmp_path):
+    path = tmp_path / "v.yaml"
+    path.write_text(vehicle_text + "effects: {fuselage_drag: 0.02}\n")
+    vehicle = read_vehicle(path)
+    assert values_of(vehicle)["fuselage_drag"] == 0.02
+    write_vehicle(vehicle, path)
+    assert read_vehicle(path) == vehicle
+    (line,) = [line for line in path.read_text().splitlines() if "fuselage_drag" in line]
+    assert line.endswith("# N s²/m²")
+    write_vehicle(read_vehicle(ORIGINAL), path)
+    assert "effects" not in path.read_text()
+    path.write_text(vehicle_text + "effects: {fuselage_darg: 0.02}\n")
+    with pytest.raises(
+        ConfigError, match=r"'effects\.fuselage_darg'; did you mean 'fuselage_drag'"
+    ):
+        read_vehicle(path)

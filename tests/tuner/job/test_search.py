@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
-from tuner.coefficients import space_of
-from tuner.config import JobFile
+from tuner.coefficients.space import space_of
+from tuner.config import ControllerFile, JobFile
 from tuner.config.job import Search
 from tuner.job import search as module
 from tuner.job.findings import noticed, surer_than_steps, unmatched
@@ -29,7 +29,7 @@ def job_with(updated, **search):
     settings = SimpleNamespace(job=JobFile(free=FREE, search=Search(**search)))
     return SimpleNamespace(
         settings=settings,
-        space=space_of(updated, settings.job),
+        space=space_of(updated, ControllerFile(), settings.job),
         inlets=("reference", "reference"),
         fitted=("a", "b"),
     )

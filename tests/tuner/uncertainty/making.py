@@ -15,7 +15,7 @@ from sim_jax.crash import AIRBORNE
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
-from tuner.coefficients import space_of
+from tuner.coefficients.space import space_of
 from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
 from tuner.config.shipped import find_config
 from tuner.model import model_of, schedule_of
@@ -59,7 +59,7 @@ def references() -> ReferenceInlet:
 def problem(free: Sequence[str], *, job: Mapping[str, object] | None = None) -> Objective:
     """Return a fit of two noiseless flights; the truth is the space's initial vector."""
     vehicle, controller = vehicle_file(), controller_file()
-    space = space_of(vehicle, JobFile(free=tuple(free), **(job or {})))
+    space = space_of(vehicle, controller, JobFile(free=tuple(free), **(job or {})))
     model, schedule = model_of(vehicle, controller), schedule_of(controller)
     samples = round(SECONDS * PHYSICS)
     at_rest = Vec3(jnp.zeros(2), jnp.zeros(2), jnp.ones(2))

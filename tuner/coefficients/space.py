@@ -13,56 +13,9 @@ from jax import Array, nn
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from tuner.config import COEFFICIENTS, JobFile, VehicleFile, values_of
+from tuner.coefficients.registry import COEFFICIENTS
+from tuner.config import ControllerFile, JobFile, VehicleFile, initial_values
 from tuner.errors import ConfigError
-from tuner.model import LONGEST_ACTUATOR_LATENCY, LONGEST_ESTIMATE_LATENCY
-
-
-@dataclass(frozen=True)
-class Habit:
-    """How a coefficient is searched unless the job says otherwise.
-
-    Attributes
-    ----------
-    free
-        Whether it is fitted by default.
-    scale
-        ``log`` moves the logarithm, ``linear`` the number.
-    reach
-        Bounds: a factor either side of the start for ``log``, absolute limits for ``linear``.
-    sd
-        Of the weak default prior around the start: of the logarithm for ``log``, else in its unit.
-    unit_step
-        A step of one in the search's coordinate, in the scaled coordinate, mid-range.
-    """
-
-    free: bool
-    scale: Literal["log", "linear"]
-    reach: float | tuple[float, float]
-    sd: float
-    unit_step: float = 1.0
-
-
-HABITS: Mapping[str, Habit] = {
-    "mass": Habit(False, "log", 3.0, 0.3),
-    "inertia_xx": Habit(True, "log", 8.0, 0.5),
-    "inertia_yy": Habit(True, "log", 8.0, 0.5),
-    "inertia_zz": Habit(True, "log", 8.0, 0.5),
-    "input_scaling": Habit(True, "log", 4.0, 0.1),
-    "zero_position_armed": Habit(True, "log", 8.0, 0.5),
-    "input_offset": Habit(False, "linear", (-0.5, 0.5), 0.05, 0.1),
-    "quadratic": Habit(False, "linear", (-1000.0, 1000.0), 200.0, 100.0),
-    "time_constant_up": Habit(True, "log", 20.0, 0.7),
-    "time_constant_down": Habit(True, "log", 20.0, 0.7),
-    "motor_constant": Habit(True, "log", 8.0, 0.5),
-    "moment_constant": Habit(True, "log", 12.0, 0.7),
-    "rotor_drag_coefficient": Habit(True, "log", 40.0, 1.5),
-    "rolling_moment_coefficient": Habit(False, "log", 1000.0, 2.0),
-    "max_relative_airspeed": Habit(False, "log", 10.0, 1.0),
-    "estimate_latency": Habit(True, "linear", (0.0, LONGEST_ESTIMATE_LATENCY), 0.02, 0.01),
-    "actuator_latency": Habit(True, "linear", (0.0, LONGEST_ACTUATOR_LATENCY), 0.005, 0.01),
-    "gyro_cutoff": Habit(False, "log", 4.0, 0.5),
-}
 
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
@@ -87,7 +40,7 @@ class Parameter:
     prior_given
         Whether the user gave the prior, or it is the weak default that only steadies the search.
     unit_step
-        See `Habit`.
+        The change of the scaled coordinate that is one in the search's coordinate, mid-range.
     moved
         Set where the start lay on or outside a bound and was moved: the value that it had.
     """
@@ -178,6 +131,11 @@ class Space:
         return len(self.parameters)
 
     @property
+    def free(self) -> tuple[str, ...]:
+        """The coefficients that the search moves, tied ones too."""
+        return tuple(name for parameter in self.parameters for name in parameter.ratios)
+
+    @property
     def initial(self) -> NDArray[np.float64]:
         """The start as a search vector, shape (K,)."""
         return self.vector_of({p.name: p.initial for p in self.parameters})
@@ -219,17 +177,32 @@ class Space:
         return np.asarray(self.width * share * (1 - share) / self.stretch)
 
 
-def space_of(vehicle: VehicleFile, job: JobFile) -> Space:
+def space_of(vehicle: VehicleFile, controller: ControllerFile, job: JobFile) -> Space:
     """Return what a job fits.
+
+    Parameters
+    ----------
+    vehicle, controller
+        Where the coefficients start.
+    job
+        Which are free, between which bounds, with which priors and ties.
 
     Raises
     ------
     ConfigError
-        Nothing is free, bounds exclude or pin the start, or a tie names a fixed coefficient.
+        Nothing is free, bounds exclude or pin the start, a tie names a fixed coefficient, or a free
+        coefficient belongs to something that does not fly.
     """
-    values = values_of(vehicle)
-    values.setdefault("gyro_cutoff", 40.0)
     free = _free_names(job)
+    values = initial_values(vehicle, controller, free)
+    for name in free:
+        if name not in values:
+            section, key = COEFFICIENTS[name].place
+            raise ConfigError(
+                name,
+                "is free, but what it belongs to does not fly",
+                f"give {section}.{key} in the vehicle file, or fix it",
+            )
     groups: dict[str, tuple[str, ...]] = {name: (name,) for name in free}
     for group in job.ties:
         tied = [name for name in group if name in free]
@@ -250,7 +223,7 @@ def space_of(vehicle: VehicleFile, job: JobFile) -> Space:
 def _free_names(job: JobFile) -> tuple[str, ...]:
     if job.free is not None:
         return tuple(name for name in COEFFICIENTS if name in job.free)
-    free = tuple(name for name, habit in HABITS.items() if habit.free and name not in job.fixed)
+    free = tuple(n for n, row in COEFFICIENTS.items() if row.free and n not in job.fixed)
     if not free:
         raise ConfigError("fixed", "leaves no coefficient free", "free at least one")
     return free
@@ -258,32 +231,39 @@ def _free_names(job: JobFile) -> tuple[str, ...]:
 
 def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:
     name = names[0]
-    habit, said, start = HABITS[name], job.coefficients.get(name), values[name]
-    scale = said.scale if said is not None and said.scale is not None else habit.scale
-    lower, upper = _default_bounds(habit, start, name)
-    lower = said.lower if said is not None and said.lower is not None else lower
-    upper = said.upper if said is not None and said.upper is not None else upper
+    row, given, start = COEFFICIENTS[name], job.coefficients.get(name), values[name]
+    scale = given.scale if given is not None and given.scale is not None else row.scale
+    bounded = given is not None and given.lower is not None and given.upper is not None
+    if row.scale == "log" and start <= 0 and not (scale == "linear" and bounded):
+        raise ConfigError(
+            name, f"starts at {start:g}, which has no logarithm", "give bounds and scale: linear"
+        )
+    lower, upper = row.limits(start)
+    lower = given.lower if given is not None and given.lower is not None else lower
+    upper = given.upper if given is not None and given.upper is not None else upper
     if scale == "log" and lower <= 0:
         raise ConfigError(name, f"lower bound {lower:g} has no logarithm", "use scale: linear")
     if lower >= upper:
-        raise ConfigError(name, f"bounds {lower:g} to {upper:g} leave no room", "widen them")
+        raise ConfigError(
+            name, f"its lower bound {lower:g} is not below its upper bound {upper:g}", "widen them"
+        )
 
     def scaled(value: float) -> float:
         return float(np.log(value)) if scale == "log" else value
 
     moved, initial = None, start
-    room = OFF_BOUND * (scaled(upper) - scaled(lower))
-    inner = float(np.clip(scaled(max(start, 1e-300)), scaled(lower) + room, scaled(upper) - room))
+    margin = OFF_BOUND * (scaled(upper) - scaled(lower))
+    nearest = scaled(max(start, 1e-300))
+    inner = float(np.clip(nearest, scaled(lower) + margin, scaled(upper) - margin))
     if not lower * (1 + 1e-9) < start < upper * (1 - 1e-9):
         moved, initial = start, float(np.exp(inner)) if scale == "log" else inner
-    mean, sd, given = scaled(initial), habit.sd, False
-    if scale != habit.scale:
-        sd = habit.sd * (1.0 / abs(initial) if scale == "log" else abs(initial))
-    if said is not None and said.prior is not None:
-        mean = scaled(said.prior.mean)
-        sd = said.prior.sd / said.prior.mean if scale == "log" else said.prior.sd
-        given = True
-    unit = habit.unit_step if scale == habit.scale else (upper - lower) / 4
+    mean, sd, prior_given = scaled(initial), row.prior_sd, False
+    if scale != row.scale:
+        sd = row.prior_sd * (1.0 / abs(initial) if scale == "log" else abs(initial))
+    if given is not None and given.prior is not None:
+        mean = scaled(given.prior.mean)
+        sd = given.prior.sd / given.prior.mean if scale == "log" else given.prior.sd
+        prior_given = True
     return Parameter(
         name=name,
         ratios={other: values[other] / start if start else 1.0 for other in names},
@@ -293,17 +273,7 @@ def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile
         scale=scale,
         prior_mean=mean,
         prior_sd=sd,
-        prior_given=given,
-        unit_step=unit,
+        prior_given=prior_given,
+        unit_step=row.step if scale == row.scale else (upper - lower) / 4,
         moved=moved,
     )
-
-
-def _default_bounds(habit: Habit, start: float, name: str) -> tuple[float, float]:
-    if isinstance(habit.reach, tuple):
-        return habit.reach
-    if start <= 0:
-        raise ConfigError(
-            name, f"starts at {start:g}, which has no logarithm", "give bounds and scale: linear"
-        )
-    return (start / habit.reach, start * habit.reach)

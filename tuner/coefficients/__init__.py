@@ -1,0 +1,15 @@
+"""The coefficients of the model: the table that defines them and the space that a fit searches."""
+
+from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Written
+from tuner.coefficients.registry import COEFFICIENTS, REGISTRY, of_scope, scale_group
+
+__all__ = [
+    "COEFFICIENTS",
+    "EFFECTS",
+    "REGISTRY",
+    "Coefficient",
+    "NotCarried",
+    "Written",
+    "of_scope",
+    "scale_group",
+]

@@ -1,0 +1,457 @@
+"""Every coefficient of the model, one row each: all that the rest of the program knows of it.
+
+To add a coefficient, add its row and use it in a term of `sim_jax`; the vehicle file, the search,
+the verdicts, the report, the exports and the documentation follow from the row. "Thesis" is M. te
+Braake, "Improving the PX4 software-in-the-loop multirotor UAV simulator accuracy"; Table 10.1
+there lists the values of the coefficients of Gazebo's motor model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Scope, Written
+
+_OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
+_FROM_SPEEDS = Written("CA_ROTOR*_CT, SIH_T_MAX, SIM_GZ_EC_*")
+
+_ROWS = (
+    # mass and inertia
+    Coefficient(
+        name="mass",
+        unit="kg",
+        meaning="take-off mass",
+        source="SDF <mass>; weighed",
+        place=("", "mass"),
+        bounds=3.0,
+        prior_sd=0.3,
+        mass_exponent=1,
+        hold_rank=0,
+        exported_as={"sdf": Written("mass", "inertial"), "px4": Written("SIH_MASS")},
+        informed_by="weighing",
+    ),
+    Coefficient(
+        name="inertia_xx",
+        unit="kg m²",
+        meaning="moment of inertia about forward",
+        source="SDF <ixx>",
+        place=("inertia", "xx"),
+        bounds=8.0,
+        prior_sd=0.5,
+        free=True,
+        mass_exponent=1,
+        exported_as={"sdf": Written("ixx", "inertia"), "px4": Written("SIH_IXX")},
+        informed_by="roll",
+    ),
+    Coefficient(
+        name="inertia_yy",
+        unit="kg m²",
+        meaning="moment of inertia about left",
+        source="SDF <iyy>",
+        place=("inertia", "yy"),
+        bounds=8.0,
+        prior_sd=0.5,
+        free=True,
+        mass_exponent=1,
+        exported_as={"sdf": Written("iyy", "inertia"), "px4": Written("SIH_IYY")},
+        informed_by="pitch",
+    ),
+    Coefficient(
+        name="inertia_zz",
+        unit="kg m²",
+        meaning="moment of inertia about up",
+        source="SDF <izz>",
+        place=("inertia", "zz"),
+        bounds=8.0,
+        prior_sd=0.5,
+        free=True,
+        mass_exponent=1,
+        exported_as={"sdf": Written("izz", "inertia"), "px4": Written("SIH_IZZ")},
+        informed_by="yaw",
+    ),
+    # from command to rotor speed
+    Coefficient(
+        name="input_scaling",
+        unit="rad/s",
+        meaning="rotor speed gained from no command to full",
+        source="thesis Eq. 4.2; SDF <input_scaling>",
+        place=("motor", "input_scaling"),
+        bounds=4.0,
+        prior_sd=0.1,
+        free=True,
+        hold_rank=1,
+        exported_as={"sdf": Written("input_scaling", "channel"), "px4": _FROM_SPEEDS},
+        informed_by="thrust curve",
+    ),
+    Coefficient(
+        name="zero_position_armed",
+        unit="rad/s",
+        meaning="rotor speed at zero command",
+        source="thesis Eq. 4.2; SDF <zero_position_armed>",
+        place=("motor", "zero_position_armed"),
+        bounds=8.0,
+        prior_sd=0.5,
+        free=True,
+        hold_rank=2,
+        exported_as={"sdf": Written("zero_position_armed", "channel"), "px4": _FROM_SPEEDS},
+        informed_by="thrust curve",
+    ),
+    Coefficient(
+        name="input_offset",
+        unit="",
+        meaning="added to the command",
+        source="thesis Eq. 4.2; SDF <input_offset>",
+        place=("motor", "input_offset"),
+        scale="linear",
+        bounds=(-0.5, 0.5),
+        prior_sd=0.05,
+        step=0.1,
+        neutral=0.0,
+        exported_as={"sdf": Written("input_offset", "channel"), "px4": _FROM_SPEEDS},
+    ),
+    Coefficient(
+        name="quadratic",
+        unit="rad/s",
+        meaning="rotor speed per squared unit of command",
+        source="thesis 4.4.1, polynomial RPM curves",
+        place=("motor", "quadratic"),
+        scale="linear",
+        bounds=(-1000.0, 1000.0),
+        prior_sd=200.0,
+        step=100.0,
+        neutral=0.0,
+        exported_as={
+            "sdf": NotCarried("the control channels map commands to speeds by a line", 0.0),
+            "px4": _FROM_SPEEDS,
+        },
+    ),
+    Coefficient(
+        name="time_constant_up",
+        unit="s",
+        meaning="lag of a rotor that speeds up",
+        source="thesis Eq. 5.3; SDF <timeConstantUp>",
+        place=("motor", "time_constant_up"),
+        bounds=20.0,
+        prior_sd=0.7,
+        free=True,
+        exported_as={"sdf": Written("timeConstantUp", "motor"), "px4": Written("SIH_T_TAU")},
+        informed_by="rotor lag",
+        plausible=(0.001, 1.0),
+    ),
+    Coefficient(
+        name="time_constant_down",
+        unit="s",
+        meaning="lag of a rotor that slows down",
+        source="thesis Eq. 5.3; SDF <timeConstantDown>",
+        place=("motor", "time_constant_down"),
+        bounds=20.0,
+        prior_sd=0.7,
+        free=True,
+        exported_as={"sdf": Written("timeConstantDown", "motor"), "px4": Written("SIH_T_TAU")},
+        informed_by="rotor lag",
+        plausible=(0.001, 1.0),
+    ),
+    # from rotor speed and air velocity to force and moment
+    Coefficient(
+        name="motor_constant",
+        unit="N s²/rad²",
+        meaning="thrust per squared rotor speed",
+        source="thesis Eq. 6.5; SDF <motorConstant>",
+        place=("aerodynamics", "motor_constant"),
+        bounds=8.0,
+        prior_sd=0.5,
+        free=True,
+        mass_exponent=1,
+        exported_as={
+            "sdf": Written("motorConstant", "motor"),
+            "px4": Written("CA_ROTOR*_CT, SIH_T_MAX, MPC_THR_HOVER"),
+        },
+        informed_by="thrust",
+    ),
+    Coefficient(
+        name="moment_constant",
+        unit="m",
+        meaning="drag torque per thrust",
+        source="thesis Eq. 7.2; SDF <momentConstant>",
+        place=("aerodynamics", "moment_constant"),
+        bounds=12.0,
+        prior_sd=0.7,
+        free=True,
+        exported_as={
+            "sdf": Written("momentConstant", "motor"),
+            "px4": Written("CA_ROTOR*_KM, SIH_Q_MAX"),
+        },
+        informed_by="yaw",
+        plausible=(0.001, 0.5),
+    ),
+    Coefficient(
+        name="rotor_drag_coefficient",
+        unit="N s²/(rad m)",
+        meaning="drag in the rotor plane per rotor speed and air velocity",
+        source="thesis Eq. 8.2; SDF <rotorDragCoefficient>",
+        place=("aerodynamics", "rotor_drag_coefficient"),
+        bounds=40.0,
+        prior_sd=1.5,
+        free=True,
+        mass_exponent=1,
+        exported_as={"sdf": Written("rotorDragCoefficient", "motor"), "px4": Written("SIH_KDV")},
+        informed_by="speed",
+    ),
+    Coefficient(
+        name="rolling_moment_coefficient",
+        unit="N s²/rad",
+        meaning="moment in the rotor plane per rotor speed and air velocity",
+        source="thesis Eq. 9.2; SDF <rollingMomentCoefficient>",
+        place=("aerodynamics", "rolling_moment_coefficient"),
+        bounds=1000.0,
+        prior_sd=2.0,
+        mass_exponent=1,
+        exported_as={
+            "sdf": Written("rollingMomentCoefficient", "motor"),
+            "px4": NotCarried("the SIH model has no rolling moment"),
+        },
+        informed_by="nothing",
+    ),
+    Coefficient(
+        name="max_relative_airspeed",
+        unit="m/s",
+        meaning="axial airspeed at which thrust vanishes",
+        source="thesis Eq. 6.6; 25 m/s in gazebo_motor_model.cpp",
+        place=("aerodynamics", "max_relative_airspeed"),
+        bounds=10.0,
+        prior_sd=1.0,
+        exported_as={
+            "sdf": NotCarried("the motor plugins have 25 m/s built in", 25.0),
+            "px4": NotCarried("the SIH model's thrust does not depend on the airspeed"),
+        },
+        informed_by="climb",
+    ),
+    # terms beyond Gazebo's motor model
+    Coefficient(
+        name="fuselage_drag",
+        unit="N s²/m²",
+        meaning="drag of the body per squared air velocity, opposite to it",
+        source="quadratic drag of a bluff body, F = -d‖v‖v",
+        place=(EFFECTS, "fuselage_drag"),
+        scale="linear",
+        bounds=(-0.5, 0.5),
+        prior_sd=0.05,
+        step=0.02,
+        mass_exponent=1,
+        neutral=0.0,
+        exported_as={
+            "sdf": NotCarried("the motor plugins know no drag of the body", 0.0),
+            "px4": NotCarried("the SIH model's drag is linear in the velocity"),
+        },
+        informed_by="speed",
+    ),
+    # what the set-up adds
+    Coefficient(
+        name="estimate_latency",
+        unit="s",
+        meaning="age of the state that the controllers see",
+        source="motion capture, network and estimator of the laboratory",
+        scope="setup",
+        place=("setup", "estimate_latency"),
+        scale="linear",
+        bounds=(0.0, 0.1),
+        prior_sd=0.02,
+        step=0.01,
+        free=True,
+        neutral=0.0,
+        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        informed_by="closed loop",
+    ),
+    Coefficient(
+        name="actuator_latency",
+        unit="s",
+        meaning="from a motor command to its effect",
+        source="output driver and speed controller",
+        scope="setup",
+        place=("setup", "actuator_latency"),
+        scale="linear",
+        bounds=(0.0, 0.04),
+        prior_sd=0.005,
+        step=0.01,
+        free=True,
+        hold_rank=3,
+        neutral=0.0,
+        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        informed_by="commands and rotor speed",
+    ),
+    Coefficient(
+        name="gyro_cutoff",
+        unit="Hz",
+        meaning="low-pass filter of the gyro",
+        source="PX4 IMU_GYRO_CUTOFF",
+        scope="setup",
+        place=("setup", "gyro_cutoff"),
+        bounds=4.0,
+        prior_sd=0.5,
+        fallback=("filters", "gyro_cutoff"),
+        leaf=("controller", "filters", "gyro_cutoff"),
+        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+    ),
+    # what a recording may get wrong by a constant
+    Coefficient(
+        name="pose",
+        unit="s",
+        meaning="lateness of the clock that stamps the motion capture's poses",
+        source="clocks of the recording",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+    ),
+    Coefficient(
+        name="flight_controller",
+        unit="s",
+        meaning="lateness of the clock that stamps what the flight controller publishes",
+        source="clocks of the recording",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+    ),
+    Coefficient(
+        name="gyro_x",
+        unit="rad/s",
+        meaning="bias of the recorded body rate about forward",
+        source="gyro bias",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+    ),
+    Coefficient(
+        name="gyro_y",
+        unit="rad/s",
+        meaning="bias of the recorded body rate about left",
+        source="gyro bias",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+    ),
+    Coefficient(
+        name="gyro_z",
+        unit="rad/s",
+        meaning="bias of the recorded body rate about up",
+        source="gyro bias",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+    ),
+    # by how much the start of a window differs from the recorded state
+    Coefficient(
+        name="position",
+        unit="m",
+        meaning="position at the start of a window, from the smoothed recording's",
+        source="smoothing error of the motion capture",
+        scope="window",
+        scale="linear",
+        prior_sd=0.01,
+        neutral=0.0,
+        count=3,
+    ),
+    Coefficient(
+        name="velocity",
+        unit="m/s",
+        meaning="velocity at the start of a window, from the smoothed recording's",
+        source="smoothing error of the motion capture",
+        scope="window",
+        scale="linear",
+        prior_sd=0.1,
+        neutral=0.0,
+        count=3,
+    ),
+    Coefficient(
+        name="attitude",
+        unit="rad",
+        meaning="attitude at the start of a window about the body's axes, from the recording's",
+        source="smoothing error of the motion capture",
+        scope="window",
+        scale="linear",
+        prior_sd=0.03,
+        neutral=0.0,
+        count=3,
+    ),
+    Coefficient(
+        name="body_rate",
+        unit="rad/s",
+        meaning="body rate at the start of a window, from the smoothed recording's",
+        source="smoothing error of the gyro",
+        scope="window",
+        scale="linear",
+        prior_sd=0.3,
+        neutral=0.0,
+        count=3,
+    ),
+    Coefficient(
+        name="rotor_speed",
+        unit="",
+        meaning="share by which a rotor turns faster at the start of a window than recorded",
+        source="smoothing error of the tachometer, or of the command's lag",
+        scope="window",
+        scale="linear",
+        prior_sd=0.05,
+        neutral=0.0,
+        count=4,
+    ),
+    Coefficient(
+        name="rate_integral",
+        unit="",
+        meaning="output of the rate controller's integrator at the start of a window",
+        source="no recording holds it",
+        scope="window",
+        scale="linear",
+        prior_sd=0.05,
+        neutral=0.0,
+        count=3,
+    ),
+    Coefficient(
+        name="trim",
+        unit="",
+        meaning="steady difference between commanded and acting torque during a window",
+        source="uneven rotors and an offset mass; the integrator takes it in closed loop",
+        scope="window",
+        scale="linear",
+        prior_sd=0.02,
+        neutral=0.0,
+        count=3,
+    ),
+)
+
+REGISTRY: dict[str, Coefficient] = {row.name: row for row in _ROWS}
+"""Name -> row, in the order in which tables list them."""
+
+
+class _OfVehicleFile(Mapping[str, Coefficient]):
+    """The registry's rows with a place in the vehicle file, as the registry stands now."""
+
+    def __getitem__(self, name: str) -> Coefficient:
+        row = REGISTRY[name]
+        if not row.place[1]:
+            raise KeyError(name)
+        return row
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name, row in REGISTRY.items() if row.place[1])
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+COEFFICIENTS: Mapping[str, Coefficient] = _OfVehicleFile()
+"""Name -> row of every coefficient that a vehicle file can hold and a job can free."""
+
+
+def of_scope(scope: Scope) -> dict[str, Coefficient]:
+    """Return name -> row of the coefficients of which each flight, window, ... has one."""
+    return {name: row for name, row in REGISTRY.items() if row.scope == scope}
+
+
+def scale_group() -> tuple[str, ...]:
+    """Return the coefficients that go with the mass: by one common factor, every motion stays."""
+    return tuple(name for name, row in COEFFICIENTS.items() if row.mass_exponent == 1)
