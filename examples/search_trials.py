@@ -33,7 +33,7 @@ from tuner.job.results import validate, vehicle_fitted  # noqa: E402
 from tuner.job.search import search  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.search.fitted import Fitted  # noqa: E402
-from tuner.uncertainty.estimates import uncertainty  # noqa: E402
+from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
 from tuner.wording.verdicts import direction_in_words, verdict_in_words  # noqa: E402
 
 FOLDER = Path(__file__).parents[1] / "reference_flights"
@@ -121,7 +121,7 @@ def mass() -> str:
     start = settings.vehicle.replace(mass=1.1 * settings.vehicle.mass)
     settings = replace(settings, vehicle=start, job=settings.job.model_copy(update={"free": free}))
     _, fitted, _ = solved(settings)
-    found = uncertainty(fitted)
+    found = uncertainty_of(fitted)
     verdict = verdict_in_words(found.estimates["mass"].verdict)
     return f"{verdict}: {direction_in_words(found.directions[0])}"
 

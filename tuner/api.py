@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tuner.comparison.table import Table
     from tuner.export.export import Exported, Format
     from tuner.export.sdf.snippet import Simulator
-    from tuner.job.examination import Examined
+    from tuner.job.sensitivity import SensitivityResult
     from tuner.simulation.simulate import Simulation
 
 Named = str | Path
@@ -192,7 +192,7 @@ def sensitivity(
     span: float = 30.0,
     profile: Sequence[str] | None = None,
     out: Named | None = None,
-) -> Examined:
+) -> SensitivityResult:
     """Tell what recordings say of each coefficient of a vehicle; what ``tune sensitivity`` does.
 
     Parameters
@@ -219,7 +219,7 @@ def sensitivity(
 
     Returns
     -------
-    Examined
+    SensitivityResult
         ``knowledge.coefficients`` has each coefficient's verdict, interval and origin,
         ``knowledge.outputs`` what it does to each signal, ``proposals`` what to fly next, and
         ``folder`` the tables and the report.
@@ -230,8 +230,8 @@ def sensitivity(
         The input cannot be used; one line says what to do.
     """
     configure()
-    from tuner.job.examination import Request, examine_vehicle  # noqa: PLC0415 (jax)
     from tuner.job.run import folder_for  # noqa: PLC0415
+    from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
     options = Options(
         flights=[str(path) for path in flights],
@@ -246,7 +246,7 @@ def sensitivity(
     )
     return examine_vehicle(
         options,
-        Request(
+        SensitivityRequest(
             arena=arena,
             whole_range=global_method,
             samples=samples,

@@ -16,8 +16,8 @@ from tuner.cli.tables import console
 if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.job.cross_validation import Fold
-    from tuner.job.examination import Examined
     from tuner.job.run import Listener
+    from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -74,7 +74,7 @@ def print_run(folder: Path, result: RunResult) -> None:
     )
 
 
-def print_examined(found: Examined) -> None:
+def print_examined(found: SensitivityResult) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
     from tuner.wording.verdicts import direction_in_words, judgement_in_words
 
@@ -100,7 +100,7 @@ def print_examined(found: Examined) -> None:
     screen.print(f"written to {found.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")
 
 
-def _moves(found: Examined, name: str) -> str:
+def _moves(found: SensitivityResult, name: str) -> str:
     """Return the largest RMS change of a position axis, and where."""
     changes = [
         (output.change[name], output.axis, output.flight)

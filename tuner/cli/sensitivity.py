@@ -71,8 +71,8 @@ def sensitivity(
 
     configure()
     from tuner.config import Options
-    from tuner.job.examination import Request, examine_vehicle
     from tuner.job.run import folder_for
+    from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
 
     options = Options(
         flights,
@@ -85,7 +85,7 @@ def sensitivity(
         fit=fit,
         fix=fix,
     )
-    request = Request(
+    request = SensitivityRequest(
         arena=None if arena is None else lengths("--arena", arena),
         whole_range=global_method,
         samples=samples,

@@ -1,180 +1,173 @@
-"""What was found about every coefficient, as ``sensitivity.json`` holds it."""
+"""An examination as the plain data that is written, tabulated and plotted."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.files import Part, read_optional, write_text
-from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.verdict import Reason, Verdict
+from tuner.coefficients.space import Space
+from tuner.config import COEFFICIENTS
+from tuner.examination.examination import Examination
+from tuner.examination.sensitivity_json import (
+    CoefficientKnowledge,
+    EffectOverTime,
+    Knowledge,
+    OutputSensitivity,
+    ResidualWhiteness,
+    numbers,
+)
+from tuner.objective.criterion import Point
+from tuner.uncertainty.estimates import Uncertainty
 
-SCHEMA_VERSION = 2
-KNOWLEDGE_FILE = "sensitivity.json"
-
-Number = float | None
-"""None stands for what cannot be told: a simulation that crashed, an interval without end."""
+Array = NDArray[np.float64]
 
 
-class Known(Part):
-    """One coefficient.
+def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowledge:
+    """Return what an examination of a fit found.
 
-    Attributes
+    Parameters
     ----------
-    unit
-        Of everything said about it.
-    fitted
-        Whether it was fitted; of a fixed one is said what would be known, were it fitted too.
-    value, std_error, ci95
-        See `tuner.uncertainty.estimates.Estimate`.
-    verdict, reason
-        How well it is known, and why.
-    step
-        One hundred percent: its value, or its usual uncertainty where that is larger.
-    shares
-        Channel -> flight -> share of what is known of it that came from there.
-    prior_share
-        The rest: from the priors.
-    bias
-        Of a fixed one: fitted coefficient -> percent by which that is wrong for each percent by
-        which this one is.
+    examination
+        What was found.
+    space, point
+        The fit's own coefficients and where it ended.
     """
-
-    unit: str
-    fitted: bool
-    value: float
-    std_error: Number
-    ci95: tuple[Number, Number]
-    verdict: Verdict
-    reason: Reason
-    step: float
-    shares: dict[str, dict[str, float]]
-    prior_share: float
-    bias: dict[str, float]
-
-
-class OutputChange(Part):
-    """What the coefficients do to one recorded signal: an axis of a channel of a flight.
-
-    Attributes
-    ----------
-    flight, channel, axis, unit
-        Which signal.
-    rmse
-        Simulated minus recorded, in ``unit`` as everything here.
-    change
-        Coefficient -> RMS change for +1 %.
-    rmse_up, rmse_down
-        Coefficient -> RMSE for +10 % and −10 %; None where the simulation crashed.
-    """
-
-    flight: str
-    channel: str
-    axis: str
-    unit: str
-    rmse: float
-    change: dict[str, float]
-    rmse_up: dict[str, Number]
-    rmse_down: dict[str, Number]
+    found = examination.uncertainty
+    worth = _worth(space, point)
+    count = len(found.names)
+    information = examination.information.data[:count, :count]
+    return Knowledge(
+        coefficients=_coefficients(examination, space),
+        flights=list(found.flights),
+        channels=list(found.channels),
+        outputs=_outputs(examination),
+        acting=_acting(examination),
+        residuals=[
+            ResidualWhiteness(
+                flight=one.flight,
+                channel=one.channel,
+                rms=one.rms,
+                spacing=float(one.lag[1]),
+                autocorrelation=one.autocorrelation.round(4).tolist(),
+                limit=one.limit,
+                memory=one.memory,
+                white=one.white,
+            )
+            for one in examination.residuals
+        ],
+        directions=list(found.directions),
+        names=list(found.names),
+        correlation=found.correlation.tolist(),
+        covariance=(found.covariance.matrix * np.outer(worth, worth)).tolist(),
+        information=(information / np.outer(worth, worth)).tolist(),
+    )
 
 
-class Acting(Part):
-    """When coefficients act during one flight.
-
-    Attributes
-    ----------
-    flight
-        Its name.
-    windowed
-        Whether time counts from the start of each window of the flight, not from the mission's.
-    time
-        s, middles of equal stretches.
-    change
-        Coefficient -> RMS change of all channels for +1 % in each stretch, in standard deviations.
-    span
-        Coefficient -> s from and to which half of its effect is felt; the shortest such stretch.
-    """
-
-    flight: str
-    windowed: bool = False
-    time: list[float]
-    change: dict[str, list[float]]
-    span: dict[str, tuple[float, float]]
+def _worth(space: Space, point: Point) -> Array:
+    """Return (K,) units of each parameter in one of its scaled coordinate."""
+    scaled = np.asarray(space.scaled(jnp.asarray(point.coefficients)))
+    return np.array(
+        [
+            space.from_scaled(i, x) if parameter.scale == "log" else 1.0
+            for i, (parameter, x) in enumerate(zip(space.parameters, scaled, strict=True))
+        ]
+    )
 
 
-class ResidualColour(Part):
-    """Whether residuals are white noise, see `tuner.uncertainty.whiteness.Residual`."""
-
-    flight: str
-    channel: str
-    rms: float
-    spacing: float
-    autocorrelation: list[float]
-    limit: float
-    memory: float
-    white: bool
-
-
-class Knowledge(Part):
-    """The content of ``sensitivity.json``.
-
-    Attributes
-    ----------
-    coefficients
-        Name -> what is known; the fitted ones first.
-    flights, channels
-        Names.
-    outputs, acting, residuals
-        Of every recorded signal, of every flight, of every channel of a flight.
-    directions
-        The worst-determined combinations of the fitted coefficients, worst first.
-    names
-        The rows of the matrices: the fitted parameters; of a tie, the first of the group.
-    correlation
-        Of their estimates.
-    covariance, information
-        Of their estimates, flights and priors together, and what the flights alone say; in the
-        coefficients' units.
-    """
-
-    schema_version: int = SCHEMA_VERSION
-    coefficients: dict[str, Known]
-    flights: list[str]
-    channels: list[str]
-    outputs: list[OutputChange]
-    acting: list[Acting]
-    residuals: list[ResidualColour]
-    directions: list[Direction]
-    names: list[str]
-    correlation: list[list[float]]
-    covariance: list[list[float]]
-    information: list[list[float]]
+def _coefficients(examination: Examination, space: Space) -> dict[str, CoefficientKnowledge]:
+    found = examination.uncertainty
+    steps = dict(zip(examination.sensitivity.names, examination.sensitivity.step, strict=True))
+    known = {}
+    for index, parameter in enumerate(space.parameters):
+        for name, ratio in parameter.ratios.items():
+            step = float(steps[parameter.name] * abs(ratio))
+            known[name] = _known(name, found, index, step, fitted=True, bias={})
+    for row, (name, freed) in enumerate(examination.freed.items()):
+        bias = dict(zip(found.names, examination.bias[row].tolist(), strict=True))
+        known[name] = _known(
+            name, freed, len(freed.names) - 1, float(steps[name]), fitted=False, bias=bias
+        )
+    return known
 
 
-def numbers(values: NDArray[np.float64]) -> list[Number]:
-    """Return a row with None for what is not finite."""
-    return [float(value) if np.isfinite(value) else None for value in values]
+def _known(
+    name: str,
+    found: Uncertainty,
+    index: int,
+    step: float,
+    *,
+    fitted: bool,
+    bias: Mapping[str, float],
+) -> CoefficientKnowledge:
+    estimate = found.estimates[name]
+    error, low, high = numbers(np.array([estimate.std_error, *estimate.ci95]))
+    return CoefficientKnowledge(
+        unit=COEFFICIENTS[name].unit,
+        fitted=fitted,
+        value=estimate.value,
+        std_error=error,
+        ci95=(low, high),
+        verdict=estimate.verdict,
+        reason=estimate.reason,
+        step=step,
+        shares={
+            channel: dict(zip(found.flights, row[:, index].tolist(), strict=True))
+            for channel, row in zip(found.channels, found.shares, strict=True)
+        },
+        prior_share=float(found.prior_share[index]),
+        bias=dict(bias),
+    )
 
 
-def write_knowledge(knowledge: Knowledge, folder: Path) -> None:
-    """Write ``sensitivity.json``; it appears whole.
+def _outputs(examination: Examination) -> list[OutputSensitivity]:
+    sensitivity = examination.sensitivity
+    names = sensitivity.names
+    return [
+        OutputSensitivity(
+            flight=output.flight,
+            channel=output.channel,
+            axis=output.axis,
+            unit=output.unit,
+            rmse=output.rmse,
+            change=dict(zip(names, sensitivity.change[:, row].tolist(), strict=True)),
+            rmse_up=dict(zip(names, numbers(sensitivity.rmse_up[:, row]), strict=True)),
+            rmse_down=dict(zip(names, numbers(sensitivity.rmse_down[:, row]), strict=True)),
+        )
+        for row, output in enumerate(sensitivity.outputs)
+    ]
 
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written to.
-    """
-    write_text(folder / KNOWLEDGE_FILE, knowledge.model_dump_json() + "\n")
+
+def _acting(examination: Examination) -> list[EffectOverTime]:
+    sensitivity = examination.sensitivity
+    return [
+        EffectOverTime(
+            flight=flight,
+            windowed=sensitivity.windowed,
+            time=sensitivity.time[row].round(3).tolist(),
+            change={
+                name: sensitivity.acts[index, row].tolist()
+                for index, name in enumerate(sensitivity.names)
+            },
+            span={
+                name: shortest_half(sensitivity.time[row], sensitivity.acts[index, row])
+                for index, name in enumerate(sensitivity.names)
+            },
+        )
+        for row, flight in enumerate(sensitivity.flights)
+    ]
 
 
-def read_knowledge(folder: Path) -> Knowledge | None:
-    """Read ``sensitivity.json`` of a folder; None where there is none.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or is of another schema version.
-    """
-    return read_optional(Knowledge, folder / KNOWLEDGE_FILE, version=SCHEMA_VERSION)
+def shortest_half(time: Sequence[float] | Array, acts: Array) -> tuple[float, float]:
+    """Return the shortest stretch, from and to in s, with half of the squared effect."""
+    middles = np.asarray(time)
+    width = float(middles[1] - middles[0])
+    cumulative = np.concatenate([[0.0], np.cumsum(np.square(acts))])
+    if cumulative[-1] <= 0.0:
+        return 0.0, float(middles[-1] + width / 2)
+    ends = np.searchsorted(cumulative, cumulative[:-1] + cumulative[-1] / 2)
+    lengths = np.where(ends < len(cumulative), ends - np.arange(len(acts)), len(cumulative))
+    first = int(np.argmin(lengths))
+    return round(first * width, 3), round(int(ends[first]) * width, 3)

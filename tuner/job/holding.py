@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.examination.examine import Examination, examine
+from tuner.examination.examination import Examination, examine
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets

@@ -95,7 +95,6 @@ def run(
     from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
-    from tuner.job.examination import write_examination  # noqa: PLC0415
     from tuner.job.findings import surer_than_steps  # noqa: PLC0415
     from tuner.job.holding import with_undetermined_held  # noqa: PLC0415
     from tuner.job.prepare import prepare  # noqa: PLC0415
@@ -106,6 +105,7 @@ def run(
         write_folder,
     )
     from tuner.job.search import search  # noqa: PLC0415
+    from tuner.job.sensitivity import write_examination  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
     from tuner.report.background import BackgroundDrawing  # noqa: PLC0415
 

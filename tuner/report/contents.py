@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.design.proposals import Proposals, read_proposals
+from tuner.design.next_flight_json import Proposals, read_proposals
 from tuner.errors import InputError
-from tuner.examination.knowledge import Knowledge, read_knowledge
+from tuner.examination.sensitivity_json import Knowledge, read_knowledge
 from tuner.flights.flight import Array
 from tuner.report.record import (
     About,
@@ -21,8 +21,8 @@ from tuner.report.record import (
 )
 from tuner.report.traces import read_traces
 from tuner.result import RESULT_FILE, Run, read_run
-from tuner.sensitivity.global_files import GlobalIndices, read_global
-from tuner.uncertainty.profile_files import Profiles, read_profiles
+from tuner.sensitivity.global_sensitivity_json import GlobalSensitivity, read_global
+from tuner.uncertainty.profiles_json import Profiles, read_profiles
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Contents:
     run: Run | None
     knowledge: Knowledge | None
     proposals: Proposals | None
-    whole_range: GlobalIndices | None
+    whole_range: GlobalSensitivity | None
     profiles: Profiles | None
     search: SearchRecord | None
     laps: LapTable | None

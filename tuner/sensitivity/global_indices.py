@@ -19,7 +19,7 @@ from tuner.coefficients.space import Space
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.sensitivity.global_files import GlobalIndices, Index, Method
+from tuner.sensitivity.global_sensitivity_json import GlobalSensitivity, Method, SensitivityIndex
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ SAMPLES = {"morris": 16, "sobol": 64}
 """Trajectories, or base points; a coefficient more costs so many simulations more."""
 
 
-def whole_range(
+def global_sensitivity(
     objective: Objective,
     point: Point,
     criterion: Criterion,
@@ -41,7 +41,7 @@ def whole_range(
     bounds: Mapping[str, tuple[float, float]],
     samples: int | None = None,
     seed: int = 0,
-) -> GlobalIndices:
+) -> GlobalSensitivity:
     """Return each coefficient's index for every channel of every flight and over all.
 
     Parameters
@@ -74,7 +74,7 @@ def whole_range(
     found = []
     for (flight, channel), column in zip(outputs, values.T, strict=True):
         found += _indices(problem, method, places, column, seed, flight=flight, channel=channel)
-    return GlobalIndices(
+    return GlobalSensitivity(
         method=method,
         bounds={name: bounds[name] for name in space.names},
         simulations=len(places),
@@ -140,7 +140,7 @@ def _indices(
     *,
     flight: str,
     channel: str,
-) -> list[Index]:
+) -> list[SensitivityIndex]:
     if np.ptp(values) == 0.0:
         nothing = np.zeros(len(problem["names"]))
         main, total, spread = nothing, nothing, nothing
@@ -158,7 +158,7 @@ def _indices(
             found = sobol.analyze(problem, values, calc_second_order=False, seed=seed + 1)
         main, total, spread = found["S1"], found["ST"], found["ST_conf"]
     return [
-        Index(
+        SensitivityIndex(
             coefficient=name,
             flight=flight,
             channel=channel,

@@ -54,7 +54,7 @@ class Output:
 
 
 @dataclass(frozen=True)
-class Sensitivity:
+class LocalSensitivity:
     """What K coefficients do to R outputs of F flights.
 
     Attributes
@@ -95,14 +95,14 @@ class Sensitivity:
     acts: Array
 
     @staticmethod
-    def joined(parts: Sequence[Sensitivity]) -> Sensitivity:
+    def joined(parts: Sequence[LocalSensitivity]) -> LocalSensitivity:
         """Return the sensitivity of flights of which each part holds the next ones."""
         first = parts[0]
 
         def beside(name: str, axis: int = -1) -> Array:
             return np.concatenate([getattr(part, name) for part in parts], axis=axis)
 
-        return Sensitivity(
+        return LocalSensitivity(
             names=first.names,
             outputs=tuple(output for part in parts for output in part.outputs),
             step=first.step,
@@ -117,7 +117,7 @@ class Sensitivity:
         )
 
 
-def sensitivity(
+def local_sensitivity(
     objective: Objective,
     point: Point,
     criterion: Criterion,
@@ -125,7 +125,7 @@ def sensitivity(
     *,
     reference: Array,
     flights: Sequence[str],
-) -> Sensitivity:
+) -> LocalSensitivity:
     """Return what each coefficient does around a point.
 
     Parameters
@@ -163,7 +163,7 @@ def sensitivity(
     rmse = np.where(failed, np.nan, rmse)
     count = len(space)
     time, acts = _when(objective, jacobian, criterion, moved, sigmas)
-    return Sensitivity(
+    return LocalSensitivity(
         names=space.names,
         outputs=tuple(
             Output(

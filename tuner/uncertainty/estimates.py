@@ -15,7 +15,7 @@ from tuner.coefficients.space import Parameter, Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance
 from tuner.uncertainty.directions import Direction, weakest
-from tuner.uncertainty.information import FisherInformation, gather
+from tuner.uncertainty.information import FisherInformation, information_at
 from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judge
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ class Uncertainty:
     directions: tuple[Direction, ...]
 
 
-def uncertainty(
+def uncertainty_of(
     fitted: Fitted,
     *,
     flights: Sequence[str] | None = None,
@@ -106,12 +106,13 @@ def uncertainty(
     clocks
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
-    information = gather(fitted.objective, fitted.point, fitted.criterion, clocks=clocks)
+    information = information_at(fitted.objective, fitted.point, fitted.criterion, clocks=clocks)
     names = tuple(fitted.scales) if flights is None else tuple(flights)
-    return judged(fitted.objective.space, np.asarray(fitted.point.coefficients), information, names)
+    vector = np.asarray(fitted.point.coefficients)
+    return uncertainty_at(fitted.objective.space, vector, information, names)
 
 
-def judged(
+def uncertainty_at(
     space: Space, vector: Array, information: FisherInformation, flights: Sequence[str]
 ) -> Uncertainty:
     """Return what the evidence at a search vector (K,) says."""

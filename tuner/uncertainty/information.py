@@ -85,7 +85,7 @@ class FisherInformation:
         return np.asarray(self.data + self.prior)
 
 
-def gather(
+def information_at(
     objective: Objective,
     point: Point,
     criterion: Criterion,
@@ -105,10 +105,12 @@ def gather(
         s of one flight that are summed up together.
     """
     jacobian = objective.jacobian(point, criterion)
-    return summed(objective, point, criterion, jacobian, clocks=clocks, block=block)
+    return information_from_jacobian(
+        objective, point, criterion, jacobian, clocks=clocks, block=block
+    )
 
 
-def summed(
+def information_from_jacobian(
     objective: Objective,
     point: Point,
     criterion: Criterion,
@@ -117,7 +119,7 @@ def summed(
     clocks: NDArray[np.bool_] | None = None,
     block: float = BLOCK,
 ) -> FisherInformation:
-    """Sum a Jacobian up; see `gather`."""
+    """Sum a Jacobian up; see `information_at`."""
     count, segments = len(objective.space), objective.segments.count
     channels = tuple(jacobian.residuals)
     blocks = _block_count(objective, criterion, block)

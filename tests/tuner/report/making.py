@@ -12,9 +12,9 @@ import numpy as np
 from tests.tuner.uncertainty import making
 from tuner.comparison.errors import FlightErrors
 from tuner.config import COEFFICIENTS, values_of, write_vehicle
-from tuner.examination.examine import Examination, examine
-from tuner.examination.files import write_files
-from tuner.examination.summary import tell
+from tuner.examination.examination import Examination, examine
+from tuner.examination.knowledge import knowledge_of
+from tuner.examination.tables import write_files
 from tuner.flights.flight import Array
 from tuner.objective.normal import Objective
 from tuner.report import write_laps
@@ -73,7 +73,7 @@ def write_run(folder: Path, free: Sequence[str], *, without: Sequence[str] = ())
             Start(origin="random", loss=None, start=values, end=values),
         ],
     ).write(folder)
-    write_files(tell(found, objective.space, point), folder)
+    write_files(knowledge_of(found, objective.space, point), folder)
     return found
 
 

@@ -10,18 +10,18 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.errors import InputError
-from tuner.examination.examine import Examination, examine
+from tuner.examination.examination import Examination, examine
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
-from tuner.sensitivity.global_files import (
-    GlobalIndices,
+from tuner.sensitivity.global_indices import _outputs, global_sensitivity
+from tuner.sensitivity.global_sensitivity_json import (
+    GlobalSensitivity,
     Method,
     read_global,
     write_global,
 )
-from tuner.sensitivity.global_indices import _outputs, whole_range
-from tuner.uncertainty.profile import profile
-from tuner.uncertainty.profile_files import Profile, read_profiles, write_profiles
+from tuner.uncertainty.profile_likelihood import profile_likelihood
+from tuner.uncertainty.profiles_json import Profile, read_profiles, write_profiles
 
 FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
 
@@ -42,9 +42,9 @@ def examination(fitted: Fitted) -> Examination:
     return examine(fitted)
 
 
-def indices(objective: Objective, method: Method, samples: int) -> GlobalIndices:
+def indices(objective: Objective, method: Method, samples: int) -> GlobalSensitivity:
     bounds = {p.name: (p.initial / 1.3, p.initial * 1.3) for p in objective.space.parameters}
-    return whole_range(
+    return global_sensitivity(
         objective,
         making.truth(objective),
         making.criterion_of(objective),
@@ -96,7 +96,7 @@ def test_a_crash_counts_as_no_better_than_the_worst_that_flew(objective: Objecti
 
 @pytest.fixture(scope="module")
 def known(examination: Examination, fitted: Fitted) -> Profile:
-    return profile(examination, fitted.criterion, "moment_constant")
+    return profile_likelihood(examination, fitted.criterion, "moment_constant")
 
 
 @pytest.mark.slow
@@ -116,7 +116,7 @@ def test_what_cannot_be_told_has_an_open_profile(
 ) -> None:
     rough = {name: 30.0 * scale for name, scale in fitted.criterion.scale.items()}
     criterion = eqx.tree_at(lambda s: s.scale, fitted.criterion, rough)
-    rolling = profile(examination, criterion, "rolling_moment_coefficient")
+    rolling = profile_likelihood(examination, criterion, "rolling_moment_coefficient")
     assert rolling.interval == (None, None)
     write_profiles([known, rolling], tmp_path)
     read = read_profiles(tmp_path)
@@ -127,4 +127,4 @@ def test_what_cannot_be_told_has_an_open_profile(
 @pytest.mark.slow
 def test_an_unknown_coefficient_is_named(examination: Examination, fitted: Fitted) -> None:
     with pytest.raises(InputError, match="did you mean 'moment_constant'"):
-        profile(examination, fitted.criterion, "moment_constand")
+        profile_likelihood(examination, fitted.criterion, "moment_constand")

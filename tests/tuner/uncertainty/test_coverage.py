@@ -8,7 +8,7 @@ from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.progress import Free, beginning, point_of
 from tuner.search.stages import plan
-from tuner.uncertainty.estimates import uncertainty
+from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = (
     "inertia_xx",
@@ -35,7 +35,7 @@ def test_intervals_cover_the_truth():
         progress = beginning(noisy, np.asarray(exact.space.initial)[None] + 0.02)
         for reached in grow(noisy, stages, progress, free=free, clipped=False, tell=lambda _: None):
             progress = reached
-        found = uncertainty(fitted_of(noisy, point_of(progress.points, 0)))
+        found = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
         for number, name in enumerate(FREE):
             low, high = found.estimates[name].ci95
             covered[repeat, number] = low <= float(right[name]) <= high

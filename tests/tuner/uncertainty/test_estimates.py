@@ -10,8 +10,8 @@ from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import total
-from tuner.uncertainty.estimates import Uncertainty, uncertainty
-from tuner.uncertainty.information import gather
+from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
+from tuner.uncertainty.information import information_at
 from tuner.uncertainty.verdict import Verdict
 
 FREE = (
@@ -38,7 +38,7 @@ def objective() -> Objective:
 @pytest.fixture(scope="module")
 def found(objective: Objective) -> Uncertainty:
     fitted = making.fitted_of(objective, making.truth(objective))
-    return uncertainty(fitted, clocks=CLOCKS)
+    return uncertainty_of(fitted, clocks=CLOCKS)
 
 
 def test_information_is_the_searchs_own_with_clock_offsets_eliminated(
@@ -54,13 +54,13 @@ def test_information_is_the_searchs_own_with_clock_offsets_eliminated(
     kept = np.concatenate([np.arange(count), count + np.flatnonzero(CLOCKS)])
     covariance = np.linalg.inv(np.asarray(hessian)[np.ix_(kept, kept)] * compared)[:count, :count]
     slope = objective.space.slope(np.asarray(point.coefficients))
-    information = gather(objective, point, criterion, clocks=CLOCKS)
+    information = information_at(objective, point, criterion, clocks=CLOCKS)
     ours = np.linalg.inv(information.total)
     assert ours == pytest.approx(covariance * np.outer(slope, slope), rel=1e-5)
 
 
 def test_residuals_at_the_truth_are_as_large_as_the_noise(objective: Objective) -> None:
-    information = gather(objective, making.truth(objective), making.criterion_of(objective))
+    information = information_at(objective, making.truth(objective), making.criterion_of(objective))
     assert information.spread == pytest.approx(1.0, abs=0.15)
     assert not information.crashed.any()
 
@@ -127,7 +127,7 @@ def test_tied_coefficients_share_their_estimate() -> None:
         job={"ties": (("inertia_xx", "inertia_yy"),)},
     )
     noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(1))
-    tied = uncertainty(making.fitted_of(noisy, making.truth(noisy)))
+    tied = uncertainty_of(making.fitted_of(noisy, making.truth(noisy)))
     first, second = tied.estimates["inertia_xx"], tied.estimates["inertia_yy"]
     assert second.std_error / first.std_error == pytest.approx(second.value / first.value)
     assert second.verdict is Verdict.TIED

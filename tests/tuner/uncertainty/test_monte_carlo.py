@@ -10,7 +10,7 @@ from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
-from tuner.uncertainty.estimates import uncertainty
+from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
 REFITS = 50
@@ -39,8 +39,8 @@ def test_standard_errors_are_the_spread_of_refits() -> None:
         point = refit(noisy, truth)
         found.append(np.asarray(noisy.space.scaled(point.coefficients)))
         if number < JUDGED:
-            judged = uncertainty(making.fitted_of(noisy, point))
-            errors.append(judged.covariance.error)
+            estimated = uncertainty_of(making.fitted_of(noisy, point))
+            errors.append(estimated.covariance.error)
     spread = np.std(found, axis=0, ddof=1)
     assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.3)
     # and they scatter about the truth

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tuner.config import COEFFICIENTS
-from tuner.examination.knowledge import Known
+from tuner.examination.sensitivity_json import CoefficientKnowledge
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
@@ -56,7 +56,7 @@ def coefficients(contents: Contents) -> Section | None:
     return Section("coefficients", "Coefficients", values, charts)
 
 
-def _fitted(name: str, one: CoefficientResult, known: Known | None) -> Row:
+def _fitted(name: str, one: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
     words, _, reason = one.note.partition(": ")
     verdict = next((v for v in Verdict if verdict_in_words(v) == words), Verdict.FIXED)
     if not one.fitted and known is not None:
@@ -65,7 +65,7 @@ def _fitted(name: str, one: CoefficientResult, known: Known | None) -> Row:
     return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (verdict, reason))
 
 
-def _known(name: str, one: Known) -> Row:
+def _known(name: str, one: CoefficientKnowledge) -> Row:
     reason = reason_in_words(one.reason)
     if not one.fitted:
         reason = f"were it fitted with the others: {reason}"
@@ -84,7 +84,7 @@ def _row(
     return Row(name, about.meaning, about.unit, *values, *spread, words, badge, sign, reason)
 
 
-def _intervals(known: dict[str, Known]) -> list[Chart]:
+def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
     """Return half the 95 % interval of every coefficient, relative to its value."""
     wide = {
         name: min(196.0 * one.std_error / one.step, 1000.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.examination.knowledge import Knowledge, OutputChange
+from tuner.examination.sensitivity_json import Knowledge, OutputSensitivity
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
@@ -51,7 +51,7 @@ def effects(contents: Contents) -> Section | None:
     return Section("effects", "What each coefficient does", values, charts)
 
 
-def _of(knowledge: Knowledge, channel: str) -> list[OutputChange]:
+def _of(knowledge: Knowledge, channel: str) -> list[OutputSensitivity]:
     return [output for output in knowledge.outputs if output.channel == channel]
 
 

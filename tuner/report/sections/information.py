@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuner.examination.knowledge import Knowledge
+from tuner.examination.sensitivity_json import Knowledge
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.sensitivity.global_files import MEANING, GlobalIndices
+from tuner.sensitivity.global_sensitivity_json import MEANING, GlobalSensitivity
 
 
 def whole_range(contents: Contents) -> Section | None:
@@ -17,7 +17,7 @@ def whole_range(contents: Contents) -> Section | None:
     return Section("whole_range", "Over the whole range", values, (_over_all(found), _each(found)))
 
 
-def _over_all(found: GlobalIndices) -> Chart:
+def _over_all(found: GlobalSensitivity) -> Chart:
     own = sorted((i for i in found.indices if not i.flight), key=lambda i: -i.total)
     meaning = MEANING[found.method]
     texts = [
@@ -35,7 +35,7 @@ def _over_all(found: GlobalIndices) -> Chart:
     )
 
 
-def _each(found: GlobalIndices) -> Chart:
+def _each(found: GlobalSensitivity) -> Chart:
     outputs = list(dict.fromkeys((i.flight, i.channel) for i in found.indices if i.flight))
     names = list(found.bounds)
     totals = {(i.coefficient, i.flight, i.channel): i.total for i in found.indices}

@@ -25,14 +25,14 @@ from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
 from tuner.coefficients import COEFFICIENTS
 from tuner.design.candidates import Arena, Candidate, candidates
-from tuner.design.proposals import Proposal, Proposals, in_words
-from tuner.examination.examine import Examination
+from tuner.design.next_flight_json import Proposal, Proposals, in_words
+from tuner.examination.examination import Examination
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.simulation.trajectory import published
 from tuner.uncertainty.covariance import WIDE
-from tuner.uncertainty.information import summed
+from tuner.uncertainty.information import information_from_jacobian
 from tuner.uncertainty.verdict import Verdict
 
 Array = NDArray[np.float64]
@@ -59,7 +59,7 @@ class Habits:
     seconds: float
 
 
-def next_flights(
+def rank_next_flights(
     examination: Examination, criterion: Criterion, *, arena: Arena, habits: Habits
 ) -> Proposals:
     """Rank the flights that could be flown next.
@@ -75,14 +75,14 @@ def next_flights(
     habits
         How it would be recorded.
     """
-    all_free = examination.all_free
+    full_problem = examination.full_problem
     flights = candidates(arena)
-    objective = _laid_out(all_free.objective, flights, habits)
-    point, weights = _there(all_free.point, criterion, objective)
+    objective = _laid_out(full_problem.objective, flights, habits)
+    point, weights = _there(full_problem.point, criterion, objective)
     jacobian = objective.jacobian(point, weights)
-    kinds = (np.asarray(all_free.point.offsets) != 0.0).any(axis=1)
+    kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
     clocks = np.repeat(kinds[:, None], len(flights), axis=1)
-    information = summed(objective, point, weights, jacobian, clocks=clocks)
+    information = information_from_jacobian(objective, point, weights, jacobian, clocks=clocks)
     flown = ~information.crashed & _inside(objective, jacobian.residuals, arena)
     gained = information.blocks.sum(axis=(0, 2))
     now = examination.information.data + examination.information.prior / WIDE**2
@@ -211,7 +211,7 @@ def _laid_out(objective: Objective, flights: Sequence[Candidate], habits: Habits
 def _logged_less(schedule: Schedule) -> Schedule:
     """Return the schedule with the lowest rate of logging that is not below `LOG_RATE`."""
     physics = schedule.physics_rate
-    rates = [physics // all_free for all_free in range(1, physics + 1) if physics % all_free == 0]
+    rates = [physics // divisor for divisor in range(1, physics + 1) if physics % divisor == 0]
     return replace(schedule, log_rate=min(rate for rate in rates if rate >= min(LOG_RATE, physics)))
 
 

@@ -16,7 +16,7 @@ from tuner.objective.normal import Objective
 
 
 @dataclass(frozen=True)
-class AllFree:
+class FullProblem:
     """The same simulation at the same point, moved by every coefficient.
 
     Attributes
@@ -53,7 +53,7 @@ class AllFree:
         return Space([space.parameters[place] for place in places], {}), places
 
 
-def every_coefficient(objective: Objective, point: Point) -> AllFree:
+def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     """Free the coefficients that a fit left alone, each around the value that it was given."""
     space = objective.space
     values = {
@@ -64,7 +64,7 @@ def every_coefficient(objective: Objective, point: Point) -> AllFree:
     whole = Space(parameters, {})
     vector = whole.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
-    return AllFree(
+    return FullProblem(
         objective=with_space(objective, whole),
         point=Point(jnp.asarray(vector), point.offsets),
         fitted=space.names,

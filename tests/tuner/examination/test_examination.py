@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.examination.examine import Examination, examine
-from tuner.examination.files import write_files
-from tuner.examination.knowledge import Knowledge, read_knowledge
-from tuner.examination.summary import half_of_it, tell
+from tuner.examination.examination import Examination, examine
+from tuner.examination.knowledge import knowledge_of, shortest_half
+from tuner.examination.sensitivity_json import Knowledge, read_knowledge
+from tuner.examination.tables import write_files
 from tuner.objective.flight_batches import portions
 from tuner.objective.normal import Objective
 
@@ -36,7 +36,7 @@ def found(objective: Objective) -> Examination:
 
 @pytest.fixture(scope="module")
 def knowledge(objective: Objective, found: Examination) -> Knowledge:
-    return tell(found, objective.space, making.truth(objective))
+    return knowledge_of(found, objective.space, making.truth(objective))
 
 
 def test_flights_that_do_not_fit_the_memory_take_turns(
@@ -138,8 +138,8 @@ def test_residuals_of_a_wrong_model_are_not_white(objective: Objective) -> None:
 def test_half_of_an_effect_is_found_where_it_is() -> None:
     acts = np.zeros(40)
     acts[20:24] = 1.0
-    assert half_of_it(np.arange(40) + 0.5, acts) == (20.0, 22.0)
-    assert half_of_it(np.arange(40) + 0.5, np.zeros(40)) == (0.0, 40.0)
+    assert shortest_half(np.arange(40) + 0.5, acts) == (20.0, 22.0)
+    assert shortest_half(np.arange(40) + 0.5, np.zeros(40)) == (0.0, 40.0)
 
 
 def test_files_hold_what_was_found(knowledge: Knowledge, tmp_path: Path) -> None:

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from tuner.objective.flight_batches import portion, portions
 from tuner.search.fitted import Fitted
-from tuner.sensitivity.local import Sensitivity, sensitivity
-from tuner.uncertainty.all_free import AllFree, every_coefficient
-from tuner.uncertainty.estimates import Uncertainty, judged, references
-from tuner.uncertainty.information import FisherInformation, summed
+from tuner.sensitivity.local import LocalSensitivity, local_sensitivity
+from tuner.uncertainty.estimates import Uncertainty, references, uncertainty_at
+from tuner.uncertainty.full_problem import FullProblem, full_problem_of
+from tuner.uncertainty.information import FisherInformation, information_from_jacobian
 from tuner.uncertainty.whiteness import Residual, whiteness
 
 Array = NDArray[np.float64]
@@ -44,9 +44,9 @@ class Examination:
     uncertainty: Uncertainty
     freed: Mapping[str, Uncertainty]
     bias: Array
-    sensitivity: Sensitivity
+    sensitivity: LocalSensitivity
     residuals: tuple[Residual, ...]
-    all_free: AllFree
+    full_problem: FullProblem
     information: FisherInformation
 
 
@@ -70,43 +70,43 @@ def examine(
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
-    all_free = every_coefficient(fitted.objective, fitted.point)
-    objective, point, criterion = all_free.objective, all_free.point, fitted.criterion
+    full_problem = full_problem_of(fitted.objective, fitted.point)
+    objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
     reference = references(objective.space, np.asarray(point.coefficients))
     evidences, sensitivities = [], []
     residuals: list[Residual] = []
     for flights in portions(objective, point, criterion):
         some = portion(objective, point, criterion, flights)
-        jacobian = some[0].jacobian(*some[1:], columns=all_free.columns)
+        jacobian = some[0].jacobian(*some[1:], columns=full_problem.columns)
         own = [names[number] for number in flights]
         free = None if clocks is None else clocks[:, flights]
-        evidences.append(summed(*some, jacobian, clocks=free))
-        sensitivities.append(sensitivity(*some, jacobian, reference=reference, flights=own))
+        evidences.append(information_from_jacobian(*some, jacobian, clocks=free))
+        sensitivities.append(local_sensitivity(*some, jacobian, reference=reference, flights=own))
         residuals.extend(whiteness(some[0], jacobian, some[2], own))
     information = FisherInformation.joined(evidences)
     return Examination(
-        uncertainty=_judged(all_free, information, all_free.fitted, names),
+        uncertainty=_judged(full_problem, information, full_problem.fitted, names),
         freed={
-            name: _judged(all_free, information, (*all_free.fitted, name), names)
-            for name in all_free.fixed
+            name: _judged(full_problem, information, (*full_problem.fitted, name), names)
+            for name in full_problem.fixed
         },
-        bias=_bias(all_free, information, reference),
-        sensitivity=Sensitivity.joined(sensitivities),
+        bias=_bias(full_problem, information, reference),
+        sensitivity=LocalSensitivity.joined(sensitivities),
         residuals=tuple(residuals),
-        all_free=all_free,
+        full_problem=full_problem,
         information=information,
     )
 
 
 def _judged(
-    all_free: AllFree,
+    full_problem: FullProblem,
     information: FisherInformation,
     names: tuple[str, ...],
     flights: Sequence[str],
 ) -> Uncertainty:
-    space, places = all_free.only(names)
-    vector = np.asarray(all_free.point.coefficients)[places]
-    return judged(space, vector, part(information, places), flights)
+    space, places = full_problem.only(names)
+    vector = np.asarray(full_problem.point.coefficients)[places]
+    return uncertainty_at(space, vector, part(information, places), flights)
 
 
 def part(information: FisherInformation, places: NDArray[np.intp]) -> FisherInformation:
@@ -121,9 +121,9 @@ def part(information: FisherInformation, places: NDArray[np.intp]) -> FisherInfo
     )
 
 
-def _bias(all_free: AllFree, information: FisherInformation, reference: Array) -> Array:
+def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:
     """Return how the fitted coefficients follow the fixed ones, relative to both references."""
-    count = len(all_free.fitted)
+    count = len(full_problem.fitted)
     total, data = information.total[:count, :count], information.data[:count, count:]
     follow = -np.linalg.solve(total, data).T
     return np.asarray(follow * reference[count:, None] / reference[:count])

@@ -15,13 +15,13 @@ from tuner.comparison.errors import FlightErrors
 from tuner.comparison.layout import Layout
 from tuner.config import Options, Settings, check_names, initial_values, settle
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
-from tuner.design.next_flight import Habits, next_flights
-from tuner.design.proposals import Proposals, write_proposals
+from tuner.design.next_flight_json import Proposals, write_proposals
+from tuner.design.ranking import Habits, rank_next_flights
 from tuner.errors import InputError
-from tuner.examination.examine import Examination, examine
-from tuner.examination.files import write_files
-from tuner.examination.knowledge import Knowledge
-from tuner.examination.summary import tell as told_of
+from tuner.examination.examination import Examination, examine
+from tuner.examination.knowledge import knowledge_of
+from tuner.examination.sensitivity_json import Knowledge
+from tuner.examination.tables import write_files
 from tuner.flights.flight import Flight
 from tuner.job.findings import UNMATCHED
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
@@ -35,10 +35,10 @@ from tuner.search.continuation import FEEDBACK_GAIN
 from tuner.search.fitted import Finding, Fitted
 from tuner.search.progress import beginning, criterion_of, with_feedback
 from tuner.search.stages import WHOLE, schedule_of
-from tuner.sensitivity.global_files import Method, write_global
-from tuner.sensitivity.global_indices import whole_range
-from tuner.uncertainty.profile import profile
-from tuner.uncertainty.profile_files import write_profiles
+from tuner.sensitivity.global_indices import global_sensitivity
+from tuner.sensitivity.global_sensitivity_json import Method, write_global
+from tuner.uncertainty.profile_likelihood import profile_likelihood
+from tuner.uncertainty.profiles_json import write_profiles
 
 ROOM = 1.0
 """m added to what the recorded flights took, to make an arena of it."""
@@ -48,7 +48,7 @@ as long, whichever is nearest to the recorded ones: each length is compiled anew
 
 
 @dataclass(frozen=True)
-class Examined:
+class SensitivityResult:
     """An examination's folder and what is in it."""
 
     folder: Path
@@ -58,7 +58,7 @@ class Examined:
 
 
 @dataclass(frozen=True)
-class Request:
+class SensitivityRequest:
     """What is to be told beside the local sensitivity.
 
     Attributes
@@ -84,12 +84,12 @@ class Request:
 
 def examine_vehicle(
     options: Options,
-    request: Request,
+    request: SensitivityRequest,
     *,
     out: Path,
     command: str = "",
     say: Callable[[str], None] = lambda _: None,
-) -> Examined:
+) -> SensitivityResult:
     """Tell what recordings say about the coefficients of a vehicle, nothing fitted.
 
     Parameters
@@ -130,11 +130,11 @@ def examine_vehicle(
     write_simulated(out, job.flights, _flown(job, fitted))
     write_about(out, _about(settings, job, fitted, command))
     render(out)
-    return Examined(out, knowledge, proposals, fitted.findings)
+    return SensitivityResult(out, knowledge, proposals, fitted.findings)
 
 
 def _on_request(
-    request: Request,
+    request: SensitivityRequest,
     job: Job,
     fitted: Fitted,
     examination: Examination,
@@ -145,7 +145,7 @@ def _on_request(
     """Write what takes longer."""
     if request.whole_range is not None:
         say(f"flying vehicles between the bounds for {request.whole_range.capitalize()}'s indices")
-        found = whole_range(
+        found = global_sensitivity(
             fitted.objective,
             fitted.point,
             fitted.criterion,
@@ -159,7 +159,7 @@ def _on_request(
     profiles = []
     for name in request.profiles:
         say(f"fitting the others again for each value of {name}")
-        profiles.append(profile(examination, fitted.criterion, name))
+        profiles.append(profile_likelihood(examination, fitted.criterion, name))
     if profiles:
         write_profiles(profiles, folder)
 
@@ -199,7 +199,7 @@ def write_examination(
 
     ``once_known`` is called in between, for the second takes its time.
     """
-    knowledge = told_of(examination, job.space, fitted.point)
+    knowledge = knowledge_of(examination, job.space, fitted.point)
     write_files(knowledge, folder)
     once_known()
     proposals = propose(job, examination, fitted.criterion, arena)
@@ -308,13 +308,13 @@ def propose(
     job: Job, examination: Examination, criterion: Criterion, said: Sequence[float] | None = None
 ) -> Proposals | None:
     """Return what to fly next; None where the controllers that flew are not simulated."""
-    if not isinstance(examination.all_free.objective.segments.inlet, ReferenceInlet):
+    if not isinstance(examination.full_problem.objective.segments.inlet, ReferenceInlet):
         return None
     arena = arena_of(job.flights) if said is None else Arena.of(said)
     seconds = float(np.median([flight.duration for flight in job.fitted]))
     doublings = max(round(float(np.log2(seconds / SHORTEST))), 0)
     habits = Habits(SPIN_CHANNELS, round(SHORTEST * 2**doublings))
-    return next_flights(examination, criterion, arena=arena, habits=habits)
+    return rank_next_flights(examination, criterion, arena=arena, habits=habits)
 
 
 def arena_of(flights: Sequence[Flight]) -> Arena:

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.design import next_flight
+from tuner.design import ranking
 from tuner.design.candidates import CLEARANCE, Arena, candidates
-from tuner.design.next_flight import Habits, next_flights
-from tuner.design.proposals import (
+from tuner.design.next_flight_json import (
     Proposal,
     Proposals,
     in_words,
     read_proposals,
     write_proposals,
 )
+from tuner.design.ranking import Habits, rank_next_flights
 from tuner.errors import InputError
-from tuner.examination.examine import Examination, examine
+from tuner.examination.examination import Examination, examine
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 
@@ -57,7 +57,7 @@ def examination(fitted: Fitted) -> Examination:
 
 @pytest.fixture(scope="module")
 def proposals(examination: Examination, fitted: Fitted) -> Proposals:
-    return next_flights(examination, fitted.criterion, arena=ARENA, habits=HABITS)
+    return rank_next_flights(examination, fitted.criterion, arena=ARENA, habits=HABITS)
 
 
 def test_what_the_swing_does_not_tell_is_told_by_a_yaw_spin(proposals: Proposals) -> None:
@@ -83,8 +83,8 @@ def test_fewer_samples_weighed_more_say_nearly_the_same(
     proposals: Proposals,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(next_flight, "SAMPLE_RATE", 50.0)
-    coarser = next_flights(examination, fitted.criterion, arena=ARENA, habits=HABITS)
+    monkeypatch.setattr(ranking, "SAMPLE_RATE", 50.0)
+    coarser = rank_next_flights(examination, fitted.criterion, arena=ARENA, habits=HABITS)
     by_name = {row.name: row for row in coarser.flights}
     for row in proposals.flights:
         for name, share in row.shrinks.items():

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from tuner.config import COEFFICIENTS
 from tuner.errors import InputError, did_you_mean
-from tuner.examination.examine import Examination
+from tuner.examination.examination import Examination
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
-from tuner.uncertainty.all_free import with_space
 from tuner.uncertainty.covariance import WIDE
-from tuner.uncertainty.profile_files import THRESHOLD, Profile
+from tuner.uncertainty.full_problem import with_space
+from tuner.uncertainty.profiles_json import THRESHOLD, Profile
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ STILL = 0.01
 """Change of any point's χ² below which no more is to be gained."""
 
 
-def profile(examination: Examination, criterion: Criterion, name: str) -> Profile:
+def profile_likelihood(examination: Examination, criterion: Criterion, name: str) -> Profile:
     """Return the profile of one coefficient, fitted or fixed.
 
     Parameters
@@ -52,16 +52,16 @@ def profile(examination: Examination, criterion: Criterion, name: str) -> Profil
     InputError
         There is no such coefficient in this simulation.
     """
-    all_free = examination.all_free
-    names = all_free.objective.space.names
+    full_problem = examination.full_problem
+    names = full_problem.objective.space.names
     if name not in names:
         raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
-    chosen = all_free.fitted if name in all_free.fitted else (*all_free.fitted, name)
-    space, places = all_free.only(chosen)
-    objective = with_space(all_free.objective, space)
-    found = examination.uncertainty if name in all_free.fitted else examination.freed[name]
+    chosen = full_problem.fitted if name in full_problem.fitted else (*full_problem.fitted, name)
+    space, places = full_problem.only(chosen)
+    objective = with_space(full_problem.objective, space)
+    found = examination.uncertainty if name in full_problem.fitted else examination.freed[name]
     index = space.names.index(name)
-    vector = np.asarray(all_free.point.coefficients)[places]
+    vector = np.asarray(full_problem.point.coefficients)[places]
     centre = np.asarray(space.scaled(jnp.asarray(vector)))
     error = float(found.covariance.data_error[index])
     reach = min(REACH * error, WIDEST * found.reference[index])
@@ -70,7 +70,7 @@ def profile(examination: Examination, criterion: Criterion, name: str) -> Profil
     grid = np.linspace(max(centre[index] - reach, low), min(centre[index] + reach, high), POINTS)
     along = found.covariance.alone[:, index] / found.covariance.alone[index, index]
     starts = np.stack([_moved(objective, centre, along, index, x) for x in grid])
-    chi = _refitted(objective, all_free.point, criterion, starts, index)
+    chi = _refitted(objective, full_problem.point, criterion, starts, index)
     values = [space.from_scaled(index, float(x)) for x in grid]
     # as the standard errors do, the likelihood allows for residuals that are not white noise
     rise = (chi - chi.min()) / found.covariance.beyond_noise[index] ** 2

@@ -11,14 +11,14 @@ Method = Literal["morris", "sobol"]
 GLOBAL_FILE = "global_sensitivity.json"
 GLOBAL_TABLE = "global_sensitivity.csv"
 
-#: Method -> what `Index.main`, `Index.total` and `Index.spread` are.
+#: Method -> what the attributes `main`, `total` and `spread` of a `SensitivityIndex` are.
 MEANING = {
     "morris": ("mean effect μ", "mean absolute effect μ*", "standard deviation of the effect σ"),
     "sobol": ("first-order index", "total index", "95 % confidence of the total index"),
 }
 
 
-class Index(Part):
+class SensitivityIndex(Part):
     """What one coefficient does to the logarithm of one RMSE; see `MEANING`.
 
     ``flight`` and ``channel`` are empty for the mean over all of them.
@@ -32,7 +32,7 @@ class Index(Part):
     spread: float
 
 
-class GlobalIndices(Part):
+class GlobalSensitivity(Part):
     """The content of ``global_sensitivity.json``.
 
     Attributes
@@ -52,10 +52,10 @@ class GlobalIndices(Part):
     bounds: dict[str, tuple[float, float]]
     simulations: int
     crashed: int
-    indices: list[Index]
+    indices: list[SensitivityIndex]
 
 
-def write_global(found: GlobalIndices, folder: Path) -> None:
+def write_global(found: GlobalSensitivity, folder: Path) -> None:
     """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
     write_text(folder / GLOBAL_FILE, found.model_dump_json(indent=1) + "\n")
     header = ("coefficient", "flight", "channel", *(text for text in MEANING[found.method]))
@@ -73,6 +73,6 @@ def write_global(found: GlobalIndices, folder: Path) -> None:
     write_text(folder / GLOBAL_TABLE, csv_text(header, rows))
 
 
-def read_global(folder: Path) -> GlobalIndices | None:
+def read_global(folder: Path) -> GlobalSensitivity | None:
     """Read ``global_sensitivity.json``; None where there is none."""
-    return read_optional(GlobalIndices, folder / GLOBAL_FILE)
+    return read_optional(GlobalSensitivity, folder / GLOBAL_FILE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from tuner.examination.knowledge import Knowledge, write_knowledge
+from tuner.examination.sensitivity_json import Knowledge, write_knowledge
 from tuner.files import csv_text, write_text
 
 SENSITIVITY_FILE = "sensitivity.csv"

@@ -1,0 +1,180 @@
+"""What was found about every coefficient, as ``sensitivity.json`` holds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.files import Part, read_optional, write_text
+from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.verdict import Reason, Verdict
+
+SCHEMA_VERSION = 2
+KNOWLEDGE_FILE = "sensitivity.json"
+
+Number = float | None
+"""None stands for what cannot be told: a simulation that crashed, an interval without end."""
+
+
+class CoefficientKnowledge(Part):
+    """One coefficient.
+
+    Attributes
+    ----------
+    unit
+        Of everything said about it.
+    fitted
+        Whether it was fitted; of a fixed one is said what would be known, were it fitted too.
+    value, std_error, ci95
+        See `tuner.uncertainty.estimates.Estimate`.
+    verdict, reason
+        How well it is known, and why.
+    step
+        One hundred percent: its value, or its usual uncertainty where that is larger.
+    shares
+        Channel -> flight -> share of what is known of it that came from there.
+    prior_share
+        The rest: from the priors.
+    bias
+        Of a fixed one: fitted coefficient -> percent by which that is wrong for each percent by
+        which this one is.
+    """
+
+    unit: str
+    fitted: bool
+    value: float
+    std_error: Number
+    ci95: tuple[Number, Number]
+    verdict: Verdict
+    reason: Reason
+    step: float
+    shares: dict[str, dict[str, float]]
+    prior_share: float
+    bias: dict[str, float]
+
+
+class OutputSensitivity(Part):
+    """What the coefficients do to one recorded signal: an axis of a channel of a flight.
+
+    Attributes
+    ----------
+    flight, channel, axis, unit
+        Which signal.
+    rmse
+        Simulated minus recorded, in ``unit`` as everything here.
+    change
+        Coefficient -> RMS change for +1 %.
+    rmse_up, rmse_down
+        Coefficient -> RMSE for +10 % and −10 %; None where the simulation crashed.
+    """
+
+    flight: str
+    channel: str
+    axis: str
+    unit: str
+    rmse: float
+    change: dict[str, float]
+    rmse_up: dict[str, Number]
+    rmse_down: dict[str, Number]
+
+
+class EffectOverTime(Part):
+    """When coefficients act during one flight.
+
+    Attributes
+    ----------
+    flight
+        Its name.
+    windowed
+        Whether time counts from the start of each window of the flight, not from the mission's.
+    time
+        s, middles of equal stretches.
+    change
+        Coefficient -> RMS change of all channels for +1 % in each stretch, in standard deviations.
+    span
+        Coefficient -> s from and to which half of its effect is felt; the shortest such stretch.
+    """
+
+    flight: str
+    windowed: bool = False
+    time: list[float]
+    change: dict[str, list[float]]
+    span: dict[str, tuple[float, float]]
+
+
+class ResidualWhiteness(Part):
+    """Whether residuals are white noise, see `tuner.uncertainty.whiteness.Residual`."""
+
+    flight: str
+    channel: str
+    rms: float
+    spacing: float
+    autocorrelation: list[float]
+    limit: float
+    memory: float
+    white: bool
+
+
+class Knowledge(Part):
+    """The content of ``sensitivity.json``.
+
+    Attributes
+    ----------
+    coefficients
+        Name -> what is known; the fitted ones first.
+    flights, channels
+        Names.
+    outputs, acting, residuals
+        Of every recorded signal, of every flight, of every channel of a flight.
+    directions
+        The worst-determined combinations of the fitted coefficients, worst first.
+    names
+        The rows of the matrices: the fitted parameters; of a tie, the first of the group.
+    correlation
+        Of their estimates.
+    covariance, information
+        Of their estimates, flights and priors together, and what the flights alone say; in the
+        coefficients' units.
+    """
+
+    schema_version: int = SCHEMA_VERSION
+    coefficients: dict[str, CoefficientKnowledge]
+    flights: list[str]
+    channels: list[str]
+    outputs: list[OutputSensitivity]
+    acting: list[EffectOverTime]
+    residuals: list[ResidualWhiteness]
+    directions: list[Direction]
+    names: list[str]
+    correlation: list[list[float]]
+    covariance: list[list[float]]
+    information: list[list[float]]
+
+
+def numbers(values: NDArray[np.float64]) -> list[Number]:
+    """Return a row with None for what is not finite."""
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def write_knowledge(knowledge: Knowledge, folder: Path) -> None:
+    """Write ``sensitivity.json``; it appears whole.
+
+    Raises
+    ------
+    ConfigError
+        The folder cannot be written to.
+    """
+    write_text(folder / KNOWLEDGE_FILE, knowledge.model_dump_json() + "\n")
+
+
+def read_knowledge(folder: Path) -> Knowledge | None:
+    """Read ``sensitivity.json`` of a folder; None where there is none.
+
+    Raises
+    ------
+    InputError
+        It cannot be read, or is of another schema version.
+    """
+    return read_optional(Knowledge, folder / KNOWLEDGE_FILE, version=SCHEMA_VERSION)
