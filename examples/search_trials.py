@@ -27,6 +27,7 @@ configure()
 
 from tuner.comparison.compare import flights_of  # noqa: E402 (jax is configured first)
 from tuner.config import Options, Settings, settle, with_values  # noqa: E402
+from tuner.findings import Code  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
 from tuner.job.results import validate, vehicle_fitted  # noqa: E402
@@ -166,7 +167,7 @@ def noise() -> str:
         return replace(flight, series=series)
 
     job, fitted, _ = solved(settings_of(), spoilt)
-    named = [f.subject for f in fitted.findings if "cannot be matched" in f.text]
+    named = [f.subject for f in fitted.findings if f.code is Code.FLIGHT_UNMATCHED]
     return f"named: {', '.join(named)}; the others: {worst(job, fitted)}"
 
 

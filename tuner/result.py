@@ -10,8 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from tuner.config import COEFFICIENTS, VehicleFile, read_vehicle
 from tuner.errors import InputError
 from tuner.files import Part, read_json, write_text
+from tuner.findings import Finding
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 RESULT_FILE = "result.json"
 BEST_FIT_FILE = "best_fit.yaml"
@@ -105,6 +106,7 @@ class RunResult(Part):
     settings: dict[str, JsonValue]
     coefficients: dict[str, CoefficientResult]
     flights: tuple[FlightResult, ...]
+    findings: tuple[Finding, ...]
     search: SearchResult
 
 

@@ -25,7 +25,9 @@ def test_keys_of_later_versions_are_passed_over(make_run):  # noqa: F811
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
-        ({"schema_version": 3}, "has schema version 3, and this tune reads version 1"),
+        ({"schema_version": 3}, "has schema version 3, and this tune reads version 2"),
+        ({"schema_version": 1}, "has schema version 1, and this tune reads version 2"),
+        ({"schema_version": None}, "has no schema version"),
         ({"seed": "x"}, "seed is 'x'"),
         (
             {"coefficients": {"mas": {"unit": "", "initial": 1, "best": 1, "fitted": False}}},

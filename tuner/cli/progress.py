@@ -76,6 +76,7 @@ def print_run(folder: Path, result: RunResult) -> None:
 
 def print_examined(found: SensitivityResult) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    from tuner.wording.findings import one_line
     from tuner.wording.verdicts import direction_in_words, judgement_in_words
 
     screen = console()
@@ -92,7 +93,7 @@ def print_examined(found: SensitivityResult) -> None:
         table.add_row(label, f"{one.value:.5g}", error, one.unit, _moves(found, name), told)
     screen.print(table)
     for finding in found.findings:
-        screen.print(f"{finding.kind}: {finding.subject}: {finding.text}; {finding.remedy}")
+        screen.print(one_line(finding), markup=False)
     for direction in found.knowledge.directions[:1]:
         screen.print(f"Worst determined: {direction_in_words(direction)}")
     for sentence in found.proposals.sentences if found.proposals else ():

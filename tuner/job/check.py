@@ -1,27 +1,26 @@
-"""What will go wrong, said before the search: nothing excited, dead, singular, or out of reach."""
+"""What would go wrong, noticed before the search: no excitation, no effect, singular directions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.inlets import NEEDS, sparse
-from tuner.search.fitted import Finding
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
-from tuner.wording.damage import damage_sentence
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""
 DEAD = 1e-3
-"""A coefficient is dead if its data, all noise, would not tell it to a factor e^(1/√this)."""
+"""Information over that of the prior below which a coefficient counts as without effect."""
 SINGULAR = 1e-6
-"""Smallest over largest eigenvalue of the normalised information, below which it is singular."""
+"""Smallest over largest eigenvalue of the normalised information below which it is singular."""
 SHARE = 0.25
 """A coefficient takes part in a direction from this share of the largest component."""
 MOVES = {"x": 0.2, "y": 0.2, "roll": 1.0, "pitch": 1.0}
@@ -40,81 +39,58 @@ def check(job: Job) -> tuple[Finding, ...]:
     tuple of Finding
         ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
     """
-    found = [*_recordings(job), *_inputs(job), *_excitation(job), *_bounds(job), *_moved(job)]
-    found += _information(job)
-    return tuple(found)
+    return (
+        *_recordings(job),
+        *_sparse_inputs(job),
+        *_excitation(job),
+        *_bounds(job),
+        *_starts_on_bounds(job),
+        *_information(job),
+    )
 
 
-def _recordings(job: Job) -> list[Finding]:
-    found = []
+def _recordings(job: Job) -> Iterator[Finding]:
     for flight in job.flights:
-        found += [
-            Finding("warning", flight.name, f"{note.topic}: {note.text}")
-            for note in flight.notes
-            if note.kind == "warning"
-        ]
-        found += [
-            Finding(
-                "warning", flight.name, damage_sentence(damage), "record it again if it matters"
-            )
-            for damage in flight.damage
-        ]
+        for note in flight.notes:
+            if note.kind == "warning":
+                names = (note.topic, note.text)
+                yield Finding(Code.RECORDING, "warning", flight.name, names=names)
+        for damage in flight.damage:
+            numbers = {name: value for name, value in vars(damage).items() if _is_number(value)}
+            names = (damage.cause.value, damage.subject)
+            yield Finding(Code.SALVAGED, "warning", flight.name, numbers, names)
         missing = [name for name in ("body_rate", "rotor_speed", "command") if not flight.has(name)]
         if missing:
-            found.append(
-                Finding(
-                    "warning",
-                    flight.name,
-                    f"holds no {' and no '.join(missing)}",
-                    "record it: position alone says little about the rotors",
-                )
-            )
+            yield Finding(Code.MISSING_SIGNALS, "warning", flight.name, names=tuple(missing))
         gap = float(np.max(np.diff(flight.series["position"].time), initial=0.0))
         if gap > GAP:
-            found.append(
-                Finding("warning", flight.name, f"no pose for {gap:.2f} s", "check the cameras")
-            )
-    return found
+            yield Finding(Code.POSE_GAP, "warning", flight.name, {"seconds": gap})
 
 
-def _inputs(job: Job) -> list[Finding]:
-    """Warn of inputs that were recorded less often than the loop that makes them ran."""
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float)
+
+
+def _sparse_inputs(job: Job) -> Iterator[Finding]:
+    """Warn of inputs that were recorded less often than the loop that computes them ran."""
     rates = {
         "body_rate": job.objective.schedule.position_control_rate,
         "actuator": job.objective.schedule.rate_control_rate,
     }
-    found = []
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         signal = NEEDS[inlet][0]
         if inlet in rates and sparse([flight], signal, rates[inlet]):
             recorded = 1.0 / float(np.median(np.diff(flight.series[signal].time)))
-            found.append(
-                Finding(
-                    "warning",
-                    flight.name,
-                    f"its {signal.replace('_', ' ')}s were recorded at {recorded:.0f} Hz, but made "
-                    f"at {rates[inlet]} Hz: what happened in between is lost, and moments of "
-                    "inertia may be wrong by tens of percent, more than their intervals say",
-                    "log them at the full rate, or use an inlet further upstream",
-                )
-            )
-    return found
+            numbers = {"recorded": recorded, "needed": float(rates[inlet])}
+            yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
 
 
-def _excitation(job: Job) -> list[Finding]:
-    found = []
+def _excitation(job: Job) -> Iterator[Finding]:
     spread = {axis: max(_spread(flight, axis) for flight in job.fitted) for axis in MOVES}
-    still = [axis for axis, least in MOVES.items() if spread[axis] < least]
+    still = tuple(axis for axis, least in MOVES.items() if spread[axis] < least)
     if still:
-        found.append(
-            Finding(
-                "warning",
-                "excitation",
-                f"no fitted flight moves in {', '.join(still)}",
-                "fly a circle or a lemniscate: inertia and rotor drag about there stay unknown",
-            )
-        )
-    turn = max(
+        yield Finding(Code.STILL_AXES, "warning", "excitation", names=still)
+    rate = max(
         (
             float(np.nanmax(np.abs(flight.signals["body_rate"][:, 2])))
             for flight in job.fitted
@@ -122,16 +98,8 @@ def _excitation(job: Job) -> list[Finding]:
         ),
         default=0.0,
     )
-    if turn < TURNS:
-        found.append(
-            Finding(
-                "warning",
-                "excitation",
-                f"no fitted flight turns about yaw (at most {turn:.2f} rad/s)",
-                "fly a yaw spin: inertia_zz and moment_constant stay unknown",
-            )
-        )
-    return found
+    if rate < TURNS:
+        yield Finding(Code.NO_YAW, "warning", "excitation", {"rate": rate})
 
 
 def _spread(flight: Flight, axis: str) -> float:
@@ -145,35 +113,24 @@ def _spread(flight: Flight, axis: str) -> float:
     return float(high - low)
 
 
-def _bounds(job: Job) -> list[Finding]:
-    found = []
+def _bounds(job: Job) -> Iterator[Finding]:
     for parameter in job.space.parameters:
         low, high = COEFFICIENTS[parameter.name].plausible or (-np.inf, np.inf)
         if parameter.upper < low or parameter.lower > high:
-            found.append(
-                Finding(
-                    "warning",
-                    parameter.name,
-                    f"bounds {parameter.lower:g} to {parameter.upper:g} exclude every plausible "
-                    f"value ({low:g} to {high:g})",
-                    "widen them",
-                )
-            )
-    return found
+            numbers = {
+                "lower": parameter.lower,
+                "upper": parameter.upper,
+                "plausible_lower": low,
+                "plausible_upper": high,
+            }
+            yield Finding(Code.IMPLAUSIBLE_BOUNDS, "warning", parameter.name, numbers)
 
 
-def _moved(job: Job) -> list[Finding]:
-    return [
-        Finding(
-            "info",
-            parameter.name,
-            f"starts on its bound at {parameter.moved:g}; the search begins at "
-            f"{parameter.initial:.3g}",
-            "",
-        )
-        for parameter in job.space.parameters
-        if parameter.moved is not None
-    ]
+def _starts_on_bounds(job: Job) -> Iterator[Finding]:
+    for parameter in job.space.parameters:
+        if parameter.moved is not None:
+            numbers = {"bound": parameter.moved, "start": parameter.initial}
+            yield Finding(Code.START_ON_BOUND, "info", parameter.name, numbers)
 
 
 def information(job: Job) -> NDArray[np.float64]:
@@ -191,49 +148,22 @@ def information(job: Job) -> NDArray[np.float64]:
     return np.asarray(hessian / np.outer(slope, slope))
 
 
-def _information(job: Job) -> list[Finding]:
-    told = information(job)
-    if not np.isfinite(told).all():
-        return [
-            Finding(
-                "failure",
-                "simulation",
-                "the starting coefficients do not give a finite simulation",
-                "check the vehicle and controller files",
-            )
-        ]
-    names, size = job.space.names, np.diag(told)
-    dead = size * job.space.prior_sd**2 < DEAD
-    found = [
-        Finding(
-            "warning",
-            names[i],
-            "has no effect on any recorded signal",
-            f"fix it with --fix {names[i]}, or record what shows it",
-        )
-        for i in np.flatnonzero(dead)
-    ]
+def _information(job: Job) -> Iterator[Finding]:
+    at_start = information(job)
+    if not np.isfinite(at_start).all():
+        yield Finding(Code.NOT_FINITE, "failure", "simulation")
+        return
+    names = job.space.names
+    dead = np.diag(at_start) * job.space.prior_sd**2 < DEAD
     if dead.all():
-        return [
-            Finding(
-                "failure",
-                "coefficients",
-                "no free coefficient has an effect on any recorded signal",
-                "use flights that move, or other channels",
-            )
-        ]
+        yield Finding(Code.NOTHING_HAS_EFFECT, "failure", "coefficients")
+        return
+    for index in np.flatnonzero(dead):
+        yield Finding(Code.NO_EFFECT, "warning", names[index])
     alive = np.flatnonzero(~dead)
-    for direction in singular_directions(told[np.ix_(alive, alive)]):
-        members = [names[alive[i]] for i in _members(direction)]
-        found.append(
-            Finding(
-                "warning",
-                "singular direction",
-                f"{_listed(members)} scale together: the flights cannot tell them apart",
-                f"fix one of them, as weighed or measured (--fix {members[0]})",
-            )
-        )
-    return found
+    for direction in singular_directions(at_start[np.ix_(alive, alive)]):
+        members = tuple(names[alive[index]] for index in _members(direction))
+        yield Finding(Code.SINGULAR_DIRECTION, "warning", "coefficients", names=members)
 
 
 def singular_directions(information: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -247,7 +177,3 @@ def singular_directions(information: NDArray[np.float64]) -> list[NDArray[np.flo
 def _members(direction: NDArray[np.float64]) -> Sequence[int]:
     share = np.abs(direction) / np.abs(direction).max()
     return [int(i) for i in np.argsort(-share) if share[i] > SHARE]
-
-
-def _listed(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.config import COEFFICIENTS
+from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.search.fitted import Finding
 from tuner.uncertainty.estimates import Uncertainty
 
 UNMATCHED = 10.0
@@ -31,16 +31,16 @@ def unmatched(scales: Scales) -> dict[str, dict[str, float]]:
     scales
         Flight -> channel -> residual in multiples of the noise.
     """
-    found = {}
+    lost = {}
     for flight, channels in scales.items():
         bad = {name: value for name, value in channels.items() if value > UNMATCHED}
         if len(bad) > len(channels) / 2:
-            found[flight] = bad
-    return found
+            lost[flight] = bad
+    return lost
 
 
-def offsets_found(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ...]:
-    """Say which clocks and gyros were found to be off.
+def offset_findings(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ...]:
+    """Return which clocks and gyros the search estimated to be off.
 
     Parameters
     ----------
@@ -49,64 +49,54 @@ def offsets_found(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ...]
     offsets
         (offsets, N) in s and rad/s.
     """
-    found = []
+    findings = []
     for number, flight in enumerate(job.fitted):
-        for kind, value in zip(OFFSETS, offsets[:, number], strict=True):
-            if value != 0.0:
-                what = kind.replace("_", " ")
-                text = (
-                    f"the {what} clock is {1000 * value:+.2f} ms late"
-                    if kind in CLOCKS
-                    else f"the {what} axis reads {value:+.4f} rad/s too much"
-                )
-                found.append(Finding("info", flight.name, f"{text}; taken into account"))
-    return tuple(found)
+        for kind, value in zip(OFFSETS, offsets[:, number].tolist(), strict=True):
+            if value == 0.0:
+                continue
+            code, unit = (
+                (Code.CLOCK_OFFSET, "seconds") if kind in CLOCKS else (Code.GYRO_OFFSET, "rate")
+            )
+            findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
+    return tuple(findings)
 
 
-def noticed(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ...]:
-    """Return what the end of a search says about the set-up and the flights.
+def end_findings(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ...]:
+    """Return what the end of a search shows about the set-up and the flights.
 
     Parameters
     ----------
     job
         What was searched.
     feedback
-        The mixer's saturation feedback that was flown in the end.
+        The mixer's saturation feedback with which the search ended, 0 or 1.
     scales
         As of `unmatched`.
     """
-    found: list[Finding] = []
-    said = 1.0 if job.settings.controller.mixer.saturation_feedback else 0.0
-    if feedback != said:
-        found.append(
-            Finding(
-                "warning",
-                "saturation_feedback",
-                "rotors were clipped low, and the recording agrees with a rate integrator that "
-                + ("does not stop then" if feedback == 0 else "stops then")
-                + f"; fitted with mixer.saturation_feedback: {str(feedback == 1).lower()}",
-                "say so in the controller file",
-            )
-        )
+    findings = []
+    if feedback != float(job.settings.controller.mixer.saturation_feedback):
+        findings.append(saturation_feedback("warning", feedback))
     lost = unmatched(scales)
-    typical = np.median([_size(channels) for channels in scales.values()])
-    odd = {name for name in lost if len(scales) == 1 or _size(scales[name]) > ODD * typical}
-    found += [_odd_one(name, lost[name]) for name in sorted(odd)]
-    if set(lost) - odd:
-        found.append(
-            Finding(
-                "warning",
-                "model",
-                f"the residuals of {len(set(lost) - odd)} of {len(scales)} flights are some "
-                f"{typical:.0f} times the noise: the model lacks something that they all have",
-                "believe held-out flights rather than standard errors",
-            )
-        )
-    return tuple(found)
+    typical = float(np.median([_size(channels) for channels in scales.values()]))
+    alone = {name for name in lost if len(scales) == 1 or _size(scales[name]) > ODD * typical}
+    findings += [
+        Finding(Code.FLIGHT_UNMATCHED, "warning", name, lost[name]) for name in sorted(alone)
+    ]
+    shared = len(set(lost) - alone)
+    if shared:
+        numbers = {"unmatched": shared, "flights": len(scales), "noise_multiple": typical}
+        findings.append(Finding(Code.MODEL_UNMATCHED, "warning", "model", numbers))
+    return tuple(findings)
 
 
-def surer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Warn of lags whose intervals tell the noise alone, and not that time goes in steps."""
+def saturation_feedback(level: Level, feedback: float) -> Finding:
+    """Return that the recordings contradict the controller file; ``feedback`` is 0 or 1."""
+    numbers = {"feedback": feedback}
+    return Finding(Code.SATURATION_FEEDBACK, level, "saturation_feedback", numbers)
+
+
+def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Warn of lags whose intervals hold the noise alone, and not that physics runs in steps."""
     names = [
         name
         for name, estimate in uncertainty.estimates.items()
@@ -114,24 +104,9 @@ def surer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
     ]
     if not names:
         return ()
-    text = (
-        f"the intervals are narrower than {1000 * STEPS_MATTER:g} ms, which is how much simulators "
-        "whose physics runs in other steps differ by"
-    )
-    remedy = f"take them as known to {2000 * STEPS_MATTER:g} ms"
-    return (Finding("warning", ", ".join(names), text, remedy),)
+    numbers = {"seconds": STEPS_MATTER}
+    return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
 
 
 def _size(channels: Mapping[str, float]) -> float:
     return float(np.median(list(channels.values())))
-
-
-def _odd_one(name: str, channels: Mapping[str, float]) -> Finding:
-    text = ", ".join(f"{channel} {value:.1f}" for channel, value in channels.items())
-    return Finding(
-        "warning",
-        name,
-        f"cannot be matched: residuals in multiples of the noise are {text}; "
-        "it was weighed down accordingly",
-        "look at its plots: wrong controller, clock, wind, damage, or another vehicle",
-    )

@@ -168,7 +168,6 @@ def result_of(
             "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
             "offsets": offsets_by_flight(job, fitted),
             "window_starts": starts_moved(fitted),
-            "findings": [vars(finding) for finding in fitted.findings],
             "starts": [
                 {"origin": outcome.origin, "cost": outcome.loss} for outcome in fitted.outcomes
             ],
@@ -178,6 +177,7 @@ def result_of(
             _flight(job, fitted, flight, initial[flight.name].rmse, best[flight.name].rmse)
             for flight in job.flights
         ),
+        findings=fitted.findings,
         search=SearchResult(
             method=fitted.method,
             evaluations=fitted.evaluations,

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 from tuner.config import Options, Settings, settle, with_values, write_vehicle
 from tuner.errors import ConfigError, InputError
 from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.wording.findings import one_line, remedy, sentence
+from tuner.wording.phrases import clause
 
 if TYPE_CHECKING:
+    from tuner.findings import Finding
     from tuner.job.cross_validation import Fold
     from tuner.job.prepare import Job
-    from tuner.search.fitted import Finding
     from tuner.search.progress import Progress
 
 logger = logging.getLogger(__name__)
@@ -95,7 +97,7 @@ def run(
     from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
-    from tuner.job.findings import surer_than_steps  # noqa: PLC0415
+    from tuner.job.findings import finer_than_steps  # noqa: PLC0415
     from tuner.job.holding import with_undetermined_held  # noqa: PLC0415
     from tuner.job.prepare import prepare  # noqa: PLC0415
     from tuner.job.results import (  # noqa: PLC0415
@@ -114,7 +116,7 @@ def run(
     folder = folder_for(out, resume=resume)
     job = prepare(settings)
     findings = check(job)
-    _refuse_failures(findings, listener, force=force)
+    _report(findings, listener, force=force)
     folder.mkdir(parents=True, exist_ok=True)
     keep = _keeper(folder, listener)
     try:
@@ -126,7 +128,7 @@ def run(
     listener.message("telling how far each coefficient can be trusted")
     fitted, examination = with_undetermined_held(job, fitted, keep, listener.message)
     uncertainty = examination.uncertainty
-    fitted = replace(fitted, findings=(*fitted.findings, *surer_than_steps(uncertainty)))
+    fitted = replace(fitted, findings=(*fitted.findings, *finer_than_steps(uncertainty)))
     vehicle = vehicle_fitted(job, fitted)
     listener.message("flying every flight with the initial and the fitted coefficients")
     errors = validate(job, fitted, vehicle)
@@ -148,14 +150,16 @@ def run(
     return folder, result
 
 
-def _refuse_failures(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:
+def _report(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:
+    """Pass findings on to the listener; refuse to go on after a failure unless forced."""
     for finding in findings:
-        remedy = f"; {finding.remedy}" if finding.remedy else ""
-        listener.message(f"{finding.kind}: {finding.subject}: {finding.text}{remedy}")
-    failures = [finding for finding in findings if finding.kind == "failure"]
+        listener.message(one_line(finding))
+    failures = [finding for finding in findings if finding.level == "failure"]
     if failures and not force:
         first = failures[0]
-        raise InputError(first.subject, first.text, f"{first.remedy}, or use --force")
+        raise InputError(
+            first.subject, clause(sentence(first)), f"{clause(remedy(first))}, or use --force"
+        )
 
 
 def _teller(listener: Listener) -> Callable[[Job, Progress], None]:

@@ -11,15 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.findings import Code, Finding
 from tuner.job.checkpoint import fingerprint, load, save
-from tuner.job.findings import noticed, offsets_found, unmatched
+from tuner.job.findings import end_findings, offset_findings, unmatched
 from tuner.job.prepare import Job, given_offset
 from tuner.job.starts import starting_vectors
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.fitted import Finding, Fitted, Outcome
+from tuner.search.fitted import Fitted, Outcome
 from tuner.search.levenberg_marquardt import total
 from tuner.search.progress import (
     Free,
@@ -68,38 +69,35 @@ def search(
     said = job.settings.job.search.method
     method = "gradient" if said == "auto" else said
     found = _run(job, folder / CHECKPOINT, method, resume=resume, tell=tell, findings=findings)
-    doubt = _doubt(job, found) if said == "auto" else ""
-    if not doubt:
+    doubt = _doubt(job, found) if said == "auto" else None
+    if doubt is None:
         return found
     resume = resume and (folder / SECOND_CHECKPOINT).exists()
     rival = _run(
         job, folder / SECOND_CHECKPOINT, "hybrid", resume=resume, tell=tell, findings=findings
     )
     better = rival if _misfit(rival) < _misfit(found) else found
+    doubt = replace(doubt, numbers={**doubt.numbers, "changed": float(better is rival)})
     return replace(
         better,
         method="auto",
         evaluations=found.evaluations + rival.evaluations,
         wall_time=found.wall_time + rival.wall_time,
         outcomes=(*found.outcomes, *rival.outcomes),
-        findings=(*better.findings, _second_opinion(doubt, better is rival)),
+        findings=(*better.findings, doubt),
     )
 
 
-def _second_opinion(doubt: str, changed: bool) -> Finding:
-    kept = "its end is better and was kept" if changed else "it found nothing better"
-    return Finding("info", "search", f"{doubt}; CMA-ES looked from further away, and {kept}")
-
-
-def _doubt(job: Job, found: Fitted) -> str:
-    """Return why least squares should not be believed, if it should not."""
-    losses = np.array([outcome.loss for outcome in found.outcomes])
+def _doubt(job: Job, fitted: Fitted) -> Finding | None:
+    """Return why the end of least squares is doubtful, if it is."""
+    losses = np.array([outcome.loss for outcome in fitted.outcomes])
     if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
-        return f"no two of {len(losses)} starts ended in the same minimum"
-    lost = unmatched(found.scales)
+        return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
+    lost = unmatched(fitted.scales)
     if set(job.inlets) == {"reference"} and len(lost) > len(job.fitted) / 2:
-        return f"{len(lost)} of {len(job.fitted)} flights stayed far from the recording"
-    return ""
+        numbers = {"far_off": len(lost), "flights": len(job.fitted)}
+        return Finding(Code.FLIGHTS_FAR_OFF, "info", "search", numbers)
+    return None
 
 
 def _misfit(found: Fitted) -> float:
@@ -229,8 +227,8 @@ def _fitted(
         message="the last steps gained nothing" if progress.converged else "stopped at its limit",
         findings=(
             *findings,
-            *noticed(job, progress.feedback, scales),
-            *offsets_found(job, np.asarray(point.offsets) * OFFSET_UNIT),
+            *end_findings(job, progress.feedback, scales),
+            *offset_findings(job, np.asarray(point.offsets) * OFFSET_UNIT),
         ),
     )
 

@@ -22,8 +22,9 @@ from tuner.examination.examination import Examination, examine
 from tuner.examination.knowledge import knowledge_of
 from tuner.examination.sensitivity_json import Knowledge
 from tuner.examination.tables import write_files
+from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
-from tuner.job.findings import UNMATCHED
+from tuner.job.findings import UNMATCHED, saturation_feedback
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
 from tuner.job.results import controller_flown, versions
 from tuner.objective.criterion import Criterion, Point
@@ -32,7 +33,7 @@ from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
 from tuner.search.continuation import FEEDBACK_GAIN
-from tuner.search.fitted import Finding, Fitted
+from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, with_feedback
 from tuner.search.stages import WHOLE, schedule_of
 from tuner.sensitivity.global_indices import global_sensitivity
@@ -285,23 +286,12 @@ def _findings(
     scale: Mapping[str, NDArray[np.float64]], names: Sequence[str], *, feedback: bool | None
 ) -> Iterator[Finding]:
     if feedback is not None:
-        yield Finding(
-            "info",
-            "saturation_feedback",
-            "rotors were clipped low, and the recordings agree with a rate integrator that "
-            f"{'stops' if feedback else 'does not stop'} then; simulated so",
-            f"say mixer.saturation_feedback: {str(feedback).lower()} in the controller file",
-        )
+        yield saturation_feedback("info", float(feedback))
     for index, name in enumerate(names):
         worst = max(scale, key=lambda channel: scale[channel][index])
-        if scale[worst][index] > UNMATCHED:
-            yield Finding(
-                "warning",
-                name,
-                f"is met badly: the {worst.replace('_', ' ')} differs by "
-                f"{scale[worst][index]:.0f} times its noise, and intervals are widened for it",
-                "fit first, then examine the fitted vehicle",
-            )
+        multiple = float(scale[worst][index])
+        if multiple > UNMATCHED:
+            yield Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (worst,))
 
 
 def propose(
@@ -342,8 +332,8 @@ def _about(settings: Settings, job: Job, fitted: Fitted, command: str) -> About:
             "origin": dict(settings.origin),
             "noise": dict(fitted.noise),
             "scales": {name: dict(scale) for name, scale in fitted.scales.items()},
-            "findings": [vars(finding) for finding in fitted.findings],
         },
+        findings=list(fitted.findings),
         flights=[
             Recording(name=f.name, path=str(f.path), sha256=f.sha256, duration=f.duration)
             for f in job.flights

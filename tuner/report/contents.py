@@ -97,6 +97,7 @@ def _about_run(run: Run) -> About:
         vehicle=run.vehicle.name,
         versions=result.versions,
         settings=result.settings,
+        findings=list(result.findings),
         flights=[
             Recording(name=f.name, path=f.path, sha256=f.sha256, duration=f.duration)
             for f in result.flights

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import JsonValue
 
 from tuner.files import Part, read_optional, write_text
+from tuner.findings import Finding
 from tuner.result import AxesRmse
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ class About(Part):
     vehicle: str
     versions: dict[str, str]
     settings: dict[str, JsonValue]
+    findings: list[Finding]
     flights: list[Recording]
 
 

@@ -1,38 +1,16 @@
-"""What a search hands on: where it ended, how it got there, and what it noticed."""
+"""The result of a search: where it ended, how it got there, and what it noticed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.findings import Finding
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that a user should know before believing a number.
-
-    Attributes
-    ----------
-    kind
-        ``failure`` stops a run unless forced, ``warning`` does not, ``info`` explains.
-    subject
-        The flight, coefficient or channel concerned.
-    text
-        What was found, with its number.
-    remedy
-        What to do about it.
-    """
-
-    kind: Literal["failure", "warning", "info"]
-    subject: str
-    text: str
-    remedy: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,8 +19,8 @@ class Iteration:
 
     Attributes
     ----------
-    criterion
-        What was being done, in words.
+    stage
+        Name of the stage of the continuation.
     number
         Counts all iterations of the search.
     loss
@@ -116,7 +94,7 @@ class Fitted:
     findings
         Everything noticed on the way.
     held
-        Coefficient that the flights do not tell -> the one kept at its initial value for it:
+        Coefficient that the flights do not identify -> the one kept at its initial value for it:
         itself, or one that it trades off against.
     """
 

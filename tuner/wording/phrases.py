@@ -22,3 +22,14 @@ def quantity(value: float, unit: str | None) -> str:
     if unit == "s":
         value, unit = 1e3 * value, "ms"
     return f"{value:.2g} {unit}".strip()
+
+
+def clause(sentence: str) -> str:
+    """Return a sentence as a clause of another: without its capital and its full stop."""
+    return sentence[:1].lower() + sentence[1:].removesuffix(".")
+
+
+def as_sentence(clause: str) -> str:
+    """Return a clause as a sentence; a first word that is a name keeps its small letter."""
+    first = clause.partition(" ")[0]
+    return f"{clause[:1].upper() if first.isalpha() else clause[:1]}{clause[1:]}."

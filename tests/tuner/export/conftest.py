@@ -69,13 +69,14 @@ def make_run(tmp_path):
         folder.mkdir(exist_ok=True)
         write_vehicle(best, folder / "best_fit.yaml")
         result = RunResult(
-            schema_version=1,
+            schema_version=2,
             status="done",
             seed=0,
             versions={"tune": "0.1.0"},
             settings={},
             coefficients={name: CoefficientResult(**data) for name, data in found.items()},
             flights=tuple(shown),
+            findings=(),
             search=SearchResult(
                 method="gradient",
                 evaluations=30,

@@ -70,7 +70,7 @@ def test_into_goes_with_sdf_only(make_run, tmp_path):
 
 
 def test_a_missing_model_is_named(make_run, tmp_path):
-    with pytest.raises(ExportError, match=r"gone\.sdf: cannot be read"):
+    with pytest.raises(ExportError, match=r"gone\.sdf: does not exist"):
         exported(make_run(), "sdf", into=tmp_path / "gone.sdf")
 
 

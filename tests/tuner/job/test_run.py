@@ -10,6 +10,7 @@ import yaml
 from tuner.comparison.errors import Comparison
 from tuner.config import ControllerFile, Options, read_vehicle, values_of
 from tuner.errors import InputError
+from tuner.findings import Code
 from tuner.flights.load import load_flight
 from tuner.job.run import SILENT, Listener, run
 from tuner.report import render
@@ -75,9 +76,9 @@ def test_mass_and_rolling_moment_stay_as_given(finished):
 
 
 @pytest.mark.slow
-def test_the_set_ups_integrator_is_found_and_said(finished):
-    said = [f for f in finished[1].settings["findings"] if f["subject"] == "saturation_feedback"]
-    assert len(said) == 1
+def test_the_set_ups_integrator_is_identified_and_reported(finished):
+    codes = [finding.code for finding in finished[1].findings]
+    assert codes.count(Code.SATURATION_FEEDBACK) == 1
     assert finished[1].settings["controller"]["mixer"]["saturation_feedback"] is False
 
 

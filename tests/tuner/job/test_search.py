@@ -10,8 +10,9 @@ from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.coefficients.space import space_of
 from tuner.config import ControllerFile, JobFile
 from tuner.config.job import Search
+from tuner.findings import Code
 from tuner.job import search as module
-from tuner.job.findings import noticed, surer_than_steps, unmatched
+from tuner.job.findings import end_findings, finer_than_steps, unmatched
 from tuner.job.starts import starting_vectors
 from tuner.search.fitted import Outcome
 from tuner.search.stages import left, plan
@@ -54,17 +55,19 @@ def test_random_starts_lie_in_the_box_and_the_first_is_the_vehicles(updated):
 def test_starts_that_agree_are_believed(fitted, updated):
     job = job_with(updated, starts=4)
     agree = replace(fitted, outcomes=ends(1.0, 1.001, 7.0, 9.0))
-    assert module._doubt(job, agree) == ""
+    assert module._doubt(job, agree) is None
     differ = replace(fitted, outcomes=ends(1.0, 1.3, 7.0, 9.0))
-    assert "no two of 4 starts" in module._doubt(job, differ)
+    doubt = module._doubt(job, differ)
+    assert (doubt.code, doubt.numbers) == (Code.STARTS_DISAGREE, {"starts": 4})
 
 
 def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
     job = job_with(updated)
     lost = {"a": {"position": 50.0, "body_rate": 30.0}, "b": {"position": 40.0, "body_rate": 3.0}}
-    assert module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0))) == ""
+    assert module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0))) is None
     lost["b"]["body_rate"] = 12.0
-    assert "2 of 2 flights" in module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0)))
+    doubt = module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0)))
+    assert (doubt.code, doubt.numbers) == (Code.FLIGHTS_FAR_OFF, {"far_off": 2, "flights": 2})
 
 
 def ends(*losses):
@@ -80,16 +83,16 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
     )
     one = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
     assert set(unmatched(one)) == {"c"}
-    (finding,) = noticed(job, 1.0, one)
-    assert finding.subject == "c"
+    (finding,) = end_findings(job, 1.0, one)
+    assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     every = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
-    (finding,) = noticed(job, 1.0, every)
-    assert finding.subject == "model"
-    assert "3 of 3 flights" in finding.text
+    (finding,) = end_findings(job, 1.0, every)
+    assert finding.code is Code.MODEL_UNMATCHED
+    assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
 
 
-def test_a_lag_told_more_finely_than_steps_allow_is_said():
-    told = {
+def test_a_lag_known_more_finely_than_physics_steps_is_warned_of():
+    estimates = {
         name: SimpleNamespace(std_error=error)
         for name, error in {
             "time_constant_up": 2e-5,
@@ -97,11 +100,11 @@ def test_a_lag_told_more_finely_than_steps_allow_is_said():
             "motor_constant": 1e-9,
         }.items()
     }
-    (finding,) = surer_than_steps(SimpleNamespace(estimates=told))
+    (finding,) = finer_than_steps(SimpleNamespace(estimates=estimates))
     assert finding.subject == "time_constant_up"
-    assert "0.1 ms" in finding.text
-    told["time_constant_up"] = SimpleNamespace(std_error=2e-4)
-    assert surer_than_steps(SimpleNamespace(estimates=told)) == ()
+    assert finding.numbers == {"seconds": 1e-4}
+    estimates["time_constant_up"] = SimpleNamespace(std_error=2e-4)
+    assert finer_than_steps(SimpleNamespace(estimates=estimates)) == ()
 
 
 def test_time_left_falls_to_nothing():

@@ -138,13 +138,14 @@ def _result(
         for number, (before, after) in enumerate(zip(errors, better, strict=True))
     )
     return RunResult(
-        schema_version=1,
+        schema_version=2,
         status="converged",
         seed=7,
         versions={"multirotor-tune": "0.1.0"},
         settings={"command": COMMAND, "origin": {"mass": "--mass"}, "vehicle": {"name": "quad"}},
         coefficients=coefficients,
         flights=flights,
+        findings=(),
         search=SearchResult(
             method="gradient",
             evaluations=9,

@@ -9,7 +9,7 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 
 #: Settings that other sections show.
-SHOWN = ("command", "origin", "findings", "starts")
+SHOWN = ("command", "origin", "starts")
 
 
 def made(contents: Contents) -> Section:

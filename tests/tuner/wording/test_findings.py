@@ -1,0 +1,98 @@
+"""Every finding has a sentence, and a sentence is whole."""
+
+import pytest
+
+from tuner.findings import Code, Finding
+from tuner.wording.findings import one_line, remedy, sentence
+
+#: What each code's maker gives beside it.
+MADE = {
+    Code.RECORDING: Finding(Code.RECORDING, "warning", "a", names=("", "poses lie far off")),
+    Code.SALVAGED: Finding(
+        Code.SALVAGED,
+        "warning",
+        "a",
+        {"salvaged": 70, "bytes_lost": 12, "occurrences": 1, "start": 20.0},
+        ("end_missing", ""),
+    ),
+    Code.MISSING_SIGNALS: Finding(
+        Code.MISSING_SIGNALS, "warning", "a", names=("rotor_speed", "command")
+    ),
+    Code.POSE_GAP: Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.4}),
+    Code.SPARSE_INPUT: Finding(
+        Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
+    ),
+    Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
+    Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),
+    Code.IMPLAUSIBLE_BOUNDS: Finding(
+        Code.IMPLAUSIBLE_BOUNDS,
+        "warning",
+        "time_constant_up",
+        {"lower": 2.0, "upper": 3.0, "plausible_lower": 0.001, "plausible_upper": 1.0},
+    ),
+    Code.START_ON_BOUND: Finding(
+        Code.START_ON_BOUND, "info", "actuator_latency", {"bound": 0.0, "start": 0.002}
+    ),
+    Code.NOT_FINITE: Finding(Code.NOT_FINITE, "failure", "simulation"),
+    Code.NOTHING_HAS_EFFECT: Finding(Code.NOTHING_HAS_EFFECT, "failure", "coefficients"),
+    Code.NO_EFFECT: Finding(Code.NO_EFFECT, "warning", "quadratic"),
+    Code.SINGULAR_DIRECTION: Finding(
+        Code.SINGULAR_DIRECTION, "warning", "coefficients", names=("mass", "inertia_xx")
+    ),
+    Code.SATURATION_FEEDBACK: Finding(
+        Code.SATURATION_FEEDBACK, "warning", "saturation_feedback", {"feedback": 0.0}
+    ),
+    Code.CLOCK_OFFSET: Finding(
+        Code.CLOCK_OFFSET, "info", "a", {"seconds": -0.012}, ("flight_controller",)
+    ),
+    Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
+    Code.FLIGHT_UNMATCHED: Finding(
+        Code.FLIGHT_UNMATCHED, "warning", "a", {"position": 90.0, "body_rate": 12.0}
+    ),
+    Code.MODEL_UNMATCHED: Finding(
+        Code.MODEL_UNMATCHED,
+        "warning",
+        "model",
+        {"unmatched": 3, "flights": 3, "noise_multiple": 35.0},
+    ),
+    Code.FINER_THAN_STEPS: Finding(
+        Code.FINER_THAN_STEPS, "warning", "estimate_latency", {"seconds": 1e-4}
+    ),
+    Code.POORLY_MET: Finding(
+        Code.POORLY_MET, "warning", "a", {"noise_multiple": 40.0}, ("body_rate",)
+    ),
+    Code.STARTS_DISAGREE: Finding(
+        Code.STARTS_DISAGREE, "info", "search", {"starts": 4, "changed": 1.0}
+    ),
+    Code.FLIGHTS_FAR_OFF: Finding(
+        Code.FLIGHTS_FAR_OFF, "info", "search", {"far_off": 2, "flights": 2, "changed": 0.0}
+    ),
+}
+
+
+@pytest.mark.parametrize("code", Code)
+def test_every_finding_is_worded_in_whole_sentences(code):
+    finding = MADE[code]
+    text = sentence(finding)
+    assert text[0].isupper()
+    assert text.endswith(".")
+    assert "{" not in text
+    advice = remedy(finding)
+    assert advice == "" or (advice[0].isupper() and advice.endswith("."))
+    assert one_line(finding).startswith(f"{finding.level}: {finding.subject}: {text}")
+
+
+def test_a_salvaged_recording_is_reported_with_its_numbers():
+    text = sentence(MADE[Code.SALVAGED])
+    assert "the end of the file is missing" in text
+    assert "12 bytes lost; 70 messages salvaged; from t = 20.00 s" in text
+
+
+def test_numbers_stand_in_the_unit_that_people_use():
+    assert "-12.00 ms late" in sentence(MADE[Code.CLOCK_OFFSET])
+    assert "flight controller clock" in sentence(MADE[Code.CLOCK_OFFSET])
+    assert "0.2 ms" in remedy(MADE[Code.FINER_THAN_STEPS])
+    assert "--fix mass" in remedy(MADE[Code.SINGULAR_DIRECTION])
+    assert "CMA-ES then searched more widely and ended lower" in sentence(
+        MADE[Code.STARTS_DISAGREE]
+    )

@@ -1,0 +1,63 @@
+"""What a user should know before believing a number: codes and numbers, no prose.
+
+Sentences and remedies are made from them in `tuner.wording.findings`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+Level = Literal["failure", "warning", "info"]
+
+
+class Code(StrEnum):
+    """What was noticed; the comment after each names its numbers and its names."""
+
+    RECORDING = "recording"  # names: topic, what reading the recording doubted
+    SALVAGED = "salvaged"  # those of `tuner.flights.damage.Damage`; names: its cause and subject
+    MISSING_SIGNALS = "missing_signals"  # names: the signals
+    POSE_GAP = "pose_gap"  # seconds
+    SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
+    STILL_AXES = "still_axes"  # names: the axes
+    NO_YAW = "no_yaw"  # rate (rad/s)
+    IMPLAUSIBLE_BOUNDS = "implausible_bounds"  # lower, upper, plausible_lower, plausible_upper
+    START_ON_BOUND = "start_on_bound"  # bound, start
+    NOT_FINITE = "not_finite"
+    NOTHING_HAS_EFFECT = "nothing_has_effect"
+    NO_EFFECT = "no_effect"
+    SINGULAR_DIRECTION = "singular_direction"  # names: the coefficients
+    SATURATION_FEEDBACK = "saturation_feedback"  # feedback: 1 if the integrator stops, else 0
+    CLOCK_OFFSET = "clock_offset"  # seconds; names: the clock
+    GYRO_OFFSET = "gyro_offset"  # rate (rad/s); names: the axis
+    FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise
+    MODEL_UNMATCHED = "model_unmatched"  # unmatched, flights, noise_multiple
+    FINER_THAN_STEPS = "finer_than_steps"  # seconds
+    POORLY_MET = "poorly_met"  # noise_multiple; names: the channel
+    STARTS_DISAGREE = "starts_disagree"  # starts, changed: 1 if CMA-ES ended lower, else 0
+    FLIGHTS_FAR_OFF = "flights_far_off"  # far_off, flights, changed
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a user should know before believing a number.
+
+    Attributes
+    ----------
+    code
+        What was noticed.
+    level
+        ``failure`` stops a run unless forced, ``warning`` does not, ``info`` explains.
+    subject
+        The flight, coefficient or part concerned.
+    numbers, names
+        What `Code` lists beside the code.
+    """
+
+    code: Code
+    level: Level
+    subject: str
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    names: tuple[str, ...] = ()

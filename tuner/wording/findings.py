@@ -1,0 +1,198 @@
+"""Findings as sentences: what was noticed, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tuner.findings import Code, Finding
+from tuner.flights.damage import Cause, Damage
+from tuner.wording.damage import damage_sentence
+from tuner.wording.phrases import as_sentence, listed
+
+#: Code -> what was noticed and what to do about it: text with the finding's numbers in braces,
+#: ``names`` for its names, ``first`` and ``second`` for one of them, ``subject`` for its subject.
+TEXTS: Mapping[Code, tuple[str, str]] = {
+    Code.MISSING_SIGNALS: (
+        "The recording holds no {names}, and position alone says little about the rotors.",
+        "Record them.",
+    ),
+    Code.POSE_GAP: (
+        "No pose was recorded for {seconds:.2f} s during the mission.",
+        "Check the cameras' view and the network.",
+    ),
+    Code.SPARSE_INPUT: (
+        (
+            "The {first} was recorded at {recorded:.0f} Hz but computed at {needed:.0f} Hz: what "
+            "happened in between is lost, and moments of inertia may be wrong by tens of percent, "
+            "more than their intervals show."
+        ),
+        "Log it at the full rate, or choose an inlet further upstream.",
+    ),
+    Code.STILL_AXES: (
+        "No fitted flight moves in {names}, so that inertia and rotor drag there are not excited.",
+        "Fly a circle or a lemniscate.",
+    ),
+    Code.NO_YAW: (
+        (
+            "No fitted flight yaws faster than {rate:.2f} rad/s, so that inertia_zz and "
+            "moment_constant are not excited."
+        ),
+        "Fly a yaw spin.",
+    ),
+    Code.IMPLAUSIBLE_BOUNDS: (
+        (
+            "The bounds {lower:g} to {upper:g} exclude every plausible value "
+            "({plausible_lower:g} to {plausible_upper:g})."
+        ),
+        "Widen them.",
+    ),
+    Code.START_ON_BOUND: (
+        "The initial value {bound:g} lies on a bound; the search starts at {start:.3g}.",
+        "",
+    ),
+    Code.NOT_FINITE: (
+        "The simulation with the initial coefficients does not stay finite.",
+        "Check the vehicle and controller files.",
+    ),
+    Code.NOTHING_HAS_EFFECT: (
+        "No free coefficient has an effect on any recorded signal.",
+        "Use flights that move, or other channels.",
+    ),
+    Code.NO_EFFECT: (
+        "The coefficient has no effect on any recorded signal.",
+        "Fix it with --fix {subject}, or record a signal that it acts on.",
+    ),
+    Code.SINGULAR_DIRECTION: (
+        (
+            "The flights do not distinguish {names}: a common change of them leaves every recorded "
+            "signal as it is."
+        ),
+        "Fix one of them to its weighed or measured value (--fix {first}).",
+    ),
+    Code.CLOCK_OFFSET: (
+        "The {first} clock is {milliseconds:+.2f} ms late, which the fit takes into account.",
+        "",
+    ),
+    Code.GYRO_OFFSET: (
+        "The {first} reads {rate:+.4f} rad/s at rest, which the fit takes into account.",
+        "",
+    ),
+    Code.MODEL_UNMATCHED: (
+        (
+            "The residuals of {unmatched:.0f} of {flights:.0f} flights are about "
+            "{noise_multiple:.0f} times the measurement noise: the model lacks an effect "
+            "that these flights share."
+        ),
+        "Judge the fit by the held-out flights rather than by its standard errors.",
+    ),
+    Code.FINER_THAN_STEPS: (
+        (
+            "The 95 % intervals hold the measurement noise alone: simulators with another physics "
+            "step differ by {milliseconds:g} ms."
+        ),
+        "Take these values as known to {twice:g} ms.",
+    ),
+    Code.POORLY_MET: (
+        (
+            "The simulated {first} differs from the recorded one by {noise_multiple:.0f} times the "
+            "measurement noise, and the intervals are widened accordingly."
+        ),
+        "Fit first, then examine the fitted vehicle.",
+    ),
+    Code.STARTS_DISAGREE: (
+        "No two of {starts:.0f} starts ended in the same minimum; {second_search}.",
+        "",
+    ),
+    Code.FLIGHTS_FAR_OFF: (
+        (
+            "The simulation of {far_off:.0f} of {flights:.0f} flights stayed far from the "
+            "recording; {second_search}."
+        ),
+        "",
+    ),
+}
+
+
+def sentence(finding: Finding) -> str:
+    """Return what was noticed, as a sentence."""
+    if finding.code in SENTENCES:
+        return SENTENCES[finding.code](finding)
+    return TEXTS[finding.code][0].format(**_values(finding))
+
+
+def remedy(finding: Finding) -> str:
+    """Return what to do about it, as a sentence; empty if there is nothing to do."""
+    if finding.code in REMEDIES:
+        return REMEDIES[finding.code](finding)
+    return TEXTS[finding.code][1].format(**_values(finding))
+
+
+def one_line(finding: Finding) -> str:
+    """Return a finding as one line of a terminal."""
+    return f"{finding.level}: {finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
+
+
+def _values(finding: Finding) -> dict[str, object]:
+    names = [name.replace("_", " ") for name in finding.names]
+    if finding.code is Code.SINGULAR_DIRECTION:  # coefficients, as a user types them
+        names = list(finding.names)
+    values: dict[str, object] = {"subject": finding.subject, **finding.numbers}
+    if names:
+        values |= {"names": listed(names), "first": names[0]}
+    seconds = finding.numbers.get("seconds", 0.0)
+    values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
+    changed = finding.numbers.get("changed")
+    lower = "ended lower, and its result was kept" if changed else "ended no lower"
+    return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}
+
+
+def _recording(finding: Finding) -> str:
+    topic, text = finding.names
+    return f"{topic}: {text}." if topic else as_sentence(text)
+
+
+def _salvaged(finding: Finding) -> str:
+    cause, subject = finding.names
+    numbers: Mapping[str, Any] = finding.numbers
+    damage = damage_sentence(Damage(Cause(cause), subject, **numbers))
+    return f"The recording is broken, and the flight is what was salvaged of it: {damage}."
+
+
+def _saturation_feedback(finding: Finding) -> str:
+    does = "stops" if finding.numbers["feedback"] else "does not stop"
+    return (
+        "Rotors were clipped at their lower limit, and the recordings agree with a rate integrator "
+        f"that {does} then, other than the controller file has it; it was simulated so."
+    )
+
+
+def _saturation_remedy(finding: Finding) -> str:
+    flag = str(bool(finding.numbers["feedback"])).lower()
+    return f"Set mixer.saturation_feedback: {flag} in the controller file."
+
+
+def _flight_unmatched(finding: Finding) -> str:
+    multiples = ", ".join(
+        f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
+    )
+    return (
+        "The simulation does not match this flight: its residuals in multiples of the measurement "
+        f"noise are {multiples}, and its weight in the fit was lowered accordingly."
+    )
+
+
+SENTENCES: Mapping[Code, Callable[[Finding], str]] = {
+    Code.RECORDING: _recording,
+    Code.SALVAGED: _salvaged,
+    Code.SATURATION_FEEDBACK: _saturation_feedback,
+    Code.FLIGHT_UNMATCHED: _flight_unmatched,
+}
+REMEDIES: Mapping[Code, Callable[[Finding], str]] = {
+    Code.RECORDING: lambda _: "",
+    Code.SALVAGED: lambda _: "Record the flight again if what was lost matters.",
+    Code.SATURATION_FEEDBACK: _saturation_remedy,
+    Code.FLIGHT_UNMATCHED: lambda _: (
+        "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ."
+    ),
+}
