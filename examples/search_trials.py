@@ -25,14 +25,19 @@ from tuner.runtime import configure
 
 configure()
 
-from tuner.comparison.compare import flights_of  # noqa: E402 (jax is configured first)
-from tuner.config import Options, Settings, settle, with_values  # noqa: E402
+from tuner.config import (  # noqa: E402 (jax is configured first)
+    Options,
+    Settings,
+    settle,
+    with_values,
+)
 from tuner.findings import Code  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
 from tuner.job.results import validate, vehicle_fitted  # noqa: E402
 from tuner.job.search import search  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
+from tuner.recordings import read_recordings  # noqa: E402
 from tuner.search.fitted import Fitted  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
 from tuner.wording.verdicts import direction_in_words, verdict_in_words  # noqa: E402
@@ -60,13 +65,8 @@ def solved(
     settings: Settings, change: Callable[[Flight], Flight] = lambda flight: flight
 ) -> tuple[Job, Fitted, float]:
     """Return a job on changed recordings, its solution, and the s that the search took."""
-    flights = [change(flight) for flight in flights_of(settings)]
-    held = set(settings.job.holdout)
-    job = job_of(
-        settings,
-        tuple(flight for flight in flights if flight.name not in held),
-        tuple(flight for flight in flights if flight.name in held),
-    )
+    recordings = [replace(r, flight=change(r.flight)) for r in read_recordings(settings)]
+    job = job_of(settings, recordings)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         fitted = search(job, Path(folder), resume=False, tell=lambda *_: None)

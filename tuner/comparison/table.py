@@ -62,7 +62,7 @@ class Table:
 
     def winners(self, flight: str, lap: int | None) -> dict[str, str]:
         """Return axis to the vehicle with the lowest RMSE over a stretch."""
-        found = {}
+        winners = {}
         for axis in UNITS:
             known = [
                 (value, row.vehicle)
@@ -71,8 +71,8 @@ class Table:
                 and (value := getattr(row.rmse, axis)) is not None
             ]
             if known:
-                found[axis] = min(known)[1]
-        return found
+                winners[axis] = min(known)[1]
+        return winners
 
 
 def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:
@@ -98,11 +98,11 @@ def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
             rows += [
                 Row(name, number, vehicle, lap.rmse, errors.crash_time)
                 for number, lap in enumerate(laps, start=1)
-                if len(lap.position) >= FEWEST_POSES
+                if len(lap.position.time) >= FEWEST_POSES
             ]
-    every = list(flights.values())
-    crashes = [errors.crash_time for errors in every if errors.crash_time is not None]
-    rows.append(Row(OVERALL, None, vehicle, rmse_of(every), min(crashes, default=None)))
+    crashes = [e.crash_time for e in flights.values() if e.crash_time is not None]
+    overall = rmse_of(list(flights.values()))
+    rows.append(Row(OVERALL, None, vehicle, overall, min(crashes, default=None)))
     return rows
 
 

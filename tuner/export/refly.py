@@ -7,10 +7,10 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from tuner.comparison.compare import flights_of
-from tuner.comparison.layout import Layout
+from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
+from tuner.recordings import read_recordings, with_offsets
 from tuner.result import RESULT_FILE, AxesRmse, Run
 
 
@@ -31,12 +31,13 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     """
     settings = _settings(run, vehicle)
     wanted = {flight.name: flight for flight in run.result.flights}
-    flights = [flight for flight in flights_of(settings) if flight.name in wanted]
-    for flight in flights:
+    recordings = [r for r in read_recordings(settings) if r.flight.name in wanted]
+    for flight in (recording.flight for recording in recordings):
         if flight.sha256 != wanted[flight.name].sha256:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")
-    offsets = {flight.name: flight.time_offset for flight in run.result.flights}
-    flown = Layout(flights, settings.controller, settings.job, offsets).fly(vehicle)
+    on_time = with_offsets(recordings, {name: f.time_offset for name, f in wanted.items()})
+    window = settings.job.search.window
+    flown = Comparison(on_time, settings.controller, window=window).fly(vehicle)
     return {name: errors.rmse for name, errors in flown.items()}
 
 

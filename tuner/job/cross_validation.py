@@ -12,13 +12,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from tuner.comparison.layout import Layout
 from tuner.config import with_values
 from tuner.errors import ConfigError, RecordingError
 from tuner.files import write_text
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
-from tuner.job.results import best_values, controller_flown, offsets_of
+from tuner.job.results import best_values, comparison_of
 from tuner.job.search import free_offsets
 from tuner.objective.normal import Objective
 from tuner.result import AxesRmse
@@ -64,9 +63,7 @@ def cross_validate(
         raise RecordingError("--cross-validate", "leaves no flight to fit", "give two or more")
     held = set(fitted.held.values())
     free = Free(np.array([name not in held for name in job.space.names]), free_offsets(job))
-    layout = Layout(
-        job.fitted, controller_flown(job, fitted), job.settings.job, offsets_of(job, fitted)
-    )
+    comparison = comparison_of(job, fitted)
     folds = []
     for number, flight in enumerate(job.fitted):
         others = replace(fitted, objective=_without(fitted.objective, number))
@@ -79,7 +76,7 @@ def cross_validate(
         )
         values = best_values(job, found)
         try:
-            rmse = layout.fly(with_values(job.settings.vehicle, values))[flight.name].rmse
+            rmse = comparison.fly(with_values(job.settings.vehicle, values))[flight.name].rmse
         except ConfigError:
             rmse = None
         folds.append(Fold(flight.name, values, rmse))

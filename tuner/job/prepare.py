@@ -1,4 +1,4 @@
-"""From settled options to the problem that is searched: flights read, noise told, segments laid."""
+"""From settled options to the problem that is searched: flights, noise, segments."""
 
 from __future__ import annotations
 
@@ -9,17 +9,16 @@ import numpy as np
 
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients.space import Space, space_of
-from tuner.comparison.compare import flights_of
 from tuner.comparison.errors import limits_of
-from tuner.comparison.layout import said_inlet
 from tuner.config import Settings
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
-from tuner.objective.inlets import InletName, inlet_for
+from tuner.objective.inlets import InletName
 from tuner.objective.noise import CHANNELS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, begins_gently, noise_of, segments_of, window_segments
+from tuner.recordings import Recording, read_recordings
 
 #: What a yaw spin is compared by: nothing holds its position, so that a gust or a tilt of a
 #: hundredth of a degree moves it by metres without meaning anything.
@@ -37,39 +36,58 @@ class Job:
     ----------
     settings
         The user's.
-    fitted, held_out
-        Flights.
+    recordings
+        The fitted ones, then those held out.
     noise
         Channel -> standard deviation in its unit (attitude: rad).
     space
         Free coefficients.
-    inlets
-        Where each fitted recording enters the simulated loop: whole flights where all enter as
-        reference, else windows.
     objective
-        What is searched.
+        What is searched: whole flights where all enter as reference, else windows.
     windows
         The same flights in windows, searched first where one does not begin gently; None where
         all do.
     """
 
     settings: Settings
-    fitted: tuple[Flight, ...]
-    held_out: tuple[Flight, ...]
+    recordings: tuple[Recording, ...]
     noise: Mapping[str, float]
     space: Space
-    inlets: tuple[InletName, ...]
     objective: Objective
     windows: Objective | None = None
 
     @property
     def flights(self) -> tuple[Flight, ...]:
-        """Every flight, the fitted ones first."""
-        return (*self.fitted, *self.held_out)
+        """All flights, the fitted ones first."""
+        return tuple(recording.flight for recording in self.recordings)
+
+    @property
+    def fitted(self) -> tuple[Flight, ...]:
+        """The flights that are fitted."""
+        return tuple(recording.flight for recording in self.recordings if not recording.holdout)
+
+    @property
+    def held_out(self) -> tuple[Flight, ...]:
+        """The flights that are evaluated and never fitted."""
+        return tuple(recording.flight for recording in self.recordings if recording.holdout)
+
+    @property
+    def inlets(self) -> tuple[InletName, ...]:
+        """Where each fitted flight enters the simulated loop."""
+        return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
+
+    @property
+    def offset_is_fixed(self) -> tuple[bool, ...]:
+        """Whether the clock offset of each fitted flight is given rather than estimated."""
+        return tuple(
+            recording.time_offset is not None
+            for recording in self.recordings
+            if not recording.holdout
+        )
 
     @property
     def clipped(self) -> bool:
-        """Tell whether some recorded rotor was clipped low."""
+        """Whether some recorded rotor was clipped low."""
         return any(
             bool((np.nan_to_num(flight.signals["command"], nan=1.0) < CLIPPED).any())
             for flight in self.fitted
@@ -85,24 +103,31 @@ def prepare(settings: Settings) -> Job:
     InputError
         A recording cannot be read or used, or the job leaves nothing to fit.
     """
-    flights = flights_of(settings)
-    held = set(settings.job.holdout)
-    fitted = tuple(flight for flight in flights if flight.name not in held)
-    held_out = tuple(flight for flight in flights if flight.name in held)
-    if not fitted:
-        raise RecordingError("--holdout", "holds out every flight", "leave one to fit")
-    return job_of(settings, fitted, held_out)
+    return job_of(settings, read_recordings(settings))
 
 
-def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Flight, ...]) -> Job:
-    """Build the problem of some flights."""
+def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
+    """Build the problem of some recordings.
+
+    Raises
+    ------
+    RecordingError
+        All of them are held out.
+    """
+    recordings = tuple(sorted(recordings, key=lambda recording: recording.holdout))
+    to_fit = [recording for recording in recordings if not recording.holdout]
+    if not to_fit:
+        raise RecordingError(
+            "--holdout", "all flights are held out, none is left to fit", "leave one to fit"
+        )
+    fitted = [recording.flight for recording in to_fit]
+    inlets = [recording.inlet for recording in to_fit]
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
     noise = noise_of(fitted, channels)
     space = space_of(settings.vehicle, settings.controller, job)
     schedule = schedule_of(settings.controller)
-    on_time = [_shifted(flight, given_offset(settings, flight.name) or 0.0) for flight in fitted]
-    inlets = _inlets(settings, fitted)
+    on_time = [_shifted(recording.flight, recording.time_offset or 0.0) for recording in to_fit]
     closed = set(inlets) == {"reference"}
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
@@ -128,32 +153,21 @@ def job_of(settings: Settings, fitted: tuple[Flight, ...], held_out: tuple[Fligh
     if closed:
         whole = segments_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
         objective = problem(whole, longest, limits_of(fitted))
-        return Job(settings, fitted, held_out, noise, space, inlets, objective, windows)
+        return Job(settings, recordings, noise, space, objective, windows)
     assert windows is not None
-    return Job(settings, fitted, held_out, noise, space, inlets, windows)
-
-
-def _inlets(settings: Settings, flights: Sequence[Flight]) -> tuple[InletName, ...]:
-    """Return where each recording enters the simulated loop."""
-    return tuple(inlet_for(flight, said_inlet(settings.job, flight.name)) for flight in flights)
-
-
-def given_offset(settings: Settings, name: str) -> float | None:
-    """Return the s by which a flight's clocks are said to be late; None where that is fitted."""
-    own = settings.job.flights.get(name)
-    said = settings.job.time_offset if own is None or own.time_offset is None else own.time_offset
-    return None if said == "free" else float(said)
+    return Job(settings, recordings, noise, space, windows)
 
 
 def _shifted(flight: Flight, late: float) -> Flight:
     """Return a flight whose measurements are stamped as if its clocks had not been late."""
     if late == 0.0:
         return flight
-    series = {
-        name: Series(one.time - late, one.values) if name in CHANNELS else one
-        for name, one in flight.series.items()
+    shifted = {
+        name: Series(series.time - late, series.values)
+        for name, series in flight.series.items()
+        if name in CHANNELS
     }
-    return replace(flight, series=series)
+    return replace(flight, series={**flight.series, **shifted})
 
 
 def _weights(
@@ -162,10 +176,10 @@ def _weights(
     """Return flight -> channel -> factor; a whole yaw spin's position means nothing."""
     weights: dict[str, dict[str, float]] = {}
     for flight in flights:
-        own = settings.job.flights.get(flight.name)
-        factor = 1.0 if own is None else own.weight
-        of_flight = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
+        flight_settings = settings.job.flights.get(flight.name)
+        factor = 1.0 if flight_settings is None else flight_settings.weight
+        of_channel = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
         if whole and flight.yaw_rate_setpoint is not None:
-            of_flight |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
-        weights[flight.name] = of_flight
+            of_channel |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
+        weights[flight.name] = of_channel
     return weights

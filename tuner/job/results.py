@@ -13,8 +13,8 @@ import numpy as np
 from pydantic import JsonValue
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.comparison.comparison import Comparison
 from tuner.comparison.errors import FlightErrors
-from tuner.comparison.layout import Layout
 from tuner.config import (
     ControllerFile,
     VehicleFile,
@@ -24,10 +24,11 @@ from tuner.config import (
 )
 from tuner.files import write_text
 from tuner.flights.flight import Flight
-from tuner.job.prepare import Job, given_offset
+from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.recordings import with_offsets
 from tuner.result import (
     BEST_FIT_FILE,
     SCHEMA_VERSION,
@@ -101,7 +102,7 @@ def impossible(job: Job, fitted: Fitted) -> tuple[str, ...]:
 def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
     """Return flight -> s by which its pose stamps are late."""
     pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
-    found = {flight.name: given_offset(job.settings, flight.name) or 0.0 for flight in job.flights}
+    found = {recording.flight.name: recording.time_offset or 0.0 for recording in job.recordings}
     for flight, late in zip(job.fitted, pose, strict=True):
         found[flight.name] += float(late)
     return found
@@ -131,13 +132,18 @@ def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
     return found
 
 
+def comparison_of(job: Job, fitted: Fitted) -> Comparison:
+    """Return the job's recordings laid out as the search ended: controller and clocks."""
+    recordings = with_offsets(job.recordings, offsets_of(job, fitted))
+    window = job.settings.job.search.window
+    return Comparison(recordings, controller_flown(job, fitted), window=window)
+
+
 def validate(
     job: Job, fitted: Fitted, vehicle: VehicleFile
 ) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
     """Fly every flight whole with the initial and with the fitted vehicle."""
-    comparison = Layout(
-        job.flights, controller_flown(job, fitted), job.settings.job, offsets_of(job, fitted)
-    )
+    comparison = comparison_of(job, fitted)
     return comparison.fly(job.settings.vehicle), comparison.fly(vehicle)
 
 

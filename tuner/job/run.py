@@ -135,7 +135,7 @@ def run(
     status = "converged" if fitted.converged else "stopped"
     result = result_of(job, fitted, uncertainty, errors, status=status, command=command)
     write_folder(folder, result, vehicle, job)
-    write_traces(folder, job.flights, *errors)
+    write_traces(folder, *errors)
     write_laps(folder, *errors)
     write_search(folder, fitted)
     if cross_validated:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tuner.findings import Code, Finding
 from tuner.job.checkpoint import fingerprint, load, save
 from tuner.job.findings import end_findings, offset_findings, unmatched
-from tuner.job.prepare import Job, given_offset
+from tuner.job.prepare import Job
 from tuner.job.starts import starting_vectors
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
@@ -179,8 +179,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     simulation's own.
     """
     free = np.ones((len(OFFSETS), len(job.fitted)), bool)
-    fixed = [given_offset(job.settings, flight.name) is not None for flight in job.fitted]
-    free[: len(CLOCKS), fixed] = False
+    free[: len(CLOCKS), list(job.offset_is_fixed)] = False
     fed = [inlet != "reference" for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
     return free

@@ -10,9 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
-from tuner.comparison.compare import flights_of, offset_of
-from tuner.comparison.errors import FlightErrors
-from tuner.comparison.layout import Layout
 from tuner.config import Options, Settings, check_names, initial_values, settle
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.design.next_flight_json import Proposals, write_proposals
@@ -26,9 +23,10 @@ from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.job.findings import UNMATCHED, saturation_feedback
 from tuner.job.prepare import SPIN_CHANNELS, Job, job_of
-from tuner.job.results import controller_flown, versions
+from tuner.job.results import comparison_of, versions
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
+from tuner.recordings import read_recordings
 from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
@@ -120,7 +118,7 @@ def examine_vehicle(
         raise InputError("--span", f"{100 * request.span:g} % is no span", "give 30 for ±30 %")
     if request.samples is not None and request.samples < 2:
         raise InputError("--samples", f"{request.samples} tell nothing", "give at least 2")
-    job = job_of(settings, flights_of(settings), ())
+    job = job_of(settings, read_recordings(settings, holdout=()))
     out.mkdir(parents=True, exist_ok=True)
     fitted = as_it_is(job)
     say("simulating, and differentiating by every coefficient")
@@ -128,7 +126,7 @@ def examine_vehicle(
     say("simulating what could be flown next")
     knowledge, proposals = write_examination(out, job, examination, fitted, arena=request.arena)
     _on_request(request, job, fitted, examination, folder=out, say=say)
-    write_simulated(out, job.flights, _flown(job, fitted))
+    write_simulated(out, comparison_of(job, fitted).fly(settings.vehicle))
     write_about(out, _about(settings, job, fitted, command))
     render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)
@@ -339,10 +337,3 @@ def _about(settings: Settings, job: Job, fitted: Fitted, command: str) -> About:
             for f in job.flights
         ],
     )
-
-
-def _flown(job: Job, fitted: Fitted) -> dict[str, FlightErrors]:
-    settings = job.settings
-    offsets = {flight.name: offset_of(settings, flight.name) for flight in job.flights}
-    layout = Layout(job.flights, controller_flown(job, fitted), settings.job, offsets)
-    return layout.fly(settings.vehicle)

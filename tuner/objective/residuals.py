@@ -94,10 +94,44 @@ def residuals(
 
     Parameters
     ----------
-    trace
-        The simulation.
+    trace, offsets, held, rate
+        As of `simulated_at_stamps`.
     segments
         The recording.
+    horizon
+        Samples of the trace that were flown.
+    """
+    weighted = {}
+    for name, measured in segments.measured.items():
+        simulated = simulated_at_stamps(trace, name, measured, offsets, held, rate=rate)
+        flown = measured.time * rate < horizon - 1
+        if name == "attitude":
+            error = _attitude_error(measured, simulated)
+        else:
+            error = simulated - measured.values
+        weighted[name] = error * measured.weight * flown[:, None]
+    return weighted
+
+
+def simulated_at_stamps(
+    trace: Trace,
+    channel: str,
+    measured: Measured,
+    offsets: Float[Array, "offsets F"],
+    held: Float[Array, "clocks F"],
+    *,
+    rate: float,
+) -> Float[Array, "n c F"]:
+    """Return what a recording of the simulation would hold at the recorded stamps.
+
+    Parameters
+    ----------
+    trace
+        The simulation.
+    channel
+        Which signal.
+    measured
+        Its recorded samples.
     offsets
         s by which each clock's stamps are late: a sample stamped t was taken at t - offset; then
         rad/s by which the gyro reads too much about each axis.
@@ -106,27 +140,14 @@ def residuals(
         ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
     rate
         Hz of the trace.
-    horizon
-        Samples of the trace that were flown.
     """
-    found = {}
-    for name, measured in segments.measured.items():
-        clock = CLOCK_OF[name]
-        place = (measured.time - offsets[clock]) * rate
-        if name == "command":
-            before = (measured.time - held[clock]) * rate
-            simulated = _held_then_moved(trace.channels[name], before, place)
-        else:
-            simulated = _between(trace.channels[name], place)
-        if name == "body_rate":
-            simulated = simulated + offsets[len(CLOCKS) :]
-        if name == "attitude":
-            error = _attitude_error(measured, simulated)
-        else:
-            error = simulated - measured.values
-        flown = measured.time * rate < horizon - 1
-        found[name] = error * measured.weight * flown[:, None]
-    return found
+    clock = CLOCK_OF[channel]
+    place = (measured.time - offsets[clock]) * rate
+    if channel == "command":
+        before = (measured.time - held[clock]) * rate
+        return _held_then_moved(trace.channels[channel], before, place)
+    simulated = _between(trace.channels[channel], place)
+    return simulated + offsets[len(CLOCKS) :] if channel == "body_rate" else simulated
 
 
 def _below(series: Array, place: Float[Array, "n F"]) -> Int[Array, "n 1 F"]:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.comparison.errors import FlightErrors
-from tuner.flights.flight import Flight
-from tuner.simulation.table import roll_pitch_yaw
 
 Array = NDArray[np.float64]
 
@@ -21,49 +19,29 @@ POINTS = 1200
 
 
 def write_traces(
-    folder: Path,
-    flights: Sequence[Flight],
-    initial: Mapping[str, FlightErrors],
-    best: Mapping[str, FlightErrors],
+    folder: Path, initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
 ) -> None:
     """Write ``traces.npz``: per flight times in s, positions in m, roll, pitch, yaw in degrees."""
-    found: dict[str, dict[str, Array]] = {}
-    for flight in flights:
-        before, after = initial[flight.name], best[flight.name]
-        place = _at(flight, "position", after.position_time)
-        turn = roll_pitch_yaw(_at(flight, "attitude", after.attitude_time))
-        found[flight.name] = {
-            "position_time": after.position_time,
-            "position": place,
-            "position_initial": place + before.position,
-            "position_best": place + after.position,
-            "attitude_time": after.attitude_time,
-            "attitude": turn,
-            "attitude_initial": turn + before.attitude,
-            "attitude_best": turn + after.attitude,
-        }
-    save_traces(folder, found)
+    save_traces(
+        folder,
+        {name: _traces({"initial": initial[name], "best": best[name]}) for name in initial},
+    )
 
 
-def write_simulated(
-    folder: Path, flights: Sequence[Flight], flown: Mapping[str, FlightErrors]
-) -> None:
+def write_simulated(folder: Path, flown: Mapping[str, FlightErrors]) -> None:
     """Write ``traces.npz`` of flights simulated with one vehicle."""
-    found: dict[str, dict[str, Array]] = {}
-    for flight in flights:
-        if flight.name in flown:
-            errors = flown[flight.name]
-            place = _at(flight, "position", errors.position_time)
-            turn = roll_pitch_yaw(_at(flight, "attitude", errors.attitude_time))
-            found[flight.name] = {
-                "position_time": errors.position_time,
-                "position": place,
-                "position_simulated": place + errors.position,
-                "attitude_time": errors.attitude_time,
-                "attitude": turn,
-                "attitude_simulated": turn + errors.attitude,
-            }
-    save_traces(folder, found)
+    save_traces(folder, {name: _traces({"simulated": errors}) for name, errors in flown.items()})
+
+
+def _traces(simulations: Mapping[str, FlightErrors]) -> dict[str, Array]:
+    """Return what was recorded of one flight, and what each simulation of it had."""
+    traces: dict[str, Array] = {}
+    for suffix, errors in simulations.items():
+        for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
+            traces[f"{signal}_time"] = of_signal.time
+            traces[signal] = of_signal.recorded
+            traces[f"{signal}_{suffix}"] = of_signal.simulated
+    return traces
 
 
 def save_traces(folder: Path, flights: Mapping[str, Mapping[str, Array]]) -> None:
@@ -91,11 +69,6 @@ def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
             flight, _, name = key.rpartition("/")
             found.setdefault(flight, {})[name] = data[key]
     return found
-
-
-def _at(flight: Flight, signal: str, time: Array) -> Array:
-    series = flight.series[signal]
-    return series.values[np.isin(series.time, time)]
 
 
 def _thinned(values: Array) -> Array:

@@ -9,11 +9,12 @@ from lxml import html
 from tests.tuner.comparison.test_errors import errors
 from tuner.cli import main
 from tuner.comparison.compare import compare
-from tuner.comparison.errors import Comparison
+from tuner.comparison.comparison import Comparison
 from tuner.comparison.table import table_of
 from tuner.comparison.write import write_table
 from tuner.config import ControllerFile, Options, configs_folder
 from tuner.errors import InputError
+from tuner.recordings import Recording
 
 LAPS = np.array([20.0, 40.0])
 GOOD = errors([[0.1, 0.1, 0.1]] * 60, [[1, 1, 1]] * 60, laps=LAPS)
@@ -167,4 +168,4 @@ def test_wrong_input_is_one_line_and_status_2(bag, arguments, expected, capsys):
 def test_a_recording_without_reference_is_refused(flight):
     bare = replace(flight, signals={"position": flight.signals["position"]})
     with pytest.raises(InputError, match="no reference"):
-        Comparison([bare], ControllerFile())
+        Comparison([Recording(bare)], ControllerFile())

@@ -4,25 +4,29 @@ import numpy as np
 import pytest
 
 from sim_jax.crash import AIRBORNE, Limits
-from tuner.comparison.errors import Comparison, FlightErrors, laps_of, limits_of, rmse_of, short_way
+from tuner.comparison.comparison import Comparison
+from tuner.comparison.errors import (
+    FlightErrors,
+    SignalErrors,
+    laps_of,
+    limits_of,
+    rmse_of,
+    short_way,
+)
 from tuner.config import ControllerFile, TrajectorySettings, with_values
 from tuner.flights.flight import Series
+from tuner.recordings import Recording
 from tuner.simulation.trajectory import with_named_reference
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def errors(position, attitude, **options):
-    position, attitude = np.asarray(position, float), np.asarray(attitude, float)
-    usual = {"laps": np.zeros(0), "crash_time": None}
-    return FlightErrors(
-        name="f",
-        position_time=np.arange(len(position)) * 1.0,
-        position=position,
-        attitude_time=np.arange(len(attitude)) * 1.0,
-        attitude=attitude,
-        **usual | options,
-    )
+    signals = {}
+    for name, values in (("position", position), ("attitude", attitude)):
+        error = np.asarray(values, float)
+        signals[name] = SignalErrors(np.arange(len(error)) * 1.0, np.zeros_like(error), error)
+    return FlightErrors("f", **signals, **{"laps": np.zeros(0), "crash_time": None} | options)
 
 
 def test_the_root_mean_square_of_known_errors():
@@ -45,12 +49,12 @@ def test_a_crash_or_nothing_measured_has_no_rmse():
 
 def test_a_stretch_is_cut_by_each_clock():
     part = errors(np.eye(3), np.eye(3)).between(1.0, 2.0)
-    np.testing.assert_array_equal(part.position, [[0, 1, 0]])
-    np.testing.assert_array_equal(part.attitude, [[0, 1, 0]])
+    np.testing.assert_array_equal(part.position.error, [[0, 1, 0]])
+    np.testing.assert_array_equal(part.attitude.error, [[0, 1, 0]])
 
 
 def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
-    comparison = Comparison([flight], ControllerFile())
+    comparison = Comparison([Recording(flight)], ControllerFile())
     own = comparison.fly(updated)["small_circle"]
     assert own.crash_time is None
     for axis in ("x", "y", "z"):
@@ -77,15 +81,15 @@ def test_a_late_clock_is_taken_back(flight, updated):
             for name, data in flight.series.items()
         },
     )
-    as_is = Comparison([late], ControllerFile()).fly(updated)["small_circle"].rmse
-    known = Comparison([late], ControllerFile(), {"small_circle": 0.05}).fly(updated)
+    as_is = Comparison([Recording(late)], ControllerFile()).fly(updated)["small_circle"].rmse
+    known = Comparison([Recording(late, time_offset=0.05)], ControllerFile()).fly(updated)
     assert known["small_circle"].rmse.x < 3e-4
     assert as_is.x > 0.02
 
 
 def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
     heavy = with_values(updated, {"mass": 9.0})
-    found = Comparison([flight], ControllerFile()).fly(heavy)["small_circle"]
+    found = Comparison([Recording(flight)], ControllerFile()).fly(heavy)["small_circle"]
     assert 0 < found.crash_time < 12
     assert found.rmse.x is None
 
@@ -97,8 +101,8 @@ def test_flights_of_different_length_fly_side_by_side(flight, updated):
         time=flight.time[:600],
         signals={name: values[:600] for name, values in flight.signals.items()},
     )
-    both = Comparison([flight, half], ControllerFile()).fly(updated)
-    assert both["half"].position_time[-1] <= half.duration
+    both = Comparison([Recording(flight), Recording(half)], ControllerFile()).fly(updated)
+    assert both["half"].position.time[-1] <= half.duration
     assert both["half"].rmse.x < 2e-4
     assert both["small_circle"].rmse.x < 2e-4
 

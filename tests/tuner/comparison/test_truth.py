@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import yaml
 
-from tuner.comparison.errors import Comparison
+from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, read_vehicle, with_values
 from tuner.config.shipped import find_config
 from tuner.flights.load import load_flight
 from tuner.objective.segments import noise_of
+from tuner.recordings import Recording
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 NAMES = sorted(path.stem for path in FLIGHTS.glob("*.bag"))
@@ -23,7 +24,9 @@ def met():
     shipped = ControllerFile()
     controller = shipped.replace(mixer=shipped.mixer.replace(saturation_feedback=False))
     flights = [load_flight(FLIGHTS / f"{name}.bag") for name in NAMES]
-    return noise_of(flights), Comparison(flights, controller).fly(vehicle)
+    return noise_of(flights), Comparison([Recording(flight) for flight in flights], controller).fly(
+        vehicle
+    )
 
 
 def beside(noise, errors):
@@ -36,5 +39,5 @@ def test_every_flight_is_met_beside_its_measurement_noise(met, name):
     noise, flown = met
     errors = flown[name]
     assert errors.crash_time is None
-    assert beside(noise["position"], errors.position).max() < 2e-3
-    assert beside(np.degrees(noise["attitude"]), errors.attitude).max() < 0.05
+    assert beside(noise["position"], errors.position.error).max() < 2e-3
+    assert beside(np.degrees(noise["attitude"]), errors.attitude.error).max() < 0.05

@@ -4,7 +4,7 @@ import pytest
 
 from tests.tuner.export.conftest import MODELS
 from tuner.cli import main
-from tuner.comparison.errors import Comparison
+from tuner.comparison.comparison import Comparison
 from tuner.config import (
     COEFFICIENTS,
     ControllerFile,
@@ -17,6 +17,7 @@ from tuner.config import (
 from tuner.errors import ExportError
 from tuner.export.export import export
 from tuner.export.refly import refly
+from tuner.recordings import Recording
 from tuner.result import (
     CoefficientResult,
     FlightResult,
@@ -31,7 +32,7 @@ from tuner.result import (
 def run(bag, flight, updated, tmp_path):
     """A result folder that tells the truth about one recording."""
     start = with_values(updated, {"rotor_drag_coefficient": 4e-4})
-    comparison = Comparison([flight], ControllerFile())
+    comparison = Comparison([Recording(flight)], ControllerFile())
     coefficients = {
         name: CoefficientResult(
             unit=COEFFICIENTS[name].unit,

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import yaml
 
-from tuner.comparison.errors import Comparison
+from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, Options, read_vehicle, values_of
 from tuner.errors import InputError
 from tuner.findings import Code
 from tuner.flights.load import load_flight
 from tuner.job.run import SILENT, Listener, run
+from tuner.recordings import Recording
 from tuner.report import render
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -100,9 +101,11 @@ def test_the_folder_holds_what_later_commands_read(finished):
 def test_a_run_started_from_best_fit_starts_where_the_fit_ended(finished):
     folder, result = finished
     controller = ControllerFile.model_validate(result.settings["controller"])
-    flights = [load_flight(flight.path) for flight in result.flights]
-    offsets = {flight.name: flight.time_offset for flight in result.flights}
-    flown = Comparison(flights, controller, offsets).fly(read_vehicle(folder / "best_fit.yaml"))
+    recordings = [
+        Recording(load_flight(flight.path), time_offset=flight.time_offset)
+        for flight in result.flights
+    ]
+    flown = Comparison(recordings, controller).fly(read_vehicle(folder / "best_fit.yaml"))
     for flight in result.flights:
         for axis, value in flight.rmse_best:
             assert getattr(flown[flight.name].rmse, axis) == pytest.approx(value, rel=1e-9)

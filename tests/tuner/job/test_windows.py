@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.comparison.layout import Layout
+from tuner.comparison.comparison import Comparison
 from tuner.config import JobFile, Options, settle, values_of, with_values
 from tuner.config.job import FlightSettings, Search
 from tuner.job.check import check
 from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
 from tuner.job.search import search
+from tuner.recordings import recordings_of
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan
 
@@ -25,7 +26,8 @@ def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
     )
     settings = settle(Options([str(bag)], vehicle=start))
     job = JobFile(free=free, inlet=inlet, search=Search(method=method, window=0.5))
-    return job_of(replace(settings, job=job), (flight,), ())
+    settings = replace(settings, job=job)
+    return job_of(settings, recordings_of(settings, [flight]))
 
 
 def fitted_through(job, folder):
@@ -53,7 +55,7 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
         update={"flights": {"second": FlightSettings(inlet="rotor_speed")}}
     )
     settings = replace(single.settings, job=job)
-    mixed = job_of(settings, (full_flight, second), ())
+    mixed = job_of(settings, recordings_of(settings, [full_flight, second]))
     assert mixed.inlets == ("actuator", "rotor_speed")
     start = mixed.objective.start(mixed.space.initial)
     criterion = stage_for(mixed)
@@ -84,13 +86,13 @@ def plan_of(job):
 @pytest.mark.slow
 def test_windows_are_compared_from_their_likeliest_starts(full_flight, full_bag, updated):
     job = job_through("actuator", full_flight, full_bag, updated)
-    layout = Layout([full_flight], job.settings.controller, job.settings.job)
-    right = layout.fly(updated)[full_flight.name]
-    wrong = layout.fly(job.settings.vehicle)[full_flight.name]
+    comparison = Comparison(job.recordings, job.settings.controller, window=0.5)
+    right = comparison.fly(updated)[full_flight.name]
+    wrong = comparison.fly(job.settings.vehicle)[full_flight.name]
     assert right.rmse.x < 0.002
     assert wrong.rmse.z > 3 * right.rmse.z
-    assert right.position_time[-1] == pytest.approx(full_flight.duration, abs=0.6)
-    assert np.all(np.diff(right.position_time) > 0)
+    assert right.position.time[-1] == pytest.approx(full_flight.duration, abs=0.6)
+    assert np.all(np.diff(right.position.time) > 0)
 
 
 def test_commands_recorded_too_seldom_are_said(flight, bag, updated, full_flight, full_bag):

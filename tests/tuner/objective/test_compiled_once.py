@@ -14,6 +14,7 @@ from tuner.flights.flight import Series
 from tuner.job.prepare import job_of
 from tuner.objective import normal
 from tuner.objective.normal import Objective
+from tuner.recordings import recordings_of
 
 
 def program(objective: Objective) -> object:
@@ -48,7 +49,10 @@ def test_other_coefficients_and_bounds_are_the_same_program(free):
 
 def test_a_flight_a_little_shorter_is_the_same_program(flight, updated):
     settings = settle(Options(flights=(str(flight.path),), vehicle=updated))
-    jobs = [job_of(settings, (one,), ()) for one in (flight, shortened(flight, 0.4))]
+    jobs = [
+        job_of(settings, recordings_of(settings, [part]))
+        for part in (flight, shortened(flight, 0.4))
+    ]
     assert jobs[0].objective.samples != jobs[1].objective.samples
     assert program(jobs[0].objective) == program(jobs[1].objective)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.tuner.uncertainty import making
-from tuner.comparison.errors import FlightErrors
+from tuner.comparison.errors import FlightErrors, SignalErrors
 from tuner.config import COEFFICIENTS, values_of, write_vehicle
 from tuner.examination.examination import Examination, examine
 from tuner.examination.knowledge import knowledge_of
@@ -80,7 +80,9 @@ def write_run(folder: Path, free: Sequence[str], *, without: Sequence[str] = ())
 def _errors(name: str, size: float) -> FlightErrors:
     time = np.linspace(0.0, making.SECONDS, 300)
     place = size * np.column_stack([np.sin(time), np.cos(time), 0.1 * time])
-    return FlightErrors(name, time, place, time, 10 * place, np.array([2.0, 4.0]), None)
+    zero = np.zeros_like(place)
+    position, attitude = SignalErrors(time, zero, place), SignalErrors(time, zero, 10 * place)
+    return FlightErrors(name, position, attitude, np.array([2.0, 4.0]), None)
 
 
 def _traces(objective: Objective, segment: int) -> dict[str, Array]:

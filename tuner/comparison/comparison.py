@@ -1,0 +1,243 @@
+"""Recordings laid out once, and compared with any number of vehicles at the recorded stamps.
+
+Simulation and reading at the stamps are those of the fit (`tuner.objective.residuals`), and so are
+the stretches: whole flights where the reference enters, windows from recorded starts where a signal
+further down does. A simulation that is fed motor commands, rotor speeds or rate set-points drifts
+away within seconds, whatever its coefficients; over a window its error says how good they are. What
+no recording holds exactly, a window's start and the trim of its rotors, is the likeliest one for
+the vehicle that flies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array as JaxArray
+from jaxtyping import Float
+
+from sim_jax.crash import AIRBORNE, Limits
+from sim_jax.schedule import Schedule
+from tuner.coefficients.space import Space
+from tuner.comparison.errors import (
+    FlightErrors,
+    SignalErrors,
+    joined,
+    laps_of,
+    limits_of,
+    short_way,
+)
+from tuner.config import ControllerFile, VehicleFile
+from tuner.flights.flight import Array
+from tuner.model import Model, model_of, schedule_of
+from tuner.objective.criterion import Criterion
+from tuner.objective.inlets import InletName
+from tuner.objective.normal import Objective
+from tuner.objective.residuals import fly, simulated_at_stamps
+from tuner.objective.segments import (
+    CLOCKS,
+    OFFSETS,
+    Segments,
+    noise_of,
+    segments_of,
+    window_segments,
+)
+from tuner.objective.windows import Window, windows_of
+from tuner.padding import padded_size
+from tuner.recordings import Recording
+from tuner.search.continuation import FAR
+from tuner.simulation.table import roll_pitch_yaw
+
+POSE = ("position", "attitude")
+LAG = 0.03
+"""s over which recent commands tell the speed of a rotor without tachometer."""
+BEYOND = 0.02
+"""s simulated beyond a window, for stamps that are late."""
+LOOSE = 10.0
+"""Multiple of the noise by which a simulation may miss before its start is doubted."""
+ROUNDS = 3
+"""Steps towards the likeliest start."""
+
+
+class Comparison:
+    """Recordings laid out once, to be compared with any number of vehicles.
+
+    Parameters
+    ----------
+    recordings
+        At least one. Their clock offsets are taken as known (`tuner.recordings.with_offsets`); one
+        that a fit would estimate counts as zero.
+    controller
+        What flew.
+    window
+        s, length of the windows of flights that enter below the reference.
+
+    Raises
+    ------
+    RecordingError
+        A flight does not hold what its inlet needs.
+    """
+
+    def __init__(
+        self, recordings: Sequence[Recording], controller: ControllerFile, *, window: float = 1.0
+    ) -> None:
+        self._names = [recording.flight.name for recording in recordings]
+        by_inlet: dict[InletName, list[Recording]] = {}
+        for recording in recordings:
+            by_inlet.setdefault(recording.inlet, []).append(recording)
+        self._groups = [
+            _Group(members, controller, inlet, window) for inlet, members in by_inlet.items()
+        ]
+
+    def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+        """Return flight name to its errors with a vehicle, in the recordings' order."""
+        errors: dict[str, FlightErrors] = {}
+        for group in self._groups:
+            errors |= group.fly(vehicle)
+        return {name: errors[name] for name in self._names}
+
+
+class _Group:
+    """The recordings that enter the loop at the same place, flown side by side."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        controller: ControllerFile,
+        inlet: InletName,
+        seconds: float,
+    ) -> None:
+        self._recordings, self._controller = tuple(recordings), controller
+        self._schedule = schedule_of(controller)
+        self._windowed = inlet != "reference"
+        rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
+        if self._windowed:
+            self._windows = [windows_of(flight, seconds) for flight in flights]
+            self._segments = window_segments(
+                flights,
+                inlets=[inlet] * len(flights),
+                seconds=seconds,
+                schedule=self._schedule,
+                lag=LAG,
+                noise=noise_of(flights),
+            )
+            self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
+        else:
+            self._windows = [(Window(flight, 0.0),) for flight in flights]
+            self._segments = segments_of(flights, noise=dict.fromkeys(POSE, 1.0))
+            longest = max(flight.duration for flight in flights)
+            self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)
+        late = np.array([recording.time_offset or 0.0 for recording in recordings])
+        self._late = late[np.asarray(self._segments.flight)]
+
+    def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+        """Return flight name to its errors, those of windows behind each other."""
+        model = model_of(vehicle, self._controller)
+        simulated, crash_times = _poses_at_stamps(
+            model,
+            self._segments,
+            jnp.asarray(self._late),
+            schedule=self._schedule,
+            samples=self._samples,
+            limits=self._limits,
+            states=jnp.asarray(self._likeliest_starts(model)) if self._windowed else None,
+        )
+        errors, first = {}, 0
+        for recording, windows in zip(self._recordings, self._windows, strict=True):
+            flight, crash = recording.flight, float(crash_times[first])
+            position, attitude = (
+                joined(
+                    [
+                        self._errors(signal, np.asarray(simulated[signal]), first + number, window)
+                        for number, window in enumerate(windows)
+                    ]
+                )
+                for signal in POSE
+            )
+            crashed = not self._windowed and crash <= flight.duration
+            errors[flight.name] = FlightErrors(
+                flight.name, position, attitude, laps_of(flight), crash if crashed else None
+            )
+            first += len(windows)
+        return errors
+
+    def _errors(self, signal: str, simulated: Array, segment: int, window: Window) -> SignalErrors:
+        """Return the errors at the complete samples of a segment."""
+        measured = self._segments.measured[signal]
+        time = np.asarray(measured.time)[:, segment]
+        used = (np.asarray(measured.weight)[..., segment] > 0).all(axis=1)
+        if self._windowed:  # the next one begins where this one ends
+            used &= time < window.flight.duration
+        recorded = np.asarray(measured.values)[used, :, segment]
+        flown = simulated[used, :, segment]
+        if signal == "attitude":
+            recorded, flown = roll_pitch_yaw(recorded), roll_pitch_yaw(flown)
+            return SignalErrors(time[used] + window.begin, recorded, short_way(flown - recorded))
+        return SignalErrors(time[used] + window.begin, recorded, flown - recorded)
+
+    def _likeliest_starts(self, model: Model) -> Array:
+        """Return the likeliest starts (L, F), in the segments' standard deviations."""
+        assert self._segments.freedom is not None
+        objective = Objective(
+            model, self._segments, Space([], {}), self._schedule, self._samples, self._limits
+        )
+        point, flights = objective.start(np.zeros(0)), len(self._recordings)
+        states = np.zeros(self._segments.freedom.shape)
+        for _ in range(ROUNDS):
+            criterion = Criterion(
+                horizon=jnp.asarray(self._samples),
+                scale={name: jnp.full(flights, LOOSE) for name in self._segments.measured},
+                held=jnp.zeros((len(CLOCKS), flights)),
+                huber=jnp.asarray(jnp.inf),
+                prior=jnp.asarray(1.0),
+                states=jnp.asarray(states),
+            )
+            asked = np.asarray(objective.sums(point, criterion, derivatives=False).states)
+            states = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
+        return states
+
+
+@eqx.filter_jit
+def _poses_at_stamps(
+    model: Model,
+    segments: Segments,
+    late: Float[JaxArray, " F"],
+    *,
+    schedule: Schedule,
+    samples: int,
+    limits: Limits,
+    states: Float[JaxArray, "L F"] | None,
+) -> tuple[dict[str, Float[JaxArray, "n c F"]], Float[JaxArray, " F"]]:
+    """Return signal -> what the simulation has at the recorded stamps, and when it crashed in s.
+
+    A stamp that is so late that it was taken before the simulation begins, or so early that it was
+    taken behind its end, is compared with the simulation's first or last sample.
+    """
+    windowed = states is not None
+    trace = fly(
+        model,
+        segments,
+        schedule,
+        samples=padded_size(samples) if windowed else samples,
+        horizon=jnp.asarray(samples) if windowed else None,
+        limits=limits,
+        states=states,
+    )
+    rate = float(schedule.log_rate)
+    on_time = jnp.zeros((len(OFFSETS), segments.count))
+    simulated = {}
+    for signal in POSE:
+        measured = segments.measured[signal]
+        taken = jnp.clip(measured.time - late, 0.0, (samples - 1) / rate)
+        simulated[signal] = simulated_at_stamps(
+            trace,
+            signal,
+            eqx.tree_at(lambda m: m.time, measured, taken),
+            on_time,
+            on_time[: len(CLOCKS)],
+            rate=rate,
+        )
+    return simulated, trace.crash_time

@@ -1,0 +1,130 @@
+"""Which flights a job uses, where each enters the simulated loop, and how late its clocks are.
+
+Every command takes its flights from here: the fit, the comparison, the examination, the export's
+check and the cross-validation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from tuner.config import Settings, TrajectorySettings
+from tuner.config.model import build
+from tuner.errors import InputError, did_you_mean
+from tuner.flights.flight import Flight
+from tuner.flights.load import load_flights
+from tuner.objective.inlets import InletName, inlet_for
+from tuner.simulation.trajectory import with_named_reference
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight, and what a job does with it.
+
+    Attributes
+    ----------
+    flight
+        The mission.
+    inlet
+        Where it enters the simulated loop.
+    time_offset
+        s by which its stamps are late; None where the fit estimates that.
+    holdout
+        Whether it is evaluated and never fitted.
+    """
+
+    flight: Flight
+    inlet: InletName = "reference"
+    time_offset: float | None = 0.0
+    holdout: bool = False
+
+
+def read_recordings(
+    settings: Settings, *, holdout: Sequence[str] | None = None
+) -> tuple[Recording, ...]:
+    """Read every mission of the settled files, and assign it what the job file says of it.
+
+    Parameters
+    ----------
+    settings
+        Of the job.
+    holdout
+        Names of the flights that are held out; None takes the job's.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, a flight does not hold what its inlet needs, its side-car names an
+        impossible trajectory, or a held-out flight is not there.
+    """
+    job = settings.job
+    flights = [
+        flight
+        for path in settings.flights
+        for flight in load_flights(path, topics=job.topics, namespace=job.namespace)
+    ]
+    names = [flight.name for flight in flights]
+    for name in job.holdout:
+        if name not in names:
+            raise InputError(
+                "holdout",
+                f"there is no flight '{name}' in the recordings",
+                did_you_mean(name, names),
+            )
+    return recordings_of(
+        settings, (_with_reference(flight, settings) for flight in flights), holdout=holdout
+    )
+
+
+def recordings_of(
+    settings: Settings, flights: Iterable[Flight], *, holdout: Sequence[str] | None = None
+) -> tuple[Recording, ...]:
+    """Assign flights the inlet, the clock offset and the part that a job's settings give them.
+
+    Parameters
+    ----------
+    settings, holdout
+        As of `read_recordings`.
+    flights
+        With a reference where one is named.
+
+    Raises
+    ------
+    RecordingError
+        A flight does not hold what its inlet needs.
+    """
+    held_out = settings.job.holdout if holdout is None else holdout
+    return tuple(_assigned(settings, flight, flight.name in held_out) for flight in flights)
+
+
+def with_offsets(
+    recordings: Sequence[Recording], offsets: Mapping[str, float]
+) -> tuple[Recording, ...]:
+    """Return recordings whose clocks are late by known s: flight name -> s."""
+    return tuple(replace(r, time_offset=offsets[r.flight.name]) for r in recordings)
+
+
+def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
+    job, flight_settings = settings.job, settings.job.flights.get(flight.name)
+    inlet, offset = job.inlet, job.time_offset
+    if flight_settings is not None:
+        inlet = flight_settings.inlet or inlet
+        offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
+    return Recording(
+        flight,
+        inlet_for(flight, inlet),
+        None if offset == "free" else float(offset),
+        holdout,
+    )
+
+
+def _with_reference(flight: Flight, settings: Settings) -> Flight:
+    """Return a flight with the trajectory that the job file names, or else its side-car."""
+    flight_settings = settings.job.flights.get(flight.name)
+    if flight_settings is not None and flight_settings.trajectory is not None:
+        return with_named_reference(flight, flight_settings.trajectory)
+    if flight.trajectory is not None and not flight.has("reference_position"):
+        named = build(TrajectorySettings, flight.trajectory, f"side-car of {flight.path}")
+        return with_named_reference(flight, named)
+    return flight
