@@ -230,7 +230,7 @@ def sensitivity(
         The input cannot be used; one line says what to do.
     """
     configure()
-    from tuner.job.run import folder_for  # noqa: PLC0415
+    from tuner.job.folder import folder_for  # noqa: PLC0415
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
     options = Options(

@@ -35,6 +35,10 @@ class RecordingError(InputError):
     """A recording cannot be read, or lacks what is asked of it."""
 
 
+class OutputError(InputError):
+    """A file or folder cannot be written where it was asked for."""
+
+
 class ExportError(InputError):
     """An export was refused or could not be written."""
 

@@ -1,11 +1,9 @@
-"""Files of this program's own: text that appears whole, JSON read with a limit and a version."""
+"""JSON and CSV of a result folder: JSON is read with a limit and a schema version."""
 
 from __future__ import annotations
 
 import csv
 import io
-import os
-import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import ClassVar, TypeVar
@@ -18,30 +16,6 @@ from tuner.validation import config_error
 
 MAX_BYTES = 50_000_000
 """Of a JSON file of a result folder."""
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file that appears whole or not at all.
-
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written to.
-    """
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as file:
-                file.write(text)
-            Path(name).chmod(0o644)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        raise ConfigError(
-            path, f"cannot be written ({error.strerror})", "check the folder"
-        ) from None
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
@@ -65,7 +39,7 @@ def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
     try:
         with path.open("rb") as file:
             raw = file.read(most + 1)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise ConfigError(path, "does not exist", remedy) from None
     except OSError as error:
         raise ConfigError(path, f"cannot be read ({error.strerror})", remedy) from None

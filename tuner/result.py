@@ -8,8 +8,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from tuner.config import COEFFICIENTS, VehicleFile, read_vehicle
+from tuner.disk import exists, write_text
 from tuner.errors import InputError
-from tuner.files import Part, read_json, write_text
+from tuner.files import Part, read_json
 from tuner.findings import Finding
 
 SCHEMA_VERSION = 2
@@ -140,7 +141,7 @@ def read_run(folder: str | Path) -> Run:
         It is no result folder, or is of another schema version, or its two files disagree.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
     path = folder / RESULT_FILE
     result = read_json(RunResult, path, version=SCHEMA_VERSION, remedy=REMEDY)

@@ -71,7 +71,7 @@ def sensitivity(
 
     configure()
     from tuner.config import Options
-    from tuner.job.run import folder_for
+    from tuner.job.folder import folder_for
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
 
     options = Options(

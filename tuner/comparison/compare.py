@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tuner.comparison.comparison import Comparison
 from tuner.comparison.table import Table, table_of
-from tuner.comparison.write import check_suffix, write_table
+from tuner.comparison.write import check_table_file, write_table
 from tuner.config import Options, Settings, VehicleFile, find_config, read_vehicle, settle
 from tuner.errors import InputError
 from tuner.recordings import read_recordings
@@ -40,7 +40,7 @@ def compare(
         Something named does not exist, cannot be read, or holds no reference.
     """
     for path in out:
-        check_suffix(path)
+        check_table_file(path)
     settings = settle(options, fits=False)
     if not vehicles:
         raise InputError("--vehicle", "names no vehicle", "name those to compare")

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tuner.comparison.table import UNITS, Row, Table
+from tuner.disk import check_file, write_text
 from tuner.errors import InputError
-from tuner.files import write_text
 
 SCHEMA_VERSION = 1
 TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
@@ -27,9 +27,10 @@ def write_table(table: Table, path: Path) -> None:
     write_text(path, _writer(path)(table))
 
 
-def check_suffix(path: Path) -> None:
-    """Refuse a file whose suffix names no format, before anything is computed."""
+def check_table_file(path: Path) -> None:
+    """Refuse a file that `write_table` could not write, before anything is computed."""
     _writer(path)
+    check_file(path)
 
 
 def _writer(path: Path) -> Callable[[Table], str]:

@@ -16,6 +16,7 @@ from tuner.config.job import JobFile, Method, read_job
 from tuner.config.shipped import Kind, find_config
 from tuner.config.values import check_names, with_values
 from tuner.config.vehicle import VehicleFile, read_vehicle
+from tuner.disk import exists
 from tuner.errors import ConfigError, InputError, did_you_mean
 from tuner.flights.paths import find_flights
 from tuner.validation import config_error
@@ -210,7 +211,7 @@ def _holdout(
     for word in options.holdout:
         if _is_among(word, names):
             held.append(word)
-        elif Path(word).exists() or glob.has_magic(word):
+        elif exists(Path(word)) or glob.has_magic(word):
             for path in find_flights([word]):
                 held.append(path.stem)
                 if path.resolve() not in {flight.resolve() for flight in (*flights, *extra)}:

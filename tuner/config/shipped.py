@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
+from tuner.disk import exists
 from tuner.errors import ConfigError, did_you_mean
 
 Kind = Literal["vehicles", "controllers", "topics"]
@@ -35,7 +36,7 @@ def find_config(kind: Kind, reference: str, base: Path) -> Path:
         A bare name is no shipped file's. Whether a path can be read is for its reader to say.
     """
     path = base / Path(reference).expanduser()
-    if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or path.exists():
+    if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or exists(path):
         return path
     folder = configs_folder() / kind
     known = {file.stem: file for file in sorted(folder.glob("*.yaml"))}

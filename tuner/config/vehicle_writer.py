@@ -7,7 +7,7 @@ from pathlib import Path
 from tuner.coefficients import COEFFICIENTS
 from tuner.config.vehicle import VehicleFile
 from tuner.config.yaml_file import commented, dump_yaml
-from tuner.files import write_text
+from tuner.disk import write_text
 
 UNIT_COLUMN = 44
 

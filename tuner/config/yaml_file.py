@@ -10,8 +10,9 @@ from pathlib import Path
 
 import yaml
 
+from tuner.disk import exists, write_text
 from tuner.errors import ConfigError
-from tuner.files import read_bytes, write_text
+from tuner.files import read_bytes
 from tuner.validation import Place
 
 MAX_BYTES = 1_000_000
@@ -140,7 +141,7 @@ def _set_style(node: yaml.Node, depth: int) -> None:
 
 
 def _read_text(path: Path) -> str:
-    if path.is_dir():
+    if exists(path) and path.is_dir():
         raise ConfigError(path, "is a folder", "give the path of a YAML file")
     raw = read_bytes(path, most=MAX_BYTES, remedy="give the path of a YAML file")
     try:

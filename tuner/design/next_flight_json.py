@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.files import Part, csv_text, read_optional, write_text
+from tuner.disk import write_text
+from tuner.files import Part, csv_text, read_optional
 from tuner.wording.phrases import listed
 
 NEXT_FILE = "next_flight.json"

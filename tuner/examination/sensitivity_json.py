@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.files import Part, read_optional, write_text
+from tuner.disk import write_text
+from tuner.files import Part, read_optional
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import Reason, Verdict
 

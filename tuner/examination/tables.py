@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from tuner.disk import write_text
 from tuner.examination.sensitivity_json import Knowledge, write_knowledge
-from tuner.files import csv_text, write_text
+from tuner.files import csv_text
 
 SENSITIVITY_FILE = "sensitivity.csv"
 SHARES_FILE = "information_shares.csv"

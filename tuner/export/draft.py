@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tuner.config import VehicleFile, values_of
+from tuner.disk import make_folder, whole_file
 from tuner.errors import ConfigError, ExportError
-from tuner.files import read_bytes, write_text
+from tuner.files import read_bytes
 
 MAX_BYTES = 10_000_000
 #: Numbers are written with twelve digits; mass and inertia may go through sums of links.
@@ -49,25 +50,23 @@ def differences(wanted: VehicleFile, found: VehicleFile) -> list[str]:
 
 
 def write(draft: Draft, path: Path) -> None:
-    """Write a draft and read it back.
+    """Write a draft if it reads back as what it should hold; otherwise the file stays as it was.
 
     Raises
     ------
     ExportError
-        It cannot be written, or does not hold what it should.
+        It does not hold what it should.
+    OutputError
+        It cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, draft.text)
-    except OSError as error:
-        raise ExportError(
-            path, f"cannot be written ({error.strerror})", "check the folder"
-        ) from None
-    except ConfigError as error:
-        raise ExportError(path, error.what, error.remedy) from None
-    wrong = draft.faults(path)
-    if wrong:
-        raise ExportError(path, f"does not read back: {'; '.join(wrong)}", "do not use it")
+    make_folder(path.parent)
+    with whole_file(path) as unfinished:
+        unfinished.write_text(draft.text, encoding="utf-8")
+        wrong = draft.faults(unfinished)
+        if wrong:
+            raise ExportError(
+                path, f"would not read back: {'; '.join(wrong)}", "report this; nothing was written"
+            )
 
 
 def read_file(path: Path) -> str:

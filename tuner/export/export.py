@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from tuner.config import VehicleFile
+from tuner.disk import check_file
 from tuner.errors import ExportError
 from tuner.export.draft import Draft, write
 from tuner.export.gates import Gate, Refly, check
@@ -76,8 +77,12 @@ def export(
     Raises
     ------
     ExportError
-        A gate is not met, the model cannot be patched, or the file does not read back.
+        A gate is not met, the model cannot be patched, or the file would not read back.
+    OutputError
+        The file cannot be written.
     """
+    path = out or into or run.folder / "export" / f"{run.vehicle.name}{SUFFIX[kind]}"
+    check_file(path, folder_is_made=True)
     if into is not None and kind != "sdf":
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
     vehicle, decided = exported_vehicle(run, today)
@@ -90,7 +95,6 @@ def export(
             f"its numbers are not fit to export: {'; '.join(refused)}",
             "fit again, or export with --accept 'REASON'",
         )
-    path = out or into or run.folder / "export" / f"{run.vehicle.name}{SUFFIX[kind]}"
     write(draft, path)
     return Exported(path, gates, (*decided, *draft.notes))
 

@@ -16,6 +16,8 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
+from tuner.errors import RecordingError
+
 logger = logging.getLogger(__name__)
 
 #: Files above this, in bytes, are not read again only to learn that they are unchanged.
@@ -38,7 +40,22 @@ def cache_folder() -> Path:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file, or of all the files in a folder with their names."""
+    """Return the SHA-256 of a file, or of all the files in a folder with their names.
+
+    Raises
+    ------
+    RecordingError
+        A file cannot be read.
+    """
+    try:
+        return _digest_of(path)
+    except OSError as error:
+        raise RecordingError(
+            path, f"cannot be read ({error.strerror})", "check its rights"
+        ) from None
+
+
+def _digest_of(path: Path) -> str:
     files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
     about = [(str(file), file.stat()) for file in files]
     if sum(stat.st_size for _, stat in about) <= LARGE:

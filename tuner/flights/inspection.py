@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tuner.disk import exists
 from tuner.errors import InputError, RecordingError
 from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.damage import Cause, Damage
@@ -225,7 +226,7 @@ def inspect_recordings(
 def _inspect(
     path: Path, topics: str | Path | TopicMap | None, namespace: str, *, cache: bool
 ) -> Inspection:
-    if not path.exists():
+    if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
     beside = path / "flight.yaml" if path.is_dir() else path.with_suffix(".yaml")
     plain = topics is None and not beside.is_file()

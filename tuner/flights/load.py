@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuner.disk import exists
 from tuner.errors import RecordingError
 from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.clock import Grid, fit_grid
@@ -146,7 +147,7 @@ def load_flights(
     """Read every mission of a recording; see `load_flight`."""
     path = Path(path)
     settings = Settings(topics, namespace, rate)
-    if not path.exists():
+    if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
     sidecar = read_sidecar(path)
     given = given_map(path, settings, sidecar)

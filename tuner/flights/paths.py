@@ -6,6 +6,7 @@ import glob
 from collections.abc import Iterable
 from pathlib import Path
 
+from tuner.disk import exists
 from tuner.errors import InputError
 
 
@@ -20,7 +21,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     found: dict[Path, Path] = {}
     for pattern in patterns:
         path = Path(pattern).expanduser()
-        if path.exists():
+        if exists(path):
             matches = [path]
         elif glob.has_magic(pattern):
             matches = [Path(match) for match in sorted(glob.glob(str(path)))]  # noqa: PTH207

@@ -10,6 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
+from tuner.disk import whole_file
 from tuner.errors import InputError
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
@@ -41,8 +42,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
         "iterations": [asdict(iteration) for iteration in progress.iterations[:done]],
         "channels": list(progress.scales),
     }
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
+    with whole_file(path) as unfinished, unfinished.open("wb") as file:
         np.savez(
             file,
             head=np.frombuffer(json.dumps(head).encode(), np.uint8),
@@ -52,7 +52,6 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
             losses=progress.losses,
             states=np.zeros(0) if progress.states is None else progress.states,
         )
-    temporary.replace(path)
 
 
 def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:

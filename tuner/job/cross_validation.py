@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.config import with_values
+from tuner.disk import write_text
 from tuner.errors import ConfigError, RecordingError
-from tuner.files import write_text
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.results import best_values, comparison_of

@@ -22,7 +22,7 @@ from tuner.config import (
     with_values,
     write_vehicle,
 )
-from tuner.files import write_text
+from tuner.disk import write_text
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT

@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tuner.config import Options, Settings, settle, with_values, write_vehicle
+from tuner.disk import make_folder
 from tuner.errors import ConfigError, InputError
+from tuner.job.folder import folder_for
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.wording.findings import one_line, remedy, sentence
 from tuner.wording.phrases import clause
@@ -117,7 +119,7 @@ def run(
     job = prepare(settings)
     findings = check(job)
     _report(findings, listener, force=force)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     keep = _keeper(folder, listener)
     try:
         fitted = search(job, folder, resume=resume, tell=keep, findings=findings)
@@ -187,20 +189,3 @@ def _keeper(folder: Path, listener: Listener) -> Callable[[Job, Progress], None]
         tell(job, progress)
 
     return keep
-
-
-def folder_for(out: Path | None, *, resume: bool = False) -> Path:
-    """Return the folder to write into: the one named, or a new one under ``runs/``.
-
-    Raises
-    ------
-    InputError
-        A file is in the way, or nothing is named to go on in.
-    """
-    if out is None:
-        if resume:
-            raise InputError("--resume", "needs the folder to go on in", "name it with --out")
-        return Path("runs") / datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    if out.exists() and not out.is_dir():
-        raise InputError(out, "is a file", "name a folder with --out")
-    return out

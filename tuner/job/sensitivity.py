@@ -14,6 +14,7 @@ from tuner.config import Options, Settings, check_names, initial_values, settle
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.design.next_flight_json import Proposals, write_proposals
 from tuner.design.ranking import Habits, rank_next_flights
+from tuner.disk import make_folder
 from tuner.errors import InputError
 from tuner.examination.examination import Examination, examine
 from tuner.examination.knowledge import knowledge_of
@@ -119,7 +120,7 @@ def examine_vehicle(
     if request.samples is not None and request.samples < 2:
         raise InputError("--samples", f"{request.samples} tell nothing", "give at least 2")
     job = job_of(settings, read_recordings(settings, holdout=()))
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     fitted = as_it_is(job)
     say("simulating, and differentiating by every coefficient")
     examination = examine(fitted)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tuner.design.next_flight_json import Proposals, read_proposals
+from tuner.disk import exists
 from tuner.errors import InputError
 from tuner.examination.sensitivity_json import Knowledge, read_knowledge
 from tuner.flights.flight import Array
@@ -70,7 +71,7 @@ def read_contents(folder: str | Path) -> Contents:
         It is neither, or one of its files cannot be used.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
     run, about = None, read_about(folder)
     if about is None or (folder / RESULT_FILE).exists():

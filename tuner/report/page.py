@@ -11,7 +11,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from tuner.files import write_text
+from tuner.disk import write_text
 from tuner.report.chart import Chart
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tuner.files import write_text
+from tuner.disk import make_folder, write_text
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
     import matplotlib as mpl  # noqa: PLC0415 (a second to import)
 
     mpl.use("Agg", force=False)
-    (folder / PLOTS).mkdir(exist_ok=True)
+    make_folder(folder / PLOTS)
     written = []
     with mpl.rc_context(SETTINGS):
         for chart in charts:

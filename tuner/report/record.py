@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import JsonValue
 
-from tuner.files import Part, read_optional, write_text
+from tuner.disk import write_text
+from tuner.files import Part, read_optional
 from tuner.findings import Finding
 from tuner.result import AxesRmse
 

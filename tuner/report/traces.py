@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.comparison.errors import FlightErrors
+from tuner.disk import whole_file
 
 Array = NDArray[np.float64]
 
@@ -51,11 +51,8 @@ def save_traces(folder: Path, flights: Mapping[str, Mapping[str, Array]]) -> Non
         for flight, parts in flights.items()
         for name, values in parts.items()
     }
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    temporary = folder / f"{TRACES_FILE}.tmp"
-    temporary.write_bytes(buffer.getvalue())
-    temporary.replace(folder / TRACES_FILE)
+    with whole_file(folder / TRACES_FILE) as unfinished, unfinished.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_traces(folder: Path) -> dict[str, dict[str, Array]]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from tuner.files import Part, csv_text, read_optional, write_text
+from tuner.disk import write_text
+from tuner.files import Part, csv_text, read_optional
 
 Method = Literal["morris", "sobol"]
 GLOBAL_FILE = "global_sensitivity.json"

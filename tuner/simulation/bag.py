@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag1 import Writer, WriterError
+from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tuner.errors import InputError
+from tuner.disk import whole_file
 from tuner.simulation.simulate import Simulation
 
 #: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
@@ -64,16 +63,12 @@ def write_bag(simulation: Simulation, path: Path) -> None:
 
     Raises
     ------
-    InputError
+    OutputError
         The file cannot be written.
     """
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-            unfinished = Path(folder) / path.name
-            _write(simulation, unfinished)
-            unfinished.replace(path)
-    except (OSError, WriterError) as error:
-        raise InputError(path, f"cannot be written ({error})", "check the folder") from None
+    with whole_file(path) as unfinished:
+        unfinished.unlink()  # the writer refuses a file that exists
+        _write(simulation, unfinished)
 
 
 def _write(simulation: Simulation, path: Path) -> None:

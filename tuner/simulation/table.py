@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.errors import InputError
+from tuner.disk import whole_file
 from tuner.flights.flight import Array
 from tuner.simulation.simulate import Simulation
 
@@ -37,25 +37,19 @@ def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
 
     Raises
     ------
-    InputError
+    OutputError
         The file cannot be written.
     """
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    try:
-        with unfinished.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            for number, simulation in enumerate(simulations):
-                if number == 0:
-                    names = (name for columns in COLUMNS.values() for name in columns)
-                    writer.writerow([*simulation.coefficients, "time", *names])
-                writer.writerows(_rows(simulation))
-        unfinished.replace(path)
-    except OSError as error:
-        raise InputError(
-            path, f"cannot be written ({error.strerror})", "check the folder"
-        ) from None
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with (
+        whole_file(path) as unfinished,
+        unfinished.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        for number, simulation in enumerate(simulations):
+            if number == 0:
+                names = (name for columns in COLUMNS.values() for name in columns)
+                writer.writerow([*simulation.coefficients, "time", *names])
+            writer.writerows(_rows(simulation))
 
 
 def _rows(simulation: Simulation) -> Iterator[list[float]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuner.disk import check_file
 from tuner.errors import InputError
 from tuner.simulation.bag import write_bag
 from tuner.simulation.simulate import Simulation
@@ -51,6 +52,7 @@ def write_flights(simulations: Iterable[Simulation], path: Path) -> tuple[Summar
     }
     if path.suffix not in writers:
         raise InputError(path, f"no flight is written as '{path.suffix}'", "name a .csv or a .bag")
+    check_file(path)
     summaries: list[Summary] = []
 
     def passing() -> Iterator[Simulation]:

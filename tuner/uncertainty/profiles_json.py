@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from tuner.files import Part, csv_text, read_optional, write_text
+from tuner.disk import write_text
+from tuner.files import Part, csv_text, read_optional
 
 PROFILES_FILE = "profiles.json"
 PROFILES_TABLE = "profiles.csv"

@@ -3,7 +3,7 @@ import re
 import pytest
 
 from tuner.config.yaml_file import MAX_BYTES, dump_yaml, read_yaml, write_yaml
-from tuner.errors import ConfigError
+from tuner.errors import ConfigError, OutputError
 
 
 def refusal(tmp_path, text):
@@ -63,7 +63,7 @@ def test_sections_have_a_line_for_each_key_and_deeper_values_one_line():
 
 def test_writing_leaves_no_half_file(tmp_path):
     target = tmp_path / "nowhere" / "x.yaml"
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(OutputError, match="cannot be written"):
         write_yaml({}, target)
     write_yaml({"a": 1}, tmp_path / "x.yaml")
     assert [file.name for file in tmp_path.iterdir()] == ["x.yaml"]

@@ -151,10 +151,12 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     assert all(line.startswith("not exported as ") and "held position" in line for line in lines)
 
 
-def test_a_file_that_does_not_read_back_is_not_reported_as_written(tmp_path, make_run):
-    draft = Draft("text", make_run().vehicle, (), lambda path: [f"{path.name} is wrong"])
-    with pytest.raises(ExportError, match=r"does not read back: a\.txt is wrong"):
+def test_a_file_that_would_not_read_back_is_not_written(tmp_path, make_run):
+    (tmp_path / "a.txt").write_text("before")
+    draft = Draft("text", make_run().vehicle, (), lambda path: [f"{path.read_text()} is wrong"])
+    with pytest.raises(ExportError, match=r"a\.txt: would not read back: text is wrong"):
         write(draft, tmp_path / "a.txt")
+    assert (tmp_path / "a.txt").read_text() == "before"
 
 
 def test_gates_fly_what_the_format_holds(make_run, tmp_path):

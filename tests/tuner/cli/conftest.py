@@ -1,0 +1,3 @@
+from tests.tuner.export.conftest import make_run
+
+__all__ = ["make_run"]

@@ -1,0 +1,108 @@
+"""Places that cannot be written to or read: one line, exit status 2, and nothing is touched."""
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from tuner.cli import main
+
+BAG = Path(__file__).parents[3] / "reference_flights" / "yaw_spin_3rps.bag"
+LONG = "x" * 300
+TUNE = ("--flights", "{bag}")
+SENSITIVITY = ("sensitivity", "--flights", "{bag}")
+COMPARE = ("compare", "--flights", "{bag}", "--vehicle", "hovergames")
+SIMULATE = ("simulate", "--trajectory", "hover", "--duration", "4")
+EXPORT = ("export", "{lab}/run", "--format")
+
+INSIDE, NO_FOLDER = "it lies inside a file", "its folder does not exist"
+A_FILE, A_FOLDER, TOO_LONG = "it is a file", "it is a folder", "path is too long"
+
+OUT = [
+    *((command, "{bag}/x", INSIDE) for command in (TUNE, SENSITIVITY)),
+    *((command, "{bag}/x/y", INSIDE) for command in (TUNE, SENSITIVITY)),
+    *((command, "{bag}", A_FILE) for command in (TUNE, SENSITIVITY)),
+    *((command, LONG, TOO_LONG) for command in (TUNE, SENSITIVITY)),
+    *((command, "{lab}/locked/x", "may not write") for command in (TUNE, SENSITIVITY)),
+    ((*TUNE, "--resume"), "{lab}/new", "nothing to resume"),
+    ((*TUNE, "--resume"), "{bag}", A_FILE),
+    *((command, "{bag}/x.csv", INSIDE) for command in (COMPARE, SIMULATE)),
+    *((command, "{lab}/new/x.csv", NO_FOLDER) for command in (COMPARE, SIMULATE)),
+    *((command, "{lab}/folder.csv", A_FOLDER) for command in (COMPARE, SIMULATE)),
+    *((command, f"{LONG}.csv", TOO_LONG) for command in (COMPARE, SIMULATE)),
+    *((command, "{lab}/locked/x.csv", "may not write") for command in (COMPARE, SIMULATE)),
+    (SIMULATE, "{bag}/x.bag", INSIDE),
+    (SIMULATE, "{lab}/folder.bag", A_FOLDER),
+    ((*EXPORT, "px4"), "{bag}/x.params", INSIDE),
+    ((*EXPORT, "yaml"), "{lab}/folder.csv", A_FOLDER),
+    ((*EXPORT, "yaml"), LONG, TOO_LONG),
+    ((*EXPORT, "sdf"), "{lab}/locked/x.sdf", "may not write"),
+]
+
+IN = [
+    (("--flights", LONG), "cannot be read"),
+    (("--flights", "{bag}/x"), "does not exist"),
+    (("--flights", "{lab}/folder.bag"), "is a folder"),
+    (("--flights", "{bag}", "--holdout", LONG), "cannot be read"),
+    (("--flights", "{bag}", "--config", "{lab}/folder.bag"), "is a folder"),
+    (("--flights", "{bag}", "--config", LONG), "cannot be read"),
+    (("--flights", "{bag}", "--vehicle", LONG), "cannot be read"),
+    (("--flights", "{bag}", "--vehicle", "{lab}"), "is a folder"),
+    (("--flights", "{bag}", "--controller", "{bag}/x.yaml"), "does not exist"),
+    (("inspect", LONG), "cannot be read"),
+    (("inspect", "{lab}/folder.bag"), "is a folder"),
+    (("report", LONG), "cannot be read"),
+    (("report", "{bag}"), "is no folder"),
+    (("report", "{bag}/x"), "is no folder"),
+    (("report", "{lab}/folder.csv"), "result.json"),
+    (("export", LONG, "--format", "px4"), "cannot be read"),
+    ((*EXPORT, "sdf", "--into", "{lab}/folder.csv"), A_FOLDER),
+    ((*EXPORT, "sdf", "--into", "{lab}/none.sdf"), "does not exist"),
+    ((*EXPORT, "sdf", "--into", LONG), TOO_LONG),
+]
+
+
+@pytest.fixture
+def lab(tmp_path, make_run, monkeypatch):
+    """A folder with a recording, a result folder, folders named like files, and a locked one."""
+    make_run()
+    for name in ("folder.csv", "folder.bag", "locked"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "spin.bag").write_bytes(BAG.read_bytes())
+    access = os.access  # whoever runs the tests may be allowed everything
+    monkeypatch.setattr(
+        "tuner.disk.os.access",
+        lambda path, mode: "locked" not in Path(path).parts and access(path, mode),
+    )
+    return tmp_path
+
+
+def content(folder):
+    return {
+        path.relative_to(folder): path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*")
+    }
+
+
+def refused(arguments, expected, lab, capsys):
+    before = content(lab)
+    words = [word.format(bag=lab / "spin.bag", lab=lab) for word in arguments]
+    assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert err.startswith("tune: ")
+    assert err.count("\n") == 1
+    assert expected in err
+    assert "Errno" not in err
+    assert out.count("written to") == 0
+    assert content(lab) == before
+
+
+@pytest.mark.parametrize(("command", "place", "expected"), OUT)
+def test_a_place_that_cannot_be_written_to(command, place, expected, lab, capsys):
+    refused((*command, "--out", place), expected, lab, capsys)
+
+
+@pytest.mark.parametrize(("command", "expected"), IN)
+def test_a_place_that_cannot_be_read(command, expected, lab, capsys):
+    refused(command, expected, lab, capsys)
