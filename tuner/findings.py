@@ -59,5 +59,5 @@ class Finding:
     code: Code
     level: Level
     subject: str
-    numbers: Mapping[str, float] = field(default_factory=dict)
+    numbers: Mapping[str, int | float] = field(default_factory=dict)
     names: tuple[str, ...] = ()

@@ -1,17 +1,19 @@
-"""What a run found, as ``result.json`` and ``best_fit.yaml`` hold it in the result folder."""
+"""The result of a run, as ``result.json`` and ``best_fit.yaml`` hold it in the result folder."""
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
 from tuner.config import COEFFICIENTS, VehicleFile, read_vehicle
 from tuner.disk import exists, write_text
 from tuner.errors import InputError
 from tuner.files import Part, read_json
 from tuner.findings import Finding
+from tuner.uncertainty.verdict import Reason, Verdict
 
 SCHEMA_VERSION = 2
 
@@ -20,13 +22,27 @@ BEST_FIT_FILE = "best_fit.yaml"
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
 
+class Status(StrEnum):
+    """How a run ended."""
+
+    CONVERGED = "converged"
+    STOPPED = "stopped"
+
+
+class Ending(StrEnum):
+    """Why a search stopped."""
+
+    NO_FURTHER_GAIN = "no_further_gain"
+    ITERATION_LIMIT = "iteration_limit"
+
+
 class CoefficientResult(Part):
-    """One coefficient: where it started, where it ended, how sure that is.
+    """One coefficient: its initial and best value, how well it is known, and why.
 
     Attributes
     ----------
     unit
-        As in `tuner.config.COEFFICIENTS`.
+        As in the registry of coefficients.
     initial, best
         Values.
     fitted
@@ -34,11 +50,13 @@ class CoefficientResult(Part):
     lower, upper
         Bounds of the search; None where there were none.
     std_error, ci95
-        Standard error and 95 % interval; None where it was not fitted or cannot be told.
+        Standard error and 95 % interval; None where it was not fitted or they are not finite.
     identifiable
         Whether the flights determine it; None where it was not fitted.
+    verdict, reason
+        How well it is known, and the code and numbers behind that.
     note
-        Anything a reader should know.
+        Both as a phrase for people; nothing reads it back.
     """
 
     unit: str
@@ -50,7 +68,13 @@ class CoefficientResult(Part):
     std_error: float | None = None
     ci95: tuple[float, float] | None = None
     identifiable: bool | None = None
+    verdict: Verdict
+    reason: Reason
     note: str = ""
+
+    @field_serializer("reason")
+    def _without_nulls(self, reason: Reason) -> dict[str, JsonValue]:
+        return reason.model_dump(mode="json", exclude_none=True)
 
 
 class AxesRmse(Part):
@@ -85,7 +109,7 @@ class FlightResult(Part):
 
 
 class SearchResult(Part):
-    """How the minimum was found; ``wall_time`` in s."""
+    """How the minimum was found; ``wall_time`` in s, ``message`` says why it stopped."""
 
     method: str
     evaluations: int
@@ -94,14 +118,14 @@ class SearchResult(Part):
     cost_initial: float | None
     cost_best: float | None
     converged: bool
-    message: str
+    message: Ending
 
 
 class RunResult(Part):
     """The content of ``result.json``."""
 
     schema_version: int
-    status: str
+    status: Status
     seed: int
     versions: dict[str, str]
     settings: dict[str, JsonValue]
@@ -112,7 +136,7 @@ class RunResult(Part):
 
 
 class Run(BaseModel):
-    """A result folder that was read: what was found, and the vehicle with the best coefficients."""
+    """A result folder that was read: its result, and the vehicle with the best coefficients."""
 
     model_config = ConfigDict(frozen=True)
 

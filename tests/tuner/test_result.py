@@ -4,6 +4,7 @@ import pytest
 
 from tests.tuner.export.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.errors import InputError
+from tuner.findings import Code, Finding
 from tuner.result import read_run, write_result
 
 
@@ -22,6 +23,25 @@ def test_keys_of_later_versions_are_passed_over(make_run):  # noqa: F811
     assert read_run(run.folder).result == run.result
 
 
+FIXED = {"verdict": "fixed", "reason": {"code": "not_fitted"}}
+
+
+def test_a_verdict_is_a_code_with_the_numbers_of_its_reason(make_run):  # noqa: F811
+    run = make_run()
+    written = json.loads((run.folder / "result.json").read_text())["coefficients"]["mass"]
+    assert written["verdict"] == "well_known"
+    assert written["reason"] == {"code": "interval", "half_width": 0.02}
+
+
+def test_findings_come_back_as_they_were(make_run):  # noqa: F811
+    run = make_run()
+    finding = Finding(Code.SALVAGED, "warning", "circle", {"lost": 7, "start": 1.5}, ("x", ""))
+    write_result(run.result.model_copy(update={"findings": (finding,)}), run.folder)
+    (again,) = read_run(run.folder).result.findings
+    assert again == finding
+    assert repr(again.numbers["lost"]) == "7"
+
+
 @pytest.mark.parametrize(
     ("change", "expected"),
     [
@@ -29,8 +49,13 @@ def test_keys_of_later_versions_are_passed_over(make_run):  # noqa: F811
         ({"schema_version": 1}, "has schema version 1, and this tune reads version 2"),
         ({"schema_version": None}, "has no schema version"),
         ({"seed": "x"}, "seed is 'x'"),
+        ({"status": "done"}, "status is 'done'"),
         (
-            {"coefficients": {"mas": {"unit": "", "initial": 1, "best": 1, "fitted": False}}},
+            {
+                "coefficients": {
+                    "mas": {"unit": "", "initial": 1, "best": 1, "fitted": False} | FIXED
+                }
+            },
             "'mas'",
         ),
     ],

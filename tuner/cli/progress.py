@@ -63,14 +63,20 @@ def listening(*, quiet: bool) -> Iterator[Listener]:
 
 def print_run(folder: Path, result: RunResult) -> None:
     """Print the coefficients, the RMSE before and after, and where everything lies."""
+    from tuner.wording.status import ending_sentence
+
     screen = console()
     screen.print(_coefficients(result))
     screen.print(_errors(result))
     search = result.search
     screen.print(
-        f"{search.evaluations} Jacobians in {search.wall_time:.0f} s, {search.message}; "
+        f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "
+        f"{search.wall_time:.0f} s."
+    )
+    screen.print(
         f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv, "
-        "sensitivity.csv)"
+        "sensitivity.csv)",
+        markup=False,
     )
 
 

@@ -6,26 +6,23 @@ from datetime import date
 
 from pydantic import JsonValue
 
-from tuner.config import VehicleFile, with_values
+from tuner.config import VehicleFile
 from tuner.result import Run
+from tuner.wording.verdicts import judgement_in_words
 
 
 def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...]]:
-    """Return the vehicle that leaves the run, with source and confidence, and what was decided.
+    """Return the run's best vehicle with source and confidence, and a note on each doubtful number.
 
-    A coefficient that the flights do not determine keeps its initial value.
+    What the run held at its initial value has that value there; what was fitted beside it keeps
+    the value that goes with it.
     """
-    kept = {
-        name: found.initial
+    notes = tuple(
+        f"{name} = {found.best:g} is {judgement_in_words(found.verdict, found.reason)}"
         for name, found in run.result.coefficients.items()
         if found.fitted and found.identifiable is False
-    }
-    vehicle = with_values(run.vehicle, kept) if kept else run.vehicle
-    notes = tuple(
-        f"{name} is not identifiable from these flights and keeps its initial value {value:g}"
-        for name, value in kept.items()
     )
-    return vehicle.replace(source=_source(run, today)), notes
+    return run.vehicle.replace(source=_source(run, today)), notes
 
 
 def provenance(run: Run, today: date, accepted: str = "") -> str:
@@ -49,14 +46,15 @@ def _source(run: Run, today: date) -> dict[str, JsonValue]:
 
 
 def _confidence(run: Run, name: str) -> dict[str, JsonValue]:
-    found = run.result.coefficients[name]
-    if not found.fitted:
+    coefficient = run.result.coefficients[name]
+    if not coefficient.fitted:
         return {"status": "fixed"}
-    if found.identifiable is False:
-        return {"status": "not identifiable, initial value kept"}
+    if coefficient.identifiable is False:
+        words = judgement_in_words(coefficient.verdict, coefficient.reason)
+        return {"status": words}
     known: dict[str, JsonValue] = {"status": "fitted"}
-    if found.std_error is not None:
-        known["std_error"] = found.std_error
-    if found.ci95 is not None:
-        known["ci95"] = list(found.ci95)
+    if coefficient.std_error is not None:
+        known["std_error"] = coefficient.std_error
+    if coefficient.ci95 is not None:
+        known["ci95"] = list(coefficient.ci95)
     return known

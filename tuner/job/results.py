@@ -34,9 +34,11 @@ from tuner.result import (
     SCHEMA_VERSION,
     AxesRmse,
     CoefficientResult,
+    Ending,
     FlightResult,
     RunResult,
     SearchResult,
+    Status,
     write_result,
 )
 from tuner.search.fitted import Fitted
@@ -153,7 +155,6 @@ def result_of(
     uncertainty: Uncertainty,
     errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
     *,
-    status: str,
     command: str = "",
 ) -> RunResult:
     """Assemble ``result.json``."""
@@ -161,7 +162,7 @@ def result_of(
     settings = job.settings
     return RunResult(
         schema_version=SCHEMA_VERSION,
-        status=status,
+        status=Status.CONVERGED if fitted.converged else Status.STOPPED,
         seed=settings.job.search.seed,
         versions=versions(),
         settings={
@@ -192,7 +193,7 @@ def result_of(
             cost_initial=fitted.loss_initial,
             cost_best=fitted.loss_best,
             converged=fitted.converged,
-            message=fitted.message,
+            message=Ending.NO_FURTHER_GAIN if fitted.converged else Ending.ITERATION_LIMIT,
         ),
     )
 
@@ -218,21 +219,26 @@ def _coefficients(
     for name, value in start.items():
         unit = COEFFICIENTS[name].unit
         if name not in best:
-            note = judgement_in_words(Verdict.FIXED, NOT_FITTED)
             found[name] = CoefficientResult(
-                unit=unit, initial=value, best=value, fitted=False, note=note
+                unit=unit,
+                initial=value,
+                best=value,
+                fitted=False,
+                verdict=Verdict.FIXED,
+                reason=NOT_FITTED,
+                note=judgement_in_words(Verdict.FIXED, NOT_FITTED),
             )
             continue
         low, high = bounds[name]
         estimate = uncertainty.estimates[name]
         if name in kept:
-            judgement = judge_impossible_inertia(float(raw[name]))
+            verdict, reason = judge_impossible_inertia(float(raw[name]))
         elif name in undetermined:
-            judgement = judge_after_holding(
+            verdict, reason = judge_after_holding(
                 name, estimate.verdict, estimate.reason, undetermined[name]
             )
         else:
-            judgement = estimate.verdict, estimate.reason
+            verdict, reason = estimate.verdict, estimate.reason
         found[name] = CoefficientResult(
             unit=unit,
             initial=value,
@@ -242,8 +248,10 @@ def _coefficients(
             upper=high,
             std_error=_finite(estimate.std_error),
             ci95=_interval(estimate.ci95),
-            identifiable=judgement[1].identifiable,
-            note=judgement_in_words(*judgement),
+            identifiable=reason.identifiable,
+            verdict=verdict,
+            reason=reason,
+            note=judgement_in_words(verdict, reason),
         )
     return found
 

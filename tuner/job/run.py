@@ -134,8 +134,7 @@ def run(
     vehicle = vehicle_fitted(job, fitted)
     listener.message("flying every flight with the initial and the fitted coefficients")
     errors = validate(job, fitted, vehicle)
-    status = "converged" if fitted.converged else "stopped"
-    result = result_of(job, fitted, uncertainty, errors, status=status, command=command)
+    result = result_of(job, fitted, uncertainty, errors, command=command)
     write_folder(folder, result, vehicle, job)
     write_traces(folder, *errors)
     write_laps(folder, *errors)

@@ -223,7 +223,6 @@ def _fitted(
         loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
         loss_best=float(progress.losses[best]),
         converged=progress.converged,
-        message="the last steps gained nothing" if progress.converged else "stopped at its limit",
         findings=(
             *findings,
             *end_findings(job, progress.feedback, scales),

@@ -242,7 +242,6 @@ def as_it_is(job: Job) -> Fitted:
         loss_initial=met.loss,
         loss_best=met.loss,
         converged=True,
-        message="nothing was fitted",
         findings=tuple(_findings(met.scale, names, feedback=None if best == said else best)),
     )
 

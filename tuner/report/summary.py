@@ -47,7 +47,7 @@ def of_run(result: RunResult) -> str:
         f"{len(known)} coefficients were fitted to {len(fitted)} "
         f"flight{'s' if len(fitted) != 1 else ''}"
     )
-    text += f", of which {unknown} cannot be told from these flights" if unknown else ""
+    text += f", of which the flights do not identify {unknown}" if unknown else ""
     pairs = [(_length(f.rmse_initial), _length(f.rmse_best)) for f in held or fitted]
     numbers = [(before, after) for before, after in pairs if before is not None and after]
     if numbers:

@@ -89,8 +89,8 @@ class Fitted:
         s.
     loss_initial, loss_best
         In the final weights.
-    converged, message
-        Whether the last stage stopped by itself, and why.
+    converged
+        Whether the last stage stopped because its steps gained nothing, not at its limit.
     findings
         Everything noticed on the way.
     held
@@ -111,6 +111,5 @@ class Fitted:
     loss_initial: float
     loss_best: float
     converged: bool
-    message: str
     findings: tuple[Finding, ...] = field(default=())
     held: Mapping[str, str] = field(default_factory=dict)

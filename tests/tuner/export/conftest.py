@@ -45,6 +45,8 @@ def make_run(tmp_path):
                 "std_error": 0.01 * value,
                 "ci95": (0.98 * value, 1.02 * value),
                 "identifiable": True,
+                "verdict": "well_known",
+                "reason": {"code": "interval", "half_width": 0.02},
             } | (coefficients or {}).get(name, {})
         usual = {
             "circle": {"split": "fit", "rmse_best": rmse(0.001)},
@@ -70,7 +72,7 @@ def make_run(tmp_path):
         write_vehicle(best, folder / "best_fit.yaml")
         result = RunResult(
             schema_version=2,
-            status="done",
+            status="converged",
             seed=0,
             versions={"tune": "0.1.0"},
             settings={},
@@ -85,7 +87,7 @@ def make_run(tmp_path):
                 cost_initial=100.0,
                 cost_best=1.0,
                 converged=True,
-                message="",
+                message="no_further_gain",
             ),
         )
         write_result(result, folder)

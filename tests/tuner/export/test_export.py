@@ -37,13 +37,29 @@ def test_yaml_carries_source_date_run_and_confidence(make_run):
     assert done.path.read_text().startswith("# fitted to circle; run run; 2024-05-06\n")
 
 
-def test_what_is_not_identifiable_keeps_its_initial_value_and_says_so(make_run):
-    run = make_run(coefficients={"moment_constant": {"identifiable": False}})
+def test_what_moved_with_a_held_coefficient_keeps_its_value_and_the_notes_tell_them_apart(make_run):
+    doubtful = {"fitted": True, "identifiable": False}
+    run = make_run(
+        coefficients={
+            "input_scaling": doubtful
+            | {"verdict": "held", "reason": {"code": "not_with_all_free"}},
+            "motor_constant": doubtful
+            | {
+                "verdict": "not_identifiable",
+                "reason": {"code": "not_with_all_free", "given_held": "input_scaling"},
+            },
+        }
+    )
     done = exported(run)
-    assert read_vehicle(done.path).aerodynamics.moment_constant == 0.06
-    assert any("moment_constant is not identifiable" in note for note in done.notes)
-    status = read_vehicle(done.path).source["coefficients"]["moment_constant"]["status"]
-    assert status == "not identifiable, initial value kept"
+    vehicle = read_vehicle(done.path)
+    assert vehicle.aerodynamics.motor_constant == run.vehicle.aerodynamics.motor_constant
+    held, moved = (
+        next(note for note in done.notes if note.startswith(name))
+        for name in ("input_scaling", "motor_constant")
+    )
+    assert "held at its initial value: " in held
+    assert "fitted with input_scaling held at its initial value" in moved
+    assert vehicle.source["coefficients"]["motor_constant"]["status"].startswith("not identifiable")
 
 
 @pytest.mark.parametrize("kind", ["sdf", "px4"])

@@ -40,6 +40,8 @@ def run(bag, flight, updated, tmp_path):
             best=values_of(updated)[name],
             fitted=name == "rotor_drag_coefficient",
             identifiable=True,
+            verdict="well_known",
+            reason={"code": "interval"},
         )
         for name, value in values_of(start).items()
     }
@@ -55,7 +57,7 @@ def run(bag, flight, updated, tmp_path):
         rmse_best=after,
     )
     result = RunResult(
-        schema_version=1,
+        schema_version=2,
         status="converged",
         seed=0,
         versions={},
@@ -65,6 +67,7 @@ def run(bag, flight, updated, tmp_path):
         },
         coefficients=coefficients,
         flights=(held_out,),
+        findings=(),
         search=SearchResult(
             method="gradient",
             evaluations=1,
@@ -73,7 +76,7 @@ def run(bag, flight, updated, tmp_path):
             cost_initial=1.0,
             cost_best=0.0,
             converged=True,
-            message="",
+            message="no_further_gain",
         ),
     )
     write_result(result, tmp_path)

@@ -22,11 +22,14 @@ from tuner.report.record import Move, SearchRecord, Start
 from tuner.report.traces import save_traces
 from tuner.result import (
     CoefficientResult,
+    Ending,
     FlightResult,
     RunResult,
     SearchResult,
+    Status,
     write_result,
 )
+from tuner.uncertainty.verdict import NOT_FITTED, Verdict
 from tuner.wording.verdicts import judgement_in_words
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
@@ -111,9 +114,13 @@ def _result(
         estimate = found.uncertainty.estimates.get(name)
         unit = COEFFICIENTS[name].unit
         if estimate is None:
-            note = "fixed"
             coefficients[name] = CoefficientResult(
-                unit=unit, initial=value, best=value, fitted=False, note=note
+                unit=unit,
+                initial=value,
+                best=value,
+                fitted=False,
+                verdict=Verdict.FIXED,
+                reason=NOT_FITTED,
             )
             continue
         coefficients[name] = CoefficientResult(
@@ -124,6 +131,8 @@ def _result(
             std_error=estimate.std_error,
             ci95=estimate.ci95,
             identifiable=estimate.identifiable,
+            verdict=estimate.verdict,
+            reason=estimate.reason,
             note=judgement_in_words(estimate.verdict, estimate.reason),
         )
     flights = tuple(
@@ -141,7 +150,7 @@ def _result(
     )
     return RunResult(
         schema_version=2,
-        status="converged",
+        status=Status.CONVERGED,
         seed=7,
         versions={"multirotor-tune": "0.1.0"},
         settings={"command": COMMAND, "origin": {"mass": "--mass"}, "vehicle": {"name": "quad"}},
@@ -156,6 +165,6 @@ def _result(
             cost_initial=10.0,
             cost_best=0.5,
             converged=True,
-            message="the last steps gained nothing",
+            message=Ending.NO_FURTHER_GAIN,
         ),
     )

@@ -56,7 +56,7 @@ def words(page: Path) -> str:
 def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     text = words(report)
     assert "on the held-out flights the position RMSE went from" in text
-    assert "7 coefficients were fitted to 1 flight, of which 1 cannot be told" in text
+    assert "7 coefficients were fitted to 1 flight, of which the flights do not identify 1" in text
     for heading in (
         "Coefficients",
         "How closely the flights are met",

@@ -149,5 +149,4 @@ def fitted_of(objective: Objective, point: Point) -> Fitted:
         loss_initial=1.0,
         loss_best=1.0,
         converged=True,
-        message="",
     )

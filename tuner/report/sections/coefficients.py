@@ -57,12 +57,11 @@ def coefficients(contents: Contents) -> Section | None:
 
 
 def _fitted(name: str, one: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
-    words, _, reason = one.note.partition(": ")
-    verdict = next((v for v in Verdict if verdict_in_words(v) == words), Verdict.FIXED)
+    reason = reason_in_words(one.reason)
     if not one.fitted and known is not None:
         judgement = judgement_in_words(known.verdict, known.reason)
         reason = f"were it fitted with the others: {judgement}"
-    return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (verdict, reason))
+    return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (one.verdict, reason))
 
 
 def _known(name: str, one: CoefficientKnowledge) -> Row:

@@ -6,6 +6,7 @@ from tuner.report.chart import FITTED, INITIAL, PALETTE, Chart, Line, Look, Pane
 from tuner.report.contents import Contents
 from tuner.report.record import SearchRecord
 from tuner.report.section import Section
+from tuner.wording.status import ending_sentence
 
 
 def search(contents: Contents) -> Section | None:
@@ -15,7 +16,8 @@ def search(contents: Contents) -> Section | None:
     charts = []
     if contents.search is not None:
         charts = [*_waterfall(contents.search), *_trace(contents.search)]
-    values = {"search": contents.run.result.search}
+    result = contents.run.result.search
+    values = {"search": result, "ending": ending_sentence(result.message)}
     return Section("search", "How it was found", values, charts)
 
 
