@@ -248,7 +248,7 @@ def sensitivity(
         options,
         SensitivityRequest(
             arena=arena,
-            whole_range=global_method,
+            global_method=global_method,
             samples=samples,
             span=span / 100.0,
             profiles=tuple(profile or ()),

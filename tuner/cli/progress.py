@@ -83,6 +83,7 @@ def print_run(folder: Path, result: RunResult) -> None:
 def print_examined(found: SensitivityResult) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
     from tuner.wording.findings import one_line
+    from tuner.wording.proposals import proposals_in_words
     from tuner.wording.verdicts import direction_in_words, judgement_in_words
 
     screen = console()
@@ -102,7 +103,7 @@ def print_examined(found: SensitivityResult) -> None:
         screen.print(one_line(finding), markup=False)
     for direction in found.knowledge.directions[:1]:
         screen.print(f"Worst determined: {direction_in_words(direction)}")
-    for sentence in found.proposals.sentences if found.proposals else ():
+    for sentence in proposals_in_words(found.proposals) if found.proposals else ():
         screen.print(sentence)
     screen.print(f"written to {found.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")
 

@@ -87,14 +87,14 @@ def sensitivity(
     )
     request = SensitivityRequest(
         arena=None if arena is None else lengths("--arena", arena),
-        whole_range=global_method,
+        global_method=global_method,
         samples=samples,
         span=span / 100.0,
         profiles=profile or (),
     )
     with listening(quiet=quiet) as listener:
         found = examine_vehicle(
-            options, request, out=folder_for(out), command=TYPED.get(), say=listener.message
+            options, request, out=folder_for(out), command=TYPED.get(), on_message=listener.message
         )
     if not quiet:
         print_examined(found)

@@ -1,4 +1,4 @@
-"""Flights that could be flown next inside an arena, as the simulator's reference and as words."""
+"""Flights that could be flown next inside an arena: the simulator's reference and a name."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from tuner.errors import InputError
 from tuner.simulation.trajectory import at_speed
 
 CLEARANCE = 0.5
-"""m that a reference keeps from the walls: a vehicle strays from its reference."""
+"""Distance that a reference keeps from the walls, from which a vehicle may stray, m."""
 LEVEL = 1.0
-"""m above the ground at which the publisher's shapes are flown."""
+"""Height above the ground at which the publisher's shapes are flown, m."""
 SPEEDS = (1.5, 3.0, 4.5, 6.0)
-"""m/s at which the reference peaks."""
+"""Peak speeds of the reference, m/s."""
 YAW_RATES = (1.0, 2.0, 4.0, 6.0)
-"""rad/s."""
+"""Yaw rates of the spins, rad/s."""
 SMALLEST = 0.5
-"""m of radius below which a shape is not worth flying."""
+"""Radius of a shape below which it is not worth flying, m."""
 HARDEST = 9.0
-"""m/s² of the reference's acceleration beyond which it is not proposed: some 45° of tilt."""
+"""Acceleration of the reference beyond which it is not proposed, some 45° of tilt; m/s²."""
 
 #: Shape -> half its extent along x and y for a radius of 1.
 EXTENT = {
@@ -35,7 +35,7 @@ BEND = {"circle": 1.0, "lemniscate": 1.1, "straight": 1.0, "diagonal": 0.71}
 
 @dataclass(frozen=True)
 class Arena:
-    """A room about the origin, from wall to wall along x and y and from the ground up; m."""
+    """A box about the origin, from wall to wall along x and y and from the ground up; m."""
 
     x: float
     y: float
@@ -65,7 +65,7 @@ class Arena:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A flight that could be flown, and what a person calls it."""
+    """A flight that could be flown, and its name: shape, size and speed in words."""
 
     name: str
     trajectory: TrajectorySettings
@@ -73,33 +73,32 @@ class Candidate:
 
 def candidates(arena: Arena) -> tuple[Candidate, ...]:
     """Return every shape in two sizes and several speeds, and yaw spins."""
-    found = []
+    flights = []
     for shape, (along_x, along_y) in EXTENT.items():
-        room = [(arena.x / 2 - CLEARANCE) / along_x]
+        widest = (arena.x / 2 - CLEARANCE) / along_x
         if along_y:
-            room.append((arena.y / 2 - CLEARANCE) / along_y)
-        widest = min(room)
+            widest = min(widest, (arena.y / 2 - CLEARANCE) / along_y)
         for radius in dict.fromkeys(max(widest * share, SMALLEST) for share in (1.0, 0.5)):
-            found += [
+            flights += [
                 _shape(shape, round(radius, 2), speed)
                 for speed in SPEEDS
                 if BEND[shape] * speed**2 / radius <= HARDEST
             ]
-    found += [
+    flights += [
         Candidate(
             f"a yaw spin at {rate:g} rad/s", TrajectorySettings(name="yaw_spin", yaw_rate=rate)
         )
         for rate in YAW_RATES
     ]
-    return tuple(found)
+    return tuple(flights)
 
 
 def _shape(shape: str, radius: float, speed: float) -> Candidate:
-    said = {
+    name = {
         "circle": f"a circle of {radius:g} m radius",
         "lemniscate": f"a lemniscate of {2 * radius:g} m length",
         "straight": f"a straight line of {2 * radius:g} m",
         "diagonal": f"a diagonal across {2 * radius:g} m",
     }[shape]
     settings = TrajectorySettings.model_validate({"name": shape, "radius": radius})
-    return Candidate(f"{said} at {speed:g} m/s", at_speed(settings, speed))
+    return Candidate(f"{name} at {speed:g} m/s", at_speed(settings, speed))

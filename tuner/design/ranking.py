@@ -1,7 +1,8 @@
-"""Which one more flight would tell the most about what is not known well yet.
+"""Which further flight would narrow the intervals of what is not known well yet the most.
 
-Every candidate is simulated with the coefficients found, differentiated by all of them, and weighed
-with the noise that the recorded flights had in each channel; its information is added to theirs.
+Every candidate is simulated with the fitted coefficients, differentiated by all of them, and
+weighed with the noise that the recorded flights had in each channel; its information is added to
+theirs.
 The measures are those of experiment design: the D-optimal flight shrinks the volume of the
 confidence ellipsoid the most, the A-optimal one the sum of squared relative errors (Goodwin and
 Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 1977).
@@ -10,7 +11,7 @@ Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 197
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
 from tuner.coefficients import COEFFICIENTS
 from tuner.design.candidates import Arena, Candidate, candidates
-from tuner.design.next_flight_json import Proposal, Proposals, in_words
+from tuner.design.next_flight_json import Proposal, Proposals
 from tuner.examination.examination import Examination
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
@@ -43,24 +44,13 @@ SAMPLE_RATE = 100.0
 """Hz at which they are compared; their weight stands for the samples in between."""
 
 
-@dataclass(frozen=True)
-class Habits:
-    """How flights are recorded and weighed.
-
-    Attributes
-    ----------
-    spin_channels
-        What a yaw spin is compared by.
-    seconds
-        How long a flight would last.
-    """
-
-    spin_channels: Sequence[str]
-    seconds: float
-
-
 def rank_next_flights(
-    examination: Examination, criterion: Criterion, *, arena: Arena, habits: Habits
+    examination: Examination,
+    criterion: Criterion,
+    *,
+    arena: Arena,
+    seconds: float,
+    spin_channels: Sequence[str],
 ) -> Proposals:
     """Rank the flights that could be flown next.
 
@@ -69,29 +59,33 @@ def rank_next_flights(
     examination
         Of the recorded flights.
     criterion
-        In whose weights they speak.
+        Whose weights the recorded residuals have.
     arena
-        Where the next one must fit.
-    habits
-        How it would be recorded.
+        Where the next flight must fit.
+    seconds
+        How long it would last.
+    spin_channels
+        Channels that a yaw spin is compared by.
     """
     full_problem = examination.full_problem
     flights = candidates(arena)
-    objective = _laid_out(full_problem.objective, flights, habits)
-    point, weights = _there(full_problem.point, criterion, objective)
+    objective = _candidate_problem(
+        full_problem.objective, flights, seconds=seconds, spin_channels=spin_channels
+    )
+    point, weights = _candidate_point(full_problem.point, criterion, objective)
     jacobian = objective.jacobian(point, weights)
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
     clocks = np.repeat(kinds[:, None], len(flights), axis=1)
     information = information_from_jacobian(objective, point, weights, jacobian, clocks=clocks)
     flown = ~information.crashed & _inside(objective, jacobian.residuals, arena)
-    gained = information.blocks.sum(axis=(0, 2))
+    gain = information.blocks.sum(axis=(0, 2))
     now = examination.information.data + examination.information.prior / WIDE**2
     return _ranked(
         examination,
-        [(one, more) for one, more, flies in zip(flights, gained, flown, strict=True) if flies],
+        [pair for pair, flies in zip(zip(flights, gain, strict=True), flown, strict=True) if flies],
         now,
         arena=arena,
-        seconds=habits.seconds,
+        seconds=seconds,
     )
 
 
@@ -107,7 +101,7 @@ def _ranked(
     fitted = examination.uncertainty
     count = len(fitted.names)
     verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}
-    verdicts |= {name: one.estimates[name].verdict for name, one in examination.freed.items()}
+    verdicts |= {name: freed.estimates[name].verdict for name, freed in examination.freed.items()}
     weak = [name for name in names if verdicts[name] is not Verdict.WELL_KNOWN]
     free = [name for name in weak if name in fitted.names]
     fixed = [
@@ -118,38 +112,48 @@ def _ranked(
     targets = free or fixed or list(fitted.names)
     rows = [
         Proposal(
-            name=one.name,
-            trajectory=one.trajectory.model_dump(mode="json"),
-            shrinks={name: _ratio(now, more, names.index(name), count) for name in targets},
-            volume=_volume(now, more, count),
+            name=flight.name,
+            trajectory=flight.trajectory.model_dump(mode="json"),
+            shrinks={name: _ratio(now, gain, names.index(name), count) for name in targets},
+            volume=_volume(now, gain, count),
         )
-        for one, more in flights
+        for flight, gain in flights
     ]
     rows.sort(key=lambda row: (row.mean, row.name))
     return Proposals(
         arena=(arena.x, arena.y, arena.z),
         seconds=seconds,
         targets=targets,
+        fixed_targets=[name for name in targets if name in examination.freed],
         all_known=not free,
         flights=rows,
-        sentences=in_words(rows, targets, fixed=tuple(examination.freed)),
     )
 
 
-def _ratio(now: Array, more: Array, place: int, count: int) -> float:
-    """Return an interval's width after a flight over that before, all fitted ones free too."""
+def _ratio(now: Array, gain: Array, place: int, count: int) -> float:
+    """Return an interval's width after a flight over that before, all fitted ones free too.
+
+    Parameters
+    ----------
+    now, gain
+        (N, N) information about all coefficients, of the recorded flights and of the candidate.
+    place
+        Of the coefficient in them.
+    count
+        How many of them, the first ones, are fitted.
+    """
     places = [*range(count), *([place] if place >= count else [])]
-    own = np.ix_(places, places)
+    square = np.ix_(places, places)
     row = places.index(place)
-    before, after = (_inverse(matrix[own])[row, row] for matrix in (now, now + more))
+    before, after = (_inverse(matrix[square])[row, row] for matrix in (now, now + gain))
     return float(np.sqrt(after / before))
 
 
-def _volume(now: Array, more: Array, count: int) -> float:
-    """Return the factor on the geometric mean of the ellipsoid's half axes of the fitted ones."""
+def _volume(now: Array, gain: Array, count: int) -> float:
+    """Return the factor on the geometric mean of the half axes of the fitted ones' ellipsoid."""
     before, after = (
         np.linalg.slogdet(_scaled(matrix[:count, :count], now[:count, :count]))[1]
-        for matrix in (now, now + more)
+        for matrix in (now, now + gain)
     )
     return float(np.exp(-0.5 * (after - before) / count))
 
@@ -164,33 +168,42 @@ def _inverse(matrix: Array) -> Array:
     return np.asarray(np.linalg.inv(_scaled(matrix, matrix)) * np.outer(unit, unit))
 
 
-def _laid_out(objective: Objective, flights: Sequence[Candidate], habits: Habits) -> Objective:
+def _candidate_problem(
+    objective: Objective,
+    flights: Sequence[Candidate],
+    *,
+    seconds: float,
+    spin_channels: Sequence[str],
+) -> Objective:
     """Return the problem with candidates in the place of recordings, whose values are zero."""
-    schedule = _logged_less(objective.schedule)
+    schedule = _with_low_log_rate(objective.schedule)
     references = [
         published(
-            one.trajectory,
-            duration=habits.seconds,
+            flight.trajectory,
+            duration=seconds,
             control_rate=schedule.position_control_rate,
         )
-        for one in flights
+        for flight in flights
     ]
     inlet: ReferenceInlet = jax.tree.map(
         lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves], axis=-1),
         *(reference.inlet for reference in references),
     )
     starts = Vec3(
-        *(jnp.stack([getattr(r.start, axis) for r in references]) for axis in ("x", "y", "z"))
+        *(
+            jnp.stack([getattr(flown.start, axis) for flown in references])
+            for axis in ("x", "y", "z")
+        )
     )
-    spins = np.array([one.trajectory.name == "yaw_spin" for one in flights])
+    spins = np.array([flight.trajectory.name == "yaw_spin" for flight in flights])
     segments = Segments(
         inlet=inlet,
         start=_hovering(objective, starts, len(flights)),
         measured={
             name: _sampled(
                 measured,
-                silent=spins & (name not in habits.spin_channels),
-                seconds=habits.seconds,
+                silent=spins & (name not in spin_channels),
+                seconds=seconds,
                 recorded=_seconds(objective),
             )
             for name, measured in objective.segments.measured.items()
@@ -202,13 +215,13 @@ def _laid_out(objective: Objective, flights: Sequence[Candidate], habits: Habits
         segments=segments,
         space=objective.space,
         schedule=schedule,
-        samples=round(habits.seconds * schedule.log_rate),
+        samples=round(seconds * schedule.log_rate),
         limits=Limits(),
         memory=objective.memory,
     )
 
 
-def _logged_less(schedule: Schedule) -> Schedule:
+def _with_low_log_rate(schedule: Schedule) -> Schedule:
     """Return the schedule with the lowest rate of logging that is not below `LOG_RATE`."""
     physics = schedule.physics_rate
     rates = [physics // divisor for divisor in range(1, physics + 1) if physics % divisor == 0]
@@ -233,41 +246,45 @@ def _seconds(objective: Objective) -> Array:
 def _sampled(
     measured: Measured, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
 ) -> Measured:
-    """Return one channel of every candidate: as often and as precisely recorded as the best was.
+    """Return one channel of every candidate, as often and as precisely recorded as in the best.
 
     Parameters
     ----------
     measured
         The channel of the recorded segments.
     silent
-        (C,) for which candidates it does not speak.
+        (C,) for which candidates it is not compared.
     seconds, recorded
-        How long a candidate lasts, and (F,) how long each segment was recorded.
+        How long a candidate lasts, and (F,) how long each segment was recorded, in s.
     """
     weight = np.asarray(measured.weight)
     rate = (weight > 0).sum(axis=0) / recorded
-    each = np.where(weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(rate / SAMPLE_RATE), 0.0)
+    equivalent = np.where(
+        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(rate / SAMPLE_RATE), 0.0
+    )
     time = np.arange(1, int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
     segments = len(silent)
     values = np.zeros((len(time), np.asarray(measured.values).shape[1], segments))
     if values.shape[1] > weight.shape[1]:
         values[:, 0] = 1.0  # an attitude
-    alike = np.where(silent, 0.0, each.max(axis=1)[:, None])
+    constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
     return Measured(
         time=jnp.asarray(np.repeat(time[:, None], segments, axis=1)),
         values=jnp.asarray(values),
-        weight=jnp.asarray(np.broadcast_to(alike, (len(time), *alike.shape))),
+        weight=jnp.asarray(np.broadcast_to(constant, (len(time), *constant.shape))),
     )
 
 
-def _there(point: Point, criterion: Criterion, objective: Objective) -> tuple[Point, Criterion]:
-    """Return point and stage for other flights: weighed as the recorded ones mostly were."""
+def _candidate_point(
+    point: Point, criterion: Criterion, objective: Objective
+) -> tuple[Point, Criterion]:
+    """Return point and criterion of the candidates, weighed as the recorded flights mostly were."""
     count = objective.flights
     offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
     held = np.zeros((np.asarray(criterion.held).shape[0], count))
     scale = {
-        name: jnp.full(count, float(np.median(np.asarray(one))))
-        for name, one in criterion.scale.items()
+        name: jnp.full(count, float(np.median(np.asarray(of_segment))))
+        for name, of_segment in criterion.scale.items()
     }
     return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
         horizon=jnp.asarray(objective.samples),
@@ -281,11 +298,10 @@ def _there(point: Point, criterion: Criterion, objective: Objective) -> tuple[Po
 def _inside(
     objective: Objective, residuals: dict[str, jax.Array], arena: Arena
 ) -> NDArray[np.bool_]:
-    """Return (C,) whether the simulated vehicle stays between the walls, where that is told."""
-    fits = np.ones(objective.segments.count, bool)
+    """Return (C,) whether the simulated vehicle stays between the walls, if positions are known."""
     if "position" not in residuals:
-        return fits
+        return np.ones(objective.segments.count, bool)
     weight = np.asarray(objective.segments.measured["position"].weight)
-    place = np.abs(np.asarray(residuals["position"])) / np.where(weight > 0, weight, np.inf)
+    distance = np.abs(np.asarray(residuals["position"])) / np.where(weight > 0, weight, np.inf)
     half = np.array([arena.x / 2, arena.y / 2, arena.z])
-    return np.asarray((place.max(axis=0) <= half[:, None]).all(axis=0))
+    return np.asarray((distance.max(axis=0) <= half[:, None]).all(axis=0))

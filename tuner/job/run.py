@@ -99,6 +99,7 @@ def run(
     from tuner.export.refly import refly  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
+    from tuner.job.examination_files import write_knowledge, write_next_flight  # noqa: PLC0415
     from tuner.job.findings import finer_than_steps  # noqa: PLC0415
     from tuner.job.holding import with_undetermined_held  # noqa: PLC0415
     from tuner.job.prepare import prepare  # noqa: PLC0415
@@ -109,7 +110,6 @@ def run(
         write_folder,
     )
     from tuner.job.search import search  # noqa: PLC0415
-    from tuner.job.sensitivity import write_examination  # noqa: PLC0415
     from tuner.report import render, write_laps, write_search, write_traces  # noqa: PLC0415
     from tuner.report.background import BackgroundDrawing  # noqa: PLC0415
 
@@ -142,7 +142,9 @@ def run(
     if cross_validated:
         listener.folds(cross_validate(job, fitted, folder, _teller(listener)))
     listener.message("simulating what could be flown next")
-    write_examination(folder, job, examination, fitted, once_known=lambda: background.begin(folder))
+    write_knowledge(folder, job, examination, fitted)
+    background.begin(folder)
+    write_next_flight(folder, job, examination, fitted)
     render(folder, drawn=background.drawn)
     for line in export_as_asked(
         folder, settings.job.export, refly=refly, today=datetime.date.today()

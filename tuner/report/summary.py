@@ -9,6 +9,7 @@ import numpy as np
 from tuner.report.contents import Contents
 from tuner.result import RunResult
 from tuner.wording.phrases import listed
+from tuner.wording.proposals import proposals_in_words
 from tuner.wording.verdicts import verdict_in_words
 
 
@@ -33,7 +34,7 @@ def summary(contents: Contents) -> list[str]:
         elif verdicts:
             said.append(f"Of the coefficients, {verdicts}.")
     if contents.proposals is not None:
-        said += contents.proposals.sentences[:2]
+        said += proposals_in_words(contents.proposals)[:2]
     return said
 
 

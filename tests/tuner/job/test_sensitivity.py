@@ -8,7 +8,7 @@ import tuner
 from tuner.cli import main
 from tuner.config import ControllerFile, configs_folder
 from tuner.errors import InputError
-from tuner.job.sensitivity import arena_of
+from tuner.job.examination_files import arena_of
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,11 @@
-"""What one more flight would tell."""
+"""Which further flight would narrow which interval."""
 
 from __future__ import annotations
 
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.wording.proposals import proposals_in_words
 
 
 def next_flight(contents: Contents) -> Section | None:
@@ -12,6 +13,7 @@ def next_flight(contents: Contents) -> Section | None:
     proposals = contents.proposals
     if proposals is None:
         return None
+    values = {"proposals": proposals, "sentences": proposals_in_words(proposals)}
     charts = []
     if proposals.flights:
         shares = [
@@ -43,4 +45,4 @@ def next_flight(contents: Contents) -> Section | None:
                 height=190 + 22 * len(proposals.flights),
             )
         )
-    return Section("next_flight", "What to fly next", {"proposals": proposals}, charts)
+    return Section("next_flight", "What to fly next", values, charts)

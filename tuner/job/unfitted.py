@@ -1,0 +1,106 @@
+"""A vehicle as it is, in the form of a fit that moved nothing, so that it can be examined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.config import initial_values
+from tuner.findings import Code, Finding
+from tuner.job.findings import UNMATCHED, saturation_feedback
+from tuner.job.prepare import Job
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.search.continuation import FEEDBACK_GAIN
+from tuner.search.fitted import Fitted
+from tuner.search.progress import beginning, criterion_of, with_feedback
+from tuner.search.stages import WHOLE, schedule_of
+
+
+def unfitted(job: Job) -> Fitted:
+    """Return the vehicle that a job would start from, as a fit that moved nothing.
+
+    Where rotors were clipped low, whether the rate integrator then stops is tried both ways.
+    """
+    space, configured = job.space, job.settings.controller.mixer.saturation_feedback
+    start = initial_values(job.settings.vehicle, job.settings.controller, space.free)
+    vector = space.vector_of(start)
+    matches = {
+        feedback: _match(with_feedback(job.objective, float(feedback)), vector)
+        for feedback in ((configured, not configured) if job.clipped else (configured,))
+    }
+    best = min(matches, key=lambda feedback: matches[feedback].loss)
+    if matches[configured].loss <= FEEDBACK_GAIN * matches[best].loss:
+        best = configured
+    match = matches[best]
+    names = [flight.name for flight in job.fitted]
+    return Fitted(
+        objective=match.objective,
+        point=match.point,
+        criterion=match.criterion,
+        noise=job.noise,
+        scales={
+            name: {channel: float(by_flight[i]) for channel, by_flight in match.scale.items()}
+            for i, name in enumerate(names)
+        },
+        iterations=(),
+        outcomes=(),
+        method="none",
+        evaluations=len(matches),
+        wall_time=0.0,
+        loss_initial=match.loss,
+        loss_best=match.loss,
+        converged=True,
+        findings=tuple(
+            _findings(match.scale, names, feedback=None if best == configured else best)
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class _Match:
+    """How closely a simulation matches the recordings: the problem, weighed accordingly."""
+
+    objective: Objective
+    point: Point
+    criterion: Criterion
+    scale: dict[str, NDArray[np.float64]]
+    loss: float
+
+
+def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
+    """Return a problem whose noise is scaled to the residuals where these are larger."""
+    rate = float(objective.schedule.log_rate)
+    (*_, whole) = (
+        stage
+        for stage in schedule_of(objective.samples, rate, robust=False, steps=1)
+        if stage.name == WHOLE
+    )
+    fresh, point = beginning(objective, vector[None]), objective.start(vector)
+    offsets = np.asarray(point.offsets)
+    sums = objective.sums(
+        point, criterion_of(whole, fresh.scales, offsets, fresh.states), derivatives=False
+    )
+    flight = np.asarray(objective.segments.flight)
+    scale = {}
+    for name, squares in sums.squares.items():
+        total = np.bincount(flight, np.asarray(squares), minlength=objective.flights)
+        count = np.bincount(flight, np.asarray(sums.counts[name]), minlength=objective.flights)
+        scale[name] = np.maximum(np.sqrt(total / np.maximum(count, 1.0)), 1.0)
+    criterion = criterion_of(whole, scale, offsets, fresh.states)
+    return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
+
+
+def _findings(
+    scale: Mapping[str, NDArray[np.float64]], names: Sequence[str], *, feedback: bool | None
+) -> Iterator[Finding]:
+    if feedback is not None:
+        yield saturation_feedback("info", float(feedback))
+    for index, name in enumerate(names):
+        worst = max(scale, key=lambda channel: scale[channel][index])
+        multiple = float(scale[worst][index])
+        if multiple > UNMATCHED:
+            yield Finding(Code.POORLY_MET, "warning", name, {"noise_multiple": multiple}, (worst,))

@@ -1,0 +1,48 @@
+"""Which flight to fly for which coefficient, as sentences."""
+
+from __future__ import annotations
+
+from tuner.design.next_flight_json import Proposals
+from tuner.wording.phrases import listed
+
+WORTH_FLYING = 0.9
+"""An interval that a flight leaves wider than this share of what it was is not narrowed."""
+HALVED = (0.45, 0.55)
+"""Shares of an interval that are called half of it."""
+
+
+def proposals_in_words(proposals: Proposals) -> list[str]:
+    """Return a sentence on each flight worth flying, the greatest gain first, and on the rest.
+
+    The last sentence names the coefficients whose intervals no single flight would narrow.
+    """
+    if not proposals.flights:
+        return ["No candidate flight stays in the air inside this arena."]
+    gains: dict[str, list[tuple[float, str]]] = {}
+    not_narrowed = []
+    for target in proposals.targets:
+        label = f"{target} (fixed so far)" if target in proposals.fixed_targets else target
+        best = min(proposals.flights, key=lambda flight: flight.shrinks[target])
+        share = best.shrinks[target]
+        if share > WORTH_FLYING:
+            not_narrowed.append(label)
+        else:
+            gains.setdefault(best.name, []).append((share, label))
+    sentences = []
+    for flight, shares in sorted(gains.items(), key=lambda item: min(item[1])):
+        effects = listed([_effect(share, label) for share, label in sorted(shares)])
+        sentences.append(f"{flight[0].upper()}{flight[1:]} would {effects}.")
+    if not_narrowed:
+        sentences.append(
+            f"No single flight in this arena would narrow the interval of {listed(not_narrowed)} "
+            f"by more than {1 - WORTH_FLYING:.0%}."
+        )
+    return sentences
+
+
+def _effect(share: float, label: str) -> str:
+    if HALVED[0] <= share <= HALVED[1]:
+        return f"halve the interval of {label}"
+    if share < HALVED[0]:
+        return f"narrow the interval of {label} to {share:.0%} of what it is"
+    return f"narrow the interval of {label} by {1 - share:.0%}"
