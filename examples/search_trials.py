@@ -69,7 +69,7 @@ def solved(
     job = job_of(settings, recordings)
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        fitted = search(job, Path(folder), resume=False, tell=lambda *_: None)
+        fitted = search(job, Path(folder), resume=False, on_progress=lambda *_: None)
     return job, fitted, time.perf_counter() - began
 
 

@@ -190,7 +190,7 @@ class _Group:
             criterion = Criterion(
                 horizon=jnp.asarray(self._samples),
                 scale={name: jnp.full(flights, LOOSE) for name in self._segments.measured},
-                held=jnp.zeros((len(CLOCKS), flights)),
+                reference_offset=jnp.zeros((len(CLOCKS), flights)),
                 huber=jnp.asarray(jnp.inf),
                 prior=jnp.asarray(1.0),
                 states=jnp.asarray(states),

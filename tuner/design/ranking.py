@@ -281,7 +281,7 @@ def _candidate_point(
     """Return point and criterion of the candidates, weighed as the recorded flights mostly were."""
     count = objective.flights
     offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
-    held = np.zeros((np.asarray(criterion.held).shape[0], count))
+    reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
     scale = {
         name: jnp.full(count, float(np.median(np.asarray(of_segment))))
         for name, of_segment in criterion.scale.items()
@@ -289,7 +289,7 @@ def _candidate_point(
     return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
         horizon=jnp.asarray(objective.samples),
         scale=scale,
-        held=jnp.asarray(held),
+        reference_offset=jnp.asarray(reference_offset),
         huber=jnp.asarray(np.inf),
         prior=criterion.prior,
     )

@@ -32,11 +32,11 @@ def fingerprint(job: Job) -> str:
 
 def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
     """Write a checkpoint that appears whole: the stage under way begins again when resumed."""
-    done = len(progress.iterations) - len(progress.trail)
+    done = len(progress.iterations) - progress.steps
     head = {
         "key": key,
         "stage": progress.stage,
-        "evaluations": progress.evaluations - len(progress.trail),
+        "evaluations": progress.evaluations - progress.steps,
         "feedback": progress.feedback,
         "seconds": seconds,
         "iterations": [asdict(iteration) for iteration in progress.iterations[:done]],
@@ -76,7 +76,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
                 scales=dict(zip(head["channels"], data["scales"], strict=True)),
                 losses=data["losses"],
                 states=data["states"] if data["states"].size else None,
-                iterations=tuple(Iteration(**one) for one in head["iterations"]),
+                iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
                 evaluations=head["evaluations"],
                 feedback=head["feedback"],
             )

@@ -22,7 +22,8 @@ from tuner.job.search import free_offsets
 from tuner.objective.normal import Objective
 from tuner.result import AxesRmse
 from tuner.search.fitted import Fitted
-from tuner.search.progress import Free, Progress
+from tuner.search.optimiser import Free
+from tuner.search.progress import Progress
 
 CROSS_VALIDATION_FILE = "cross_validation.csv"
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -72,7 +73,7 @@ def cross_validate(
             others,
             free=free,
             title=f"without {flight.name}",
-            tell=lambda now: tell(job, now),
+            on_progress=lambda now: tell(job, now),
         )
         values = best_values(job, found)
         try:

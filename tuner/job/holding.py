@@ -22,7 +22,8 @@ from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
-from tuner.search.progress import Free, Progress
+from tuner.search.optimiser import Free
+from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
 
 MOST_ROUNDS = 3
@@ -99,6 +100,6 @@ def hold(
         replace(fitted, point=point),
         free=free,
         title=f"with {len(names)} held",
-        tell=lambda now: tell(job, now),
+        on_progress=lambda now: tell(job, now),
     )
     return replace(end, held=dict(held), wall_time=fitted.wall_time + time.perf_counter() - clock)

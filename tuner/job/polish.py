@@ -12,7 +12,8 @@ from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted
-from tuner.search.progress import Free, Progress, criterion_of, point_of
+from tuner.search.optimiser import Free
+from tuner.search.progress import Progress, criterion_of, point_of
 from tuner.search.stages import plan
 
 
@@ -22,7 +23,7 @@ def polished(
     *,
     free: Free,
     title: str,
-    tell: Callable[[Progress], None],
+    on_progress: Callable[[Progress], None],
 ) -> Fitted:
     """Return a fit polished again.
 
@@ -36,7 +37,7 @@ def polished(
         What may move.
     title
         For people, before the stages' names.
-    tell
+    on_progress
         Called after every iteration.
     """
     objective, settings = fitted.objective, job.settings.job.search
@@ -65,8 +66,7 @@ def polished(
         evaluations=fitted.evaluations,
         feedback=float(objective.model.controller.rate.saturation_feedback),
     )
-    for reached in grow(objective, stages, progress, free=free, clipped=False, tell=tell):
-        progress = reached
+    progress = grow(objective, stages, progress, free=free, clipped=False, on_progress=on_progress)
     point = point_of(progress.points, 0)
     return replace(
         fitted,

@@ -122,7 +122,7 @@ def run(
     make_folder(folder)
     keep = _keeper(folder, listener)
     try:
-        fitted = search(job, folder, resume=resume, tell=keep, findings=findings)
+        fitted = search(job, folder, resume=resume, on_progress=keep, findings=findings)
     except KeyboardInterrupt:
         listener.message(f"the best so far is in {folder}; go on with --out {folder} --resume")
         raise

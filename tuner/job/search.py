@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -21,9 +21,9 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted, Outcome
-from tuner.search.levenberg_marquardt import total
+from tuner.search.normal_equations import normal_equations
+from tuner.search.optimiser import Free
 from tuner.search.progress import (
-    Free,
     Progress,
     beginning,
     criterion_of,
@@ -37,16 +37,20 @@ SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
 AGREE = 0.01
 """Starts whose losses differ by less than this share have reached the same minimum."""
 
+OnProgress = Callable[[Job, Progress], None]
+
 
 def search(
     job: Job,
     folder: Path,
     *,
     resume: bool,
-    tell: Callable[[Job, Progress], None],
+    on_progress: OnProgress,
     findings: tuple[Finding, ...] = (),
 ) -> Fitted:
     """Look for the best coefficients of a job.
+
+    With the method ``auto``, least squares is followed by ``hybrid`` where its end is doubtful.
 
     Parameters
     ----------
@@ -56,7 +60,7 @@ def search(
         Where the checkpoint lies.
     resume
         Go on from the checkpoint.
-    tell
+    on_progress
         Called after every iteration.
     findings
         Of the check before the search, to be handed on.
@@ -66,24 +70,24 @@ def search(
     InputError
         There is no checkpoint to resume from, or it belongs to another job.
     """
-    said = job.settings.job.search.method
-    method = "gradient" if said == "auto" else said
-    found = _run(job, folder / CHECKPOINT, method, resume=resume, tell=tell, findings=findings)
-    doubt = _doubt(job, found) if said == "auto" else None
-    if doubt is None:
-        return found
-    resume = resume and (folder / SECOND_CHECKPOINT).exists()
-    rival = _run(
-        job, folder / SECOND_CHECKPOINT, "hybrid", resume=resume, tell=tell, findings=findings
+    method = job.settings.job.search.method
+    first = _Attempt(
+        job, folder / CHECKPOINT, "gradient" if method == "auto" else method, on_progress, findings
     )
-    better = rival if _misfit(rival) < _misfit(found) else found
+    fitted = first.run(resume=resume)
+    doubt = _doubt(job, fitted) if method == "auto" else None
+    if doubt is None:
+        return fitted
+    second = replace(first, checkpoint=folder / SECOND_CHECKPOINT, method="hybrid")
+    rival = second.run(resume=resume and second.checkpoint.exists())
+    better = rival if _misfit(rival) < _misfit(fitted) else fitted
     doubt = replace(doubt, numbers={**doubt.numbers, "changed": float(better is rival)})
     return replace(
         better,
         method="auto",
-        evaluations=found.evaluations + rival.evaluations,
-        wall_time=found.wall_time + rival.wall_time,
-        outcomes=(*found.outcomes, *rival.outcomes),
+        evaluations=fitted.evaluations + rival.evaluations,
+        wall_time=fitted.wall_time + rival.wall_time,
+        outcomes=(*fitted.outcomes, *rival.outcomes),
         findings=(*better.findings, doubt),
     )
 
@@ -100,23 +104,101 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     return None
 
 
-def _misfit(found: Fitted) -> float:
+def _misfit(fitted: Fitted) -> float:
     """Return how far all channels of all flights are met, each by its own noise."""
-    return float(np.mean([np.log(s) for scale in found.scales.values() for s in scale.values()]))
+    return float(np.mean([np.log(s) for scale in fitted.scales.values() for s in scale.values()]))
 
 
-def _run(
-    job: Job,
-    checkpoint: Path,
-    method: str,
-    *,
-    resume: bool,
-    tell: Callable[[Job, Progress], None],
-    findings: tuple[Finding, ...],
-) -> Fitted:
-    """Run one method from the starts, or from where its checkpoint stands."""
-    objective, settings = job.objective, job.settings.job.search
-    stages = plan(
+@dataclass(frozen=True)
+class _Attempt:
+    """One method's search, with its own checkpoint."""
+
+    job: Job
+    checkpoint: Path
+    method: str
+    on_progress: OnProgress
+    findings: tuple[Finding, ...]
+
+    def run(self, *, resume: bool) -> Fitted:
+        """Run the method from the starts, or from where its checkpoint stands."""
+        job, key = self.job, fingerprint(self.job)
+        stages, starts = self._stages(), starting_vectors(job)
+        free = Free(np.ones(len(job.space), bool), free_offsets(job))
+        progress, spent = beginning(job.objective, starts), 0.0
+        if resume:
+            progress, spent = load(self.checkpoint, key, progress)
+        began = time.perf_counter() - spent
+
+        def on_progress(progress: Progress) -> None:
+            seconds = time.perf_counter() - began
+            save(self.checkpoint, key, progress, seconds)
+            remaining = left(stages, progress.stage, progress.steps, seconds)
+            self.on_progress(job, replace(progress, left=remaining))
+
+        if job.windows is not None and not resume:
+            progress = beginning(job.objective, _through_windows(job, starts, free))
+        progress = grow(
+            job.objective,
+            stages,
+            progress,
+            free=free,
+            clipped=job.clipped,
+            on_progress=on_progress,
+            seed=job.settings.job.search.seed,
+        )
+        seconds = time.perf_counter() - began
+        save(self.checkpoint, key, progress, seconds)
+        return self._fitted(stages[-1], progress, starts, seconds)
+
+    def _stages(self) -> tuple[Stage, ...]:
+        """Return the method's stages; flights that windows prepare are flown whole at once."""
+        stages = _plan(self.job, self.job.objective, self.method)
+        if self.job.windows is None:
+            return stages
+        return tuple(stage for stage in stages if stage.horizon == self.job.objective.samples)
+
+    def _fitted(
+        self, stage: Stage, progress: Progress, starts: NDArray[np.float64], seconds: float
+    ) -> Fitted:
+        job, best = self.job, int(np.argmin(progress.losses))
+        point = point_of(progress.points, best)
+        objective = with_feedback(job.objective, progress.feedback)
+        criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
+        vectors = np.asarray(progress.points.coefficients)
+        outcomes = tuple(
+            Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
+            for i in range(len(starts))
+        )
+        scales = {
+            flight.name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
+            for i, flight in enumerate(job.fitted)
+        }
+        return Fitted(
+            objective=objective,
+            point=point,
+            criterion=criterion,
+            noise=job.noise,
+            scales=scales,
+            iterations=progress.iterations,
+            outcomes=outcomes,
+            method=self.method,
+            evaluations=progress.evaluations,
+            wall_time=seconds,
+            loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
+            loss_best=float(progress.losses[best]),
+            converged=progress.converged,
+            findings=(
+                *self.findings,
+                *end_findings(job, progress.feedback, scales),
+                *offset_findings(job, np.asarray(point.offsets) * OFFSET_UNIT),
+            ),
+        )
+
+
+def _plan(job: Job, objective: Objective, method: str) -> tuple[Stage, ...]:
+    """Return a method's stages for an objective of the job."""
+    settings = job.settings.job.search
+    return plan(
         method,
         objective.samples,
         float(objective.schedule.log_rate),
@@ -124,51 +206,19 @@ def _run(
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
-    starts = starting_vectors(job)
-    free = Free(np.ones(len(job.space), bool), free_offsets(job))
-    if job.windows is not None:
-        stages = tuple(stage for stage in stages if stage.horizon == objective.samples)
-    progress, spent = beginning(objective, starts), 0.0
-    key = fingerprint(job)
-    if resume:
-        progress, spent = load(checkpoint, key, progress)
-    clock = time.perf_counter()
-
-    def keep(now: Progress) -> None:
-        seconds = spent + time.perf_counter() - clock
-        save(checkpoint, key, now, seconds)
-        tell(job, replace(now, left=left(stages, now.stage, len(now.trail), seconds)))
-
-    if job.windows is not None and not resume:
-        progress = beginning(objective, _through_windows(job, starts, free))
-    for reached in grow(
-        objective, stages, progress, free=free, clipped=job.clipped, tell=keep, seed=settings.seed
-    ):
-        progress = reached
-    save(checkpoint, key, progress, spent + time.perf_counter() - clock)
-    spent += time.perf_counter() - clock
-    return _fitted(
-        job, stages[-1], progress, starts, method=method, seconds=spent, findings=findings
-    )
 
 
 def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArray[np.float64]:
     """Return where windows lead each start (S, K), for flights that do not begin gently."""
-    objective, settings = job.windows, job.settings.job.search
-    assert objective is not None
-    stages = plan(
-        "gradient",
-        objective.samples,
-        float(objective.schedule.log_rate),
-        windows=True,
-        robust=settings.robust == "huber",
-        steps=settings.max_iterations,
+    assert job.windows is not None
+    progress = grow(
+        job.windows,
+        _plan(job, job.windows, "gradient")[:-1],
+        beginning(job.windows, starts),
+        free=free,
+        clipped=False,
+        on_progress=lambda _: None,
     )
-    progress = beginning(objective, starts)
-    for reached in grow(
-        objective, stages[:-1], progress, free=free, clipped=False, tell=lambda _: None
-    ):
-        progress = reached
     return np.asarray(progress.points.coefficients)
 
 
@@ -185,67 +235,20 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     return free
 
 
-def _fitted(
-    job: Job,
-    stage: Stage,
-    progress: Progress,
-    starts: NDArray[np.float64],
-    *,
-    method: str,
-    seconds: float,
-    findings: tuple[Finding, ...],
-) -> Fitted:
-    best = int(np.argmin(progress.losses))
-    point = point_of(progress.points, best)
-    objective = with_feedback(job.objective, progress.feedback)
-    criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
-    vectors = np.asarray(progress.points.coefficients)
-    outcomes = tuple(
-        Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
-        for i in range(len(starts))
-    )
-    names = [flight.name for flight in job.fitted]
-    scales = {
-        name: {channel: float(progress.scales[channel][i]) for channel in progress.scales}
-        for i, name in enumerate(names)
-    }
-    return Fitted(
-        objective=objective,
-        point=point,
-        criterion=criterion,
-        noise=job.noise,
-        scales=scales,
-        iterations=progress.iterations,
-        outcomes=outcomes,
-        method=method,
-        evaluations=progress.evaluations,
-        wall_time=seconds,
-        loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
-        loss_best=float(progress.losses[best]),
-        converged=progress.converged,
-        findings=(
-            *findings,
-            *end_findings(job, progress.feedback, scales),
-            *offset_findings(job, np.asarray(point.offsets) * OFFSET_UNIT),
-        ),
-    )
-
-
 def _origin(number: int) -> str:
     return "vehicle file" if number == 0 else "random"
 
 
 def _loss_at(objective: Objective, point: Point, criterion: Criterion) -> float:
     """Return the loss at a point, as the search counts it."""
-    flight = np.asarray(objective.segments.flight)
-    return float(
-        total(objective.space, flight, point, criterion, objective.sums(point, criterion))[0]
+    sums = objective.sums(point, criterion)
+    loss, _, _ = normal_equations(
+        objective.space, np.asarray(objective.segments.flight), point, criterion, sums
     )
+    return float(loss)
 
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:
     """Return the best coefficients so far."""
-    best = int(np.argmin(progress.trail[-1] if progress.trail else progress.losses))
-    points = progress.points if progress.step is None else progress.step.point
-    values = job.space.values(jnp.asarray(points.coefficients[best]))
+    values = job.space.values(jnp.asarray(progress.best_point.coefficients))
     return {name: float(value) for name, value in values.items()}

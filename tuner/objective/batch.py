@@ -14,7 +14,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.normal import Flier, Objective, robust_loss
+from tuner.objective.flier import Flier
+from tuner.objective.loss import robust_loss
+from tuner.objective.normal import Objective
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 

@@ -1,4 +1,4 @@
-"""What an objective is asked with and what it answers: points, stages, sums and derivatives."""
+"""What an objective is asked with and what it answers: points, criteria, sums and derivatives."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Criterion(eqx.Module):
     scale
         Channel -> (N,) factor on the standard deviations: inflated at first, more for a flight that
         the model cannot match.
-    held
-        (clocks, N) s of clock offset for the signals that jump between samples.
+    reference_offset
+        (clocks, N) s of clock offset at which signals that jump between samples are read exactly.
     huber
         Residuals beyond so many (scaled) standard deviations count linearly; infinite for plain
         squares.
@@ -51,7 +51,7 @@ class Criterion(eqx.Module):
 
     horizon: Int[Array, ""]
     scale: dict[str, Float[Array, " N"]]
-    held: Float[Array, "clocks N"]
+    reference_offset: Float[Array, "clocks N"]
     huber: Float[Array, ""]
     prior: Float[Array, ""]
     states: Float[Array, "L F"] | None = None
@@ -107,10 +107,10 @@ class Jacobian(eqx.Module):
 
 
 class SegmentData(eqx.Module):
-    """Recordings and the part of a point and a stage that concerns them, segment by segment."""
+    """Recordings and the part of a point and a criterion that concerns them, segment by segment."""
 
     segments: Segments
     offsets: Float[Array, "*starts offsets F"]
     scale: dict[str, Float[Array, " F"]]
-    held: Float[Array, "clocks F"]
+    reference_offset: Float[Array, "clocks F"]
     states: Float[Array, "L F"] | None

@@ -44,7 +44,7 @@ def _bytes_a_segment(objective: Objective, point: Point, criterion: Criterion) -
 def portion(
     objective: Objective, point: Point, criterion: Criterion, flights: Flights
 ) -> tuple[Objective, Point, Criterion]:
-    """Return problem, point and stage of some flights alone."""
+    """Return problem, point and criterion of some flights alone."""
     flight = np.asarray(objective.segments.flight)
     segments = np.flatnonzero(np.isin(flight, flights))
     kept = jax.tree.map(
@@ -59,7 +59,7 @@ def portion(
         Criterion(
             horizon=criterion.horizon,
             scale={name: scale[flights] for name, scale in criterion.scale.items()},
-            held=criterion.held[:, flights],
+            reference_offset=criterion.reference_offset[:, flights],
             huber=criterion.huber,
             prior=criterion.prior,
             states=None if criterion.states is None else criterion.states[:, segments],

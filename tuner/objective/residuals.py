@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
@@ -69,7 +67,7 @@ def fly(
         limits=limits,
     )
     motion = flown.log.motion
-    every = {
+    logged = {
         "position": (motion.position.x, motion.position.y, motion.position.z),
         "attitude": (motion.attitude.w, motion.attitude.x, motion.attitude.y, motion.attitude.z),
         "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
@@ -77,7 +75,7 @@ def fly(
         "command": flown.log.command,
     }
     return Trace(
-        {name: jnp.stack(every[name], axis=1) for name in segments.measured}, flown.crash_time
+        {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
     )
 
 
@@ -85,7 +83,7 @@ def residuals(
     trace: Trace,
     segments: Segments,
     offsets: Float[Array, "offsets F"],
-    held: Float[Array, "clocks F"],
+    reference_offset: Float[Array, "clocks F"],
     *,
     rate: float,
     horizon: Int[Array, ""],
@@ -94,7 +92,7 @@ def residuals(
 
     Parameters
     ----------
-    trace, offsets, held, rate
+    trace, offsets, reference_offset, rate
         As of `simulated_at_stamps`.
     segments
         The recording.
@@ -103,7 +101,7 @@ def residuals(
     """
     weighted = {}
     for name, measured in segments.measured.items():
-        simulated = simulated_at_stamps(trace, name, measured, offsets, held, rate=rate)
+        simulated = simulated_at_stamps(trace, name, measured, offsets, reference_offset, rate=rate)
         flown = measured.time * rate < horizon - 1
         if name == "attitude":
             error = _attitude_error(measured, simulated)
@@ -118,7 +116,7 @@ def simulated_at_stamps(
     channel: str,
     measured: Measured,
     offsets: Float[Array, "offsets F"],
-    held: Float[Array, "clocks F"],
+    reference_offset: Float[Array, "clocks F"],
     *,
     rate: float,
 ) -> Float[Array, "n c F"]:
@@ -135,8 +133,8 @@ def simulated_at_stamps(
     offsets
         s by which each clock's stamps are late: a sample stamped t was taken at t - offset; then
         rad/s by which the gyro reads too much about each axis.
-    held
-        Offsets at which signals that jump between samples are read exactly; from there to
+    reference_offset
+        s of clock offset at which signals that jump between samples are read exactly; from there to
         ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
     rate
         Hz of the trace.
@@ -144,9 +142,9 @@ def simulated_at_stamps(
     clock = CLOCK_OF[channel]
     place = (measured.time - offsets[clock]) * rate
     if channel == "command":
-        before = (measured.time - held[clock]) * rate
-        return _held_then_moved(trace.channels[channel], before, place)
-    simulated = _between(trace.channels[channel], place)
+        before = (measured.time - reference_offset[clock]) * rate
+        return _zero_order_hold_moved(trace.channels[channel], before, place)
+    simulated = _linear_interpolation(trace.channels[channel], place)
     return simulated + offsets[len(CLOCKS) :] if channel == "body_rate" else simulated
 
 
@@ -156,7 +154,7 @@ def _below(series: Array, place: Float[Array, "n F"]) -> Int[Array, "n 1 F"]:
     return jnp.clip(below, 0, last)[:, None]
 
 
-def _between(
+def _linear_interpolation(
     series: Float[Array, "samples c F"], place: Float[Array, "n F"]
 ) -> Float[Array, "n c F"]:
     """Read a series at fractional sample numbers by linear interpolation."""
@@ -166,23 +164,20 @@ def _between(
     return first + (place[:, None] - below) * (second - first)
 
 
-def _held_then_moved(
+def _zero_order_hold_moved(
     series: Float[Array, "samples c F"], before: Float[Array, "n F"], place: Float[Array, "n F"]
 ) -> Float[Array, "n c F"]:
-    """Read a series that is held between samples, moved a little along its interpolation.
+    """Read a zero-order hold, moved a little along the series' linear interpolation.
 
-    Half a sample earlier the interpolation of a held signal is its mean.
+    Half a sample earlier the interpolation is the mean of the signal that holds.
     """
-    held = jnp.take_along_axis(series, _below(series, before), axis=0)
-    return held + (_between(series, place - 0.5) - _between(series, before - 0.5))
+    step = jnp.take_along_axis(series, _below(series, before), axis=0)
+    return step + (
+        _linear_interpolation(series, place - 0.5) - _linear_interpolation(series, before - 0.5)
+    )
 
 
 def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Float[Array, "n 3 F"]:
     recorded = Quaternion.of(jnp.moveaxis(measured.values, 1, 0))
     flown = Quaternion.of(jnp.moveaxis(simulated, 1, 0))
     return jnp.moveaxis(recorded.rotation_vector_to(flown).stacked(), 0, 1)
-
-
-def sum_of_squares(parts: Mapping[str, Array]) -> Array:
-    """Return the sum of squares over channels and samples, per segment (F,)."""
-    return sum((jnp.sum(part * part, axis=(0, 1)) for part in parts.values()), jnp.zeros(()))

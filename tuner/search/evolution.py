@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,102 +14,117 @@ from numpy.typing import NDArray
 from tuner.objective.batch import CHUNK, evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.search.fitted import Iteration
-from tuner.search.progress import Free, Progress, criterion_of, point_of, with_feedback
-from tuner.search.stages import Stage
+from tuner.search.optimiser import Iterate, Optimiser, StageProblem
+from tuner.search.progress import point_of
 
 POPULATION = CHUNK
 """Vectors in one generation."""
 SPREAD = 0.5
 """First standard deviation, in those of the coefficients' priors."""
+WIDEST = 0.25
+"""First standard deviation at most, as a share of the coefficient's range."""
 FLAT = 1e-3
 """A stage ends when the best losses of the last generations differ by less than this share."""
 
+Array = NDArray[np.float64]
 
-def evolve(
-    objective: Objective,
-    stage: Stage,
-    progress: Progress,
-    *,
-    free: Free,
-    seed: int,
-    tell: Callable[[Progress], None],
-) -> Progress:
-    """Run one stage from the best start so far; clock offsets stay where they are.
 
-    Parameters
+@dataclass(frozen=True)
+class Evolution:
+    """A population under way.
+
+    Attributes
     ----------
-    objective, stage, progress
-        As for `tuner.search.continuation.run_leg`.
-    free
-        What may move.
-    seed
-        Of the population; each stage draws its own.
-    tell
-        Called after every generation.
-
-    Returns
-    -------
-    Progress
-        The best vector in the place of the start that it came from.
+    strategy
+        cma's own state, which it changes in place.
+    loss
+        (n, K) vectors -> (n,) losses and position RMSE in m.
+    vector, least
+        The best vector (K,) so far, and its loss.
     """
-    import cma  # noqa: PLC0415 (takes its time)
 
-    objective = with_feedback(objective, progress.feedback)
-    best = int(np.argmin(progress.losses))
-    point = point_of(progress.points, best)
-    criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
-    space, centre = objective.space, np.asarray(point.coefficients)
-    loss_of = _loss(objective, point, criterion)
-    moves = np.flatnonzero(free.coefficients)
-    spread = SPREAD * (space.prior_sd / space.width)[moves]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        strategy = cma.CMAEvolutionStrategy(
-            space.share(centre)[moves],
-            1.0,
-            {
-                "bounds": [0.0, 1.0],
-                "CMA_stds": np.minimum(spread, 0.25),
-                "seed": 1 + seed + 1000 * progress.stage,
-                "popsize": POPULATION,
-                "maxiter": stage.steps,
-                "tolfunrel": FLAT,
-                "verbose": -9,
-            },
+    strategy: Any
+    loss: Callable[[Array], tuple[Array, Array]]
+    vector: Array
+    least: float = np.inf
+
+
+class CmaEs(Optimiser):
+    """CMA-ES from the best start so far, by pycma; the flights' offsets stay where they are."""
+
+    name = "cma"
+
+    def init(self, problem: StageProblem) -> Evolution:
+        """Return a population around the best start, as wide as its coefficients' priors."""
+        import cma  # noqa: PLC0415 (takes its time)
+
+        point, space = point_of(problem.points, problem.best), problem.objective.space
+        centre, moves = np.asarray(point.coefficients), _moves(problem)
+        spread = SPREAD * (space.prior_sd / space.width)[moves]
+        options = {
+            "bounds": [0.0, 1.0],
+            "CMA_stds": np.minimum(spread, WIDEST),
+            "seed": problem.seed,
+            "popsize": POPULATION,
+            "maxiter": problem.stage.steps,
+            "tolfunrel": FLAT,
+            "verbose": -9,
+        }
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            strategy = cma.CMAEvolutionStrategy(space.share(centre)[moves], 1.0, options)
+        return Evolution(strategy, _loss(problem.objective, point, problem.criterion), centre)
+
+    def step(self, problem: StageProblem, state: Evolution) -> tuple[Evolution, Iterate]:
+        """Fly one generation; the best vector takes the place of the start that it came from."""
+        space, start = problem.objective.space, problem.best
+        centre = np.asarray(problem.points.coefficients[start])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            drawn = state.strategy.ask()
+            shares = np.repeat(space.share(centre)[None], len(drawn), axis=0)
+            shares[:, _moves(problem)] = drawn
+            vectors = np.stack([space.at_share(share) for share in shares])
+            losses, position_rmse = state.loss(vectors)
+            state.strategy.tell(drawn, list(losses))
+        best = int(np.argmin(losses))
+        if losses[best] < state.least:
+            state = replace(state, vector=vectors[best], least=float(losses[best]))
+        coefficients = np.array(problem.points.coefficients)
+        coefficients[start] = state.vector
+        kept = np.array(problem.losses)
+        kept[start] = state.least
+        iterate = Iterate(
+            points=Point(jnp.asarray(coefficients), problem.points.offsets),
+            losses=kept,
+            accepted=np.ones(len(kept), bool),
+            position_rmse=float(position_rmse[best]),
         )
-        vector, least = centre, np.inf
-        while not strategy.stop():
-            shares = strategy.ask()
-            every = np.repeat(space.share(centre)[None], len(shares), axis=0)
-            every[:, moves] = shares
-            vectors = np.stack([space.at_share(share) for share in every])
-            losses, position_rmse = loss_of(vectors)
-            strategy.tell(shares, list(losses))
-            here = int(np.argmin(losses))
-            if losses[here] < least:
-                vector, least = vectors[here], float(losses[here])
-            progress = _told(objective, stage, progress, least, float(position_rmse[here]))
-            progress = _placed(progress, best, vector, least)
-            tell(progress)
-    return replace(
-        progress,
-        stage=progress.stage + 1,
-        converged="maxiter" not in strategy.stop(),
-    )
+        return state, iterate
+
+    def terminate(self, problem: StageProblem, state: Evolution) -> bool:  # noqa: ARG002
+        """Return whether pycma has a reason to stop other than the number of generations."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            reasons = state.strategy.stop()
+        return bool(reasons) and "maxiter" not in reasons
+
+
+def _moves(problem: StageProblem) -> NDArray[np.intp]:
+    return np.flatnonzero(problem.free.coefficients)
 
 
 def _loss(
     objective: Objective, point: Point, criterion: Criterion
-) -> Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return (S, K) vectors -> (S,) losses as least squares counts them, and position RMSE in m."""
+) -> Callable[[Array], tuple[Array, Array]]:
+    """Return (n, K) vectors -> (n,) losses as least squares counts them, and position RMSE in m."""
     space = objective.space
     counts = objective.sums(point, criterion).counts
     compared = max(float(sum(np.sum(number) for number in counts.values())), 1.0)
     position = objective.segments.measured.get("position")
     sigma = np.nan if position is None else 1.0 / np.asarray(position.weight).max()
 
-    def loss(vectors: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def loss(vectors: Array) -> tuple[Array, Array]:
         batch = evaluate(objective, vectors, point, criterion)
         scaled = np.stack([np.asarray(space.scaled(jnp.asarray(vector))) for vector in vectors])
         pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
@@ -119,30 +135,3 @@ def _loss(
         return np.nan_to_num(total / compared, nan=np.inf, posinf=np.inf), rmse
 
     return loss
-
-
-def _told(
-    objective: Objective, stage: Stage, progress: Progress, loss: float, position_rmse: float
-) -> Progress:
-    iteration = Iteration(
-        stage=stage.name,
-        number=len(progress.iterations),
-        loss=loss,
-        position_rmse=position_rmse,
-        accepted=True,
-        horizon=stage.horizon / float(objective.schedule.log_rate),
-    )
-    return replace(
-        progress,
-        iterations=(*progress.iterations, iteration),
-        evaluations=progress.evaluations + 1,
-    )
-
-
-def _placed(progress: Progress, start: int, vector: NDArray[np.float64], loss: float) -> Progress:
-    coefficients = np.array(progress.points.coefficients)
-    coefficients[start] = vector
-    losses = np.array(progress.losses)
-    losses[start] = loss
-    points = Point(jnp.asarray(coefficients), progress.points.offsets)
-    return replace(progress, points=points, losses=losses)

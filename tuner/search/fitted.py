@@ -31,6 +31,9 @@ class Iteration:
         Whether the step was kept.
     horizon
         s.
+    damping
+        λ of the Levenberg-Marquardt step that follows, relative to the Hessian per compared value;
+        NaN for CMA-ES.
     """
 
     stage: str
@@ -39,6 +42,7 @@ class Iteration:
     position_rmse: float
     accepted: bool
     horizon: float
+    damping: float = float("nan")
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,18 @@
-"""Levenberg-Marquardt on normal equations: optimistix's solver, fed with a square problem."""
+"""optimistix's Levenberg-Marquardt, stepped by hand for several starts at once.
+
+The solver is put together as optimistix documents it: an `AbstractGaussNewton` made of a descent
+(`DampedNewtonDescent`, which solves (JᵀJ + λ I) Δy = -Jᵀr by QR) and a search
+(`ClassicalTrustRegion`, which accepts or rejects the point and sets λ = 1/step size). Its `init`,
+`step` and `terminate` are called here rather than by `optimistix.least_squares`, because the
+residuals of a step come from a simulation that runs on all devices, outside the compiled step, and
+because a user sees each iteration. What `fn` is and why it is linear: `tuner.search
+.normal_equations`.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias, cast
+from dataclasses import replace
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -11,131 +21,20 @@ import numpy as np
 import optimistix
 from jax import Array
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from tuner.coefficients import of_scope
-from tuner.coefficients.space import Coordinates, Space
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
+from tuner.coefficients.space import Coordinates
+from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
-
-_Before: TypeAlias = tuple[Point, Any, SegmentSums]
-"""Best points, solver states and the sums at the points that these wanted to try."""
-RIDGE = 1e-13
-"""Relative to the largest diagonal element: keeps a singular Hessian factorisable."""
-
-
-class Step(eqx.Module):
-    """Where a solver stands after a step; with S starts, every leaf has S first.
-
-    Attributes
-    ----------
-    point
-        The best point so far.
-    solver
-        optimistix's own state.
-    sums
-        The segments' sums at the point that was tried, gradient and Hessian included; None before.
-    loss
-        Scalar: the loss at the best point, per compared value.
-    accepted
-        Whether the tried point was better.
-    """
-
-    point: Point
-    solver: Any
-    sums: SegmentSums | None
-    loss: Float[Array, ""]
-    accepted: Array
+from tuner.search.normal_equations import (
+    LinearResiduals,
+    linear_residuals,
+    normal_equations,
+    residuals_at,
+)
 
 
-def total(
-    space: Space | Coordinates,
-    flight: ArrayLike,
-    point: Point,
-    criterion: Criterion,
-    sums: SegmentSums,
-) -> tuple[Array, Array, Array]:
-    """Return loss, gradient (P,) and Hessian (P, P) over all segments, priors included.
-
-    The parameters are the coefficients, then the flights' offsets, one kind after the other;
-    everything is divided by the number of compared values, so that damping means the same at every
-    horizon.
-
-    Parameters
-    ----------
-    space
-        Free coefficients and their priors.
-    flight
-        (F,) number of the flight that each segment belongs to.
-    point, criterion, sums
-        Where, in which terms, and what the segments contribute there.
-    """
-    count, (kinds, flights) = len(space), point.offsets.shape
-    compared = jnp.maximum(sum(jnp.sum(n) for n in sums.counts.values()), 1.0)
-    mean, sd = jnp.asarray(space.prior_mean), jnp.asarray(space.prior_sd)
-
-    def prior(vector: Array) -> Array:
-        return (space.scaled(vector) - mean) / sd * criterion.prior
-
-    pull, slope = jax.jvp(prior, (point.coefficients,), (jnp.ones(count),))
-    offset_pull = point.offsets / OFFSET_SD
-    loss = jnp.sum(sums.loss) + 0.5 * (jnp.sum(pull**2) + jnp.sum(offset_pull**2))
-    owner = (jnp.arange(flights)[:, None] == jnp.asarray(flight)).astype(sums.gradient.dtype)
-    own_gradient = sums.gradient[count:] @ owner.T + offset_pull / OFFSET_SD
-    gradient = jnp.concatenate(
-        [jnp.sum(sums.gradient[:count], axis=-1) + slope * pull, own_gradient.ravel()]
-    )
-    shared = jnp.sum(sums.hessian[:count, :count], axis=-1) + jnp.diag(slope**2)
-    across = (sums.hessian[:count, count:] @ owner.T).reshape(count, -1)
-    own = sums.hessian[count:, count:] @ owner.T  # (kinds, kinds, N): a flight's own alone
-    spread = own[:, :, :, None] * jnp.eye(flights)
-    block = jnp.moveaxis(spread, 2, 1).reshape(kinds * flights, kinds * flights)
-    block = block + jnp.eye(len(block)) / OFFSET_SD**2
-    hessian = jnp.block([[shared, across], [across.T, block]])
-    return loss / compared, gradient / compared, hessian / compared
-
-
-(OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in of_scope("flight").values()}
-"""Prior of an offset, in its unit of 10 ms or 0.01 rad/s: likelier small than large."""
-
-
-def _pack(point: Point) -> Array:
-    return jnp.concatenate([point.coefficients, point.offsets.reshape(-1)])
-
-
-def _unpack(packed: Array, like: Point) -> Point:
-    count = len(like.coefficients)
-    return Point(packed[:count], packed[count:].reshape(like.offsets.shape))
-
-
-def _square_problem(loss: Array, gradient: Array, hessian: Array, free: ArrayLike) -> Any:
-    """Return a least-squares function with as many residuals as parameters, plus one.
-
-    It knows one point alone, where its value and its derivative rule give residuals r and Jacobian
-    J with ½|r|² the loss, Jᵀr its gradient and JᵀJ the Gauss-Newton Hessian: a solver takes the
-    very step that it would take on all the residuals, without seeing them.
-    """
-    free = jnp.asarray(free)
-    gradient = gradient * free
-    hessian = hessian * free[:, None] * free[None] + jnp.diag(1.0 - free)
-    ridge = RIDGE * jnp.max(jnp.diag(hessian))
-    factor = jnp.linalg.cholesky(hessian + ridge * jnp.eye(len(free)))
-    residual = jax.scipy.linalg.solve_triangular(factor, gradient, lower=True)
-    rest = jnp.sqrt(jnp.maximum(2.0 * loss - residual @ residual, 0.0))
-    value = jnp.concatenate([residual, rest[None]])
-
-    @jax.custom_jvp
-    def square(packed: Array) -> Array:
-        return value + 0.0 * packed[0]
-
-    @square.defjvp
-    def derivative(_: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-        return value, jnp.concatenate([factor.T @ tangents[0], jnp.zeros(1, value.dtype)])
-
-    return lambda packed, _: (square(packed), None)
-
-
-class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]
+class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]
     """Levenberg-Marquardt that takes longer steps as soon as the model predicts well."""
 
     rtol: float = 1e-9
@@ -148,57 +47,122 @@ class _Solver(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[mi
     verbose: Any = eqx.field(static=True, default=lambda **_: None)
 
 
-_SOLVER = _Solver()
+_SOLVER = _LevenbergMarquardt()
+_NO_OPTIONS: dict[str, Any] = {}
+_NO_TAGS: frozenset[object] = frozenset()
 
 
-def _fresh(packed: Array, fn: Any) -> Any:
-    """Return the solver's first state."""
-    shape, _ = jax.eval_shape(lambda p: fn(p, None), packed)
-    return _SOLVER.init(fn, packed, None, {}, shape, None, frozenset())
+class Step(eqx.Module):
+    """Where the solver stands after a step; with S starts, every array has S first.
+
+    Attributes
+    ----------
+    point
+        The best point so far.
+    solver
+        optimistix's state; its ``y_eval`` is the point to be tried next.
+    sums
+        The segments' sums at the point that was tried, gradient and Hessian included; None before.
+    loss
+        Scalar: the loss at the best point, per compared value.
+    accepted
+        Whether the tried point was better.
+    damping
+        λ of the next step, relative to the Hessian per compared value.
+    still
+        Whether optimistix's own `terminate` holds: the accepted point and its residuals differ
+        from those before by less than 1e-9.
+    """
+
+    point: Point
+    solver: Any
+    sums: SegmentSums | None
+    loss: Float[Array, ""]
+    accepted: Bool[Array, ""]
+    damping: Float[Array, ""]
+    still: Bool[Array, ""]
+
+
+def _pack(point: Point) -> Array:
+    return jnp.concatenate([point.coefficients, point.offsets.reshape(-1)])
+
+
+def _unpack(packed: Array, like: Point) -> Point:
+    count = len(like.coefficients)
+    return Point(packed[:count], packed[count:].reshape(like.offsets.shape))
 
 
 @eqx.filter_jit
-def _begin(packed: Array, free: ArrayLike) -> Any:
-    def one(packed: Array) -> Any:
-        still = jnp.zeros_like(packed)
-        fn = _square_problem(jnp.zeros(()), still, jnp.diag(still), free)
-        return eqx.filter(_fresh(packed, fn), eqx.is_array)
+def _init(parameters: Array) -> Any:
+    """Return the solver's state before the first step, for S starts (S, P)."""
 
-    return eqx.filter_vmap(one)(packed)
+    def init(parameters: Array) -> Any:
+        count = len(parameters)
+        shapes = LinearResiduals(jnp.eye(count), jnp.zeros(count + 1), parameters)
+        residual, _ = jax.eval_shape(residuals_at, parameters, shapes)
+        return _SOLVER.init(residuals_at, parameters, shapes, _NO_OPTIONS, residual, None, _NO_TAGS)
+
+    return eqx.filter_vmap(init)(parameters)
 
 
 @eqx.filter_jit
 def _step(
-    space: Coordinates, flight: ArrayLike, before: _Before, criterion: Criterion, free: ArrayLike
+    space: Coordinates,
+    flight: ArrayLike,
+    step: Step,
+    criterion: Criterion,
+    free: ArrayLike,
 ) -> Step:
-    def one(point: Point, solver: Any, sums: SegmentSums) -> Step:
-        tried = _unpack(solver.y_eval, point)
-        fn = _square_problem(*total(space, flight, tried, criterion, sums), free)
-        packed = _pack(point)
-        static = eqx.filter(_fresh(packed, fn), eqx.is_array, inverse=True)
-        new, state, _ = _SOLVER.step(fn, packed, None, {}, eqx.combine(solver, static), frozenset())
-        accepted = state.num_steps_since_acceptance == 0
-        arrays = eqx.filter(state, eqx.is_array)
-        return Step(_unpack(new, point), arrays, sums, state.f_info.as_min(), accepted)
+    """Take a step for S starts, whose sums are those at the points that are to be tried."""
 
-    after: Step = eqx.filter_vmap(one)(*before)
+    def advanced(before: Step) -> Step:
+        assert before.sums is not None
+        tried = _unpack(before.solver.y_eval, before.point)
+        equations = normal_equations(space, flight, tried, criterion, before.sums)
+        linear = linear_residuals(before.solver.y_eval, *equations, free)
+        parameters, solver, _ = _SOLVER.step(
+            residuals_at, _pack(before.point), linear, _NO_OPTIONS, before.solver, _NO_TAGS
+        )
+        still, _ = _SOLVER.terminate(
+            residuals_at, parameters, linear, _NO_OPTIONS, solver, _NO_TAGS
+        )
+        return Step(
+            point=_unpack(parameters, before.point),
+            solver=solver,
+            sums=before.sums,
+            loss=solver.f_info.as_min(),
+            accepted=solver.num_steps_since_acceptance == 0,
+            damping=1.0 / solver.search_state.step_size,
+            still=still,
+        )
+
+    after: Step = eqx.filter_vmap(advanced)(step)
     return after
 
 
-def begin(points: Point, free: ArrayLike) -> Step:
-    """Set a stage up at S points; their leaves have S first, and so has every leaf returned.
+def begin(points: Point) -> Step:
+    """Return where the solver stands before its first step from S points.
 
     Parameters
     ----------
     points
-        Where the starts stand.
-    free
-        (K + offsets·N,) one for what may move, zero for what stays.
+        The starts; their leaves have S first, and so has every array returned.
     """
     starts = len(points.coefficients)
-    solver = _begin(jax.vmap(_pack)(points), np.asarray(free))
-    fresh = Step(points, solver, None, jnp.full(starts, jnp.inf), jnp.ones(starts, bool))
-    return cast(Step, on_host(fresh))
+    return cast(
+        Step,
+        on_host(
+            Step(
+                point=points,
+                solver=_init(jax.vmap(_pack)(points)),
+                sums=None,
+                loss=jnp.full(starts, jnp.inf),
+                accepted=jnp.ones(starts, bool),
+                damping=jnp.ones(starts),
+                still=jnp.zeros(starts, bool),
+            )
+        ),
+    )
 
 
 def advance(objective: Objective, before: Step, criterion: Criterion, free: ArrayLike) -> Step:
@@ -215,13 +179,13 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     criterion
         Horizon, scales, robust limit: may change without compiling again, but only at `begin`.
     free
-        As given to `begin`.
+        (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
     tried = jax.vmap(_unpack)(jnp.asarray(before.solver.y_eval), before.point)
     after = _step(
         objective.space.coordinates,
         np.asarray(objective.segments.flight),
-        (before.point, before.solver, objective.sums_of(on_host(tried), criterion)),
+        replace(before, sums=objective.sums_of(on_host(tried), criterion)),
         criterion,
         np.asarray(free),
     )
@@ -229,8 +193,8 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
 
 
 def on_host(tree: Any) -> Any:
-    """Return a pytree with numpy leaves: the same compiled step then serves every iteration.
+    """Return a pytree with numpy arrays: the same compiled step then serves every iteration.
 
     What comes back from several devices would otherwise count as another kind of argument.
     """
-    return jax.tree.map(np.asarray, tree)
+    return jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, tree)

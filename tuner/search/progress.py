@@ -15,27 +15,12 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.fitted import Iteration
-from tuner.search.levenberg_marquardt import Step, on_host
+from tuner.search.levenberg_marquardt import on_host
+from tuner.search.optimiser import Iterate
 from tuner.search.stages import Stage
 
 HUBER = 4.0
 """Standard deviations beyond which a residual counts linearly, in the polish."""
-
-
-@dataclass(frozen=True)
-class Free:
-    """What a search may move.
-
-    Attributes
-    ----------
-    coefficients
-        (K,) of the search vector.
-    offsets
-        (offsets, N) of the flights.
-    """
-
-    coefficients: NDArray[np.bool_]
-    offsets: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -45,7 +30,7 @@ class Progress:
     Attributes
     ----------
     stage
-        Number of the stage that comes next, or that is under way where ``step`` is not None.
+        Number of the stage that comes next, or that is under way where ``iterate`` is not None.
     points
         S points.
     scales
@@ -57,16 +42,15 @@ class Progress:
     iterations
         The trace so far.
     evaluations
-        Jacobians so far.
+        Jacobians, or populations, so far.
     converged
         Whether the last stage ended by itself.
     feedback
         The mixer's saturation feedback that is flown: 1 as in PX4.
     left
-        s that the search may still take; NaN where nobody said.
-    step, trail
-        The solver's state inside a stage, and the losses (S,) of the stage so far; None between
-        stages.
+        s that the search may still take; NaN where that is unknown.
+    steps, iterate
+        How many steps of the stage are done, and where the last one led; None between stages.
     """
 
     stage: int
@@ -79,8 +63,15 @@ class Progress:
     converged: bool = False
     feedback: float = 1.0
     left: float = float("nan")
-    step: Step | None = None
-    trail: tuple[NDArray[np.float64], ...] = ()
+    steps: int = 0
+    iterate: Iterate | None = None
+
+    @property
+    def best_point(self) -> Point:
+        """The best point so far, the stage under way included."""
+        if self.iterate is None:
+            return point_of(self.points, int(np.argmin(self.losses)))
+        return point_of(self.iterate.points, int(np.argmin(self.iterate.losses)))
 
 
 def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
@@ -118,7 +109,7 @@ def criterion_of(
     criterion = Criterion(
         horizon=jnp.asarray(stage.horizon),
         scale={name: jnp.asarray(stage.noise_inflation * scale) for name, scale in scales.items()},
-        held=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
+        reference_offset=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
         huber=jnp.asarray(HUBER if stage.robust else np.inf),
         prior=jnp.asarray(1.0),
         states=None if states is None else jnp.asarray(states),

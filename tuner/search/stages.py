@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
 """s; the whole flights follow. The first are so short that even a vehicle with a third of the
@@ -22,11 +21,13 @@ EVOLVED = (0.8, 3.0)
 """s of horizon at which CMA-ES looks for where to begin."""
 GENERATIONS = 60
 """Of CMA-ES in one stage, at most."""
+FEEDBACK_AT = 3.0
+"""s of horizon at which the mixer's saturation feedback is tried both ways."""
 WHOLE = "whole length"
 USUAL = 5
 """Steps that a stage takes, more or less."""
 PAUSE = 4000
-"""What a step costs beside its simulation, in samples of it."""
+"""What a step takes beside its simulation, in samples of it."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Stage:
         For people.
     horizon
         Samples of the simulation.
-    noise inflation
+    noise_inflation
         Factor on the standard deviations.
     robust
         Whether large residuals count linearly.
@@ -54,11 +55,14 @@ class Stage:
         strays.
     prunes
         Whether offsets too small to matter are dropped before it.
-    solver
-        ``gradient`` moves everything down the slope, ``offsets`` the flights' offsets alone, and
-        ``cma`` the coefficients alone by CMA-ES.
+    optimiser
+        Name of an `tuner.search.optimiser.Optimiser`.
+    coefficients
+        Whether the coefficients are free.
     enough
         Loss, in inflated standard deviations, below which the next stage may as well begin.
+    tries_feedback
+        Whether the mixer's saturation feedback is tried both ways where rotors were clipped.
     """
 
     name: str
@@ -70,8 +74,10 @@ class Stage:
     tolerance: float
     weighs: bool
     prunes: bool
-    solver: Literal["gradient", "offsets", "cma"] = "gradient"
+    optimiser: str = "gradient"
+    coefficients: bool = True
     enough: float = 0.0
+    tries_feedback: bool = False
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
@@ -92,6 +98,7 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     weighs=False,
                     prunes=False,
                     enough=ENOUGH if seconds < GENTLE else 0.0,
+                    tries_feedback=seconds == FEEDBACK_AT,
                 )
             )
     return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
@@ -123,7 +130,7 @@ def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, ...
 
 
 def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> float:
-    """Return the s that a search may still take, told from what it took so far.
+    """Return the s that a search may still take, extrapolated from what it took so far.
 
     Parameters
     ----------
@@ -134,14 +141,14 @@ def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> flo
     spent
         s so far.
     """
-    costs = [min(one.steps, USUAL) * (one.horizon + PAUSE) for one in stages]
+    work = [min(planned.steps, USUAL) * (planned.horizon + PAUSE) for planned in stages]
     under_way = (
-        costs[stage] * min(steps / min(stages[stage].steps, USUAL), 1.0)
+        work[stage] * min(steps / min(stages[stage].steps, USUAL), 1.0)
         if stage < len(stages)
         else 0
     )
-    done = sum(costs[:stage]) + under_way
-    return spent * (sum(costs) - done) / done if done else float("nan")
+    done = sum(work[:stage]) + under_way
+    return spent * (sum(work) - done) / done if done else float("nan")
 
 
 def plan(
@@ -158,7 +165,8 @@ def plan(
     Parameters
     ----------
     method
-        ``gradient``, ``cma`` or ``hybrid``: CMA-ES from far, then the slope.
+        ``hybrid``: CMA-ES from far, then least squares; ``cma``: CMA-ES, the offsets alone by least
+        squares; else the name of an optimiser, which takes every stage.
     samples, rate
         Of the longest segment, at so many Hz.
     windows
@@ -170,21 +178,33 @@ def plan(
     """
     schedule = window_schedule if windows else schedule_of
     stages = schedule(samples, rate, robust=robust, steps=steps)
-    if method == "gradient":
-        return stages
+    if method not in ("hybrid", "cma"):
+        return tuple(replace(stage, optimiser=method) for stage in stages)
     evolving = [
-        replace(stage, name=f"CMA-ES, {stage.name}", solver="cma", steps=min(GENERATIONS, steps))
+        _by_cma(stage, f"CMA-ES, {stage.name}", steps)
         for stage in stages
         if windows or stage.horizon / rate in EVOLVED
-    ]
+    ][:2]
     if method == "hybrid":
         horizon = evolving[-1].horizon if evolving and not windows else 0
-        return (*evolving[:2], *(stage for stage in stages if stage.horizon >= horizon))
+        return (*evolving, *(stage for stage in stages if stage.horizon >= horizon))
     *_, polish, last = stages
-    final = replace(last, name="CMA-ES, whole length", solver="cma", steps=min(GENERATIONS, steps))
+    whole = replace(last, noise_inflation=3.0, robust=False)
     return (
-        *evolving[:2],
-        replace(final, noise_inflation=3.0, robust=False, prunes=False),
-        replace(polish, name="offsets", solver="offsets", prunes=False),
-        replace(final, name="CMA-ES, polish"),
+        *evolving,
+        _by_cma(whole, "CMA-ES, whole length", steps),
+        replace(polish, name="offsets", coefficients=False, prunes=False),
+        _by_cma(last, "CMA-ES, polish", steps),
+    )
+
+
+def _by_cma(stage: Stage, name: str, steps: int) -> Stage:
+    return replace(
+        stage,
+        name=name,
+        optimiser="cma",
+        steps=min(GENERATIONS, steps),
+        offsets=False,
+        prunes=False,
+        tries_feedback=False,
     )

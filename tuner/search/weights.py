@@ -5,40 +5,51 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.criterion import SegmentSums
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import Step
 
 STRAY = 3.0
 """A flight this many times worse than the others is weighed down, channel by channel."""
 
 
-def root_mean_squares(objective: Objective, step: Step) -> dict[str, NDArray[np.float64]]:
-    """Return channel -> (N,) root mean square residual in σ at the best start's point, or NaN."""
-    assert step.sums is not None
-    best, found = int(np.argmin(step.loss)), {}
+def root_mean_squares(
+    objective: Objective, losses: NDArray[np.float64], sums: SegmentSums
+) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (N,) root mean square residual in σ at the best start's point, or NaN.
+
+    Parameters
+    ----------
+    objective
+        Says which segment belongs to which flight.
+    losses, sums
+        (S,) losses, and the segments' sums with S first.
+    """
+    best, residual = int(np.argmin(losses)), {}
     flight, flights = np.asarray(objective.segments.flight), objective.flights
-    for name, squares in step.sums.squares.items():
-        counts = np.bincount(flight, np.asarray(step.sums.counts[name][best]), flights)
+    for name, squares in sums.squares.items():
+        counts = np.bincount(flight, np.asarray(sums.counts[name][best]), flights)
         mean = np.bincount(flight, np.asarray(squares[best]), flights) / np.maximum(counts, 1.0)
-        found[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
-    return found
+        residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
+    return residual
 
 
 def strays(
-    found: dict[str, NDArray[np.float64]], noise_inflation: float
+    residual: dict[str, NDArray[np.float64]], noise_inflation: float
 ) -> dict[str, NDArray[np.float64]]:
     """Weigh a flight down that is met far worse than the others, so that it cannot poison them."""
-    table = np.stack(list(found.values())) / noise_inflation
+    table = np.stack(list(residual.values())) / noise_inflation
     with np.errstate(all="ignore"):
         per_flight = np.nan_to_num(np.nanmedian(table, axis=0), nan=1.0)
     typical = max(float(np.median(per_flight)), 1.0)
     stray = per_flight > STRAY * typical
     return {
         name: np.where(stray & np.isfinite(values), np.maximum(values / noise_inflation, 1.0), 1.0)
-        for name, values in found.items()
+        for name, values in residual.items()
     }
 
 
-def misfit(found: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+def misfit(residual: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
     """Return how much larger than noise each channel's residuals are on each flight, at least 1."""
-    return {name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in found.items()}
+    return {
+        name: np.maximum(np.nan_to_num(values, nan=1.0), 1.0) for name, values in residual.items()
+    }

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import OFFSET_SD
+from tuner.search.normal_equations import OFFSET_SD
 
 Array = NDArray[np.float64]
 

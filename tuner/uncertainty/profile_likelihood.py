@@ -107,13 +107,13 @@ def _refitted(
     quiet = Criterion(
         horizon=criterion.horizon,
         scale=criterion.scale,
-        held=criterion.held,
+        reference_offset=criterion.reference_offset,
         huber=criterion.huber,
         prior=jnp.asarray(1.0 / WIDE),
         states=criterion.states,
     )
     points = Point(jnp.asarray(starts), jnp.asarray(np.repeat(offsets[None], len(starts), axis=0)))
-    step, before = begin(on_host(points), free), np.full(len(starts), np.inf)
+    step, before = begin(on_host(points)), np.full(len(starts), np.inf)
     for _ in range(STEPS):
         step = advance(objective, step, on_host(quiet), free)
         assert step.sums is not None

@@ -46,7 +46,7 @@ def fitted() -> Fitted:
     exact_fit = making.fitted_of(alone, making.truth(alone))
     rough = {name: 200.0 * scale[:1] for name, scale in exact_fit.criterion.scale.items()}
     criterion = eqx.tree_at(
-        lambda s: (s.scale, s.held), exact_fit.criterion, (rough, np.zeros((2, 1)))
+        lambda s: (s.scale, s.reference_offset), exact_fit.criterion, (rough, np.zeros((2, 1)))
     )
     return replace(exact_fit, criterion=criterion)
 

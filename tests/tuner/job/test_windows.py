@@ -32,7 +32,7 @@ def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
 
 def fitted_through(job, folder):
     folder.mkdir(exist_ok=True)
-    return search(job, folder, resume=False, tell=lambda *_: None)
+    return search(job, folder, resume=False, on_progress=lambda *_: None)
 
 
 @pytest.mark.slow

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from tests.tuner.uncertainty import making
@@ -89,9 +88,8 @@ def _errors(name: str, size: float) -> FlightErrors:
 
 
 def _traces(objective: Objective, segment: int) -> dict[str, Array]:
-    point = making.truth(objective)
-    trace = objective.simulate(point.coefficients, jnp.asarray(objective.samples))
-    place = np.asarray(trace.channels["position"])[::4, :, segment]
+    channels = making.fly_at(objective, making.truth(objective))
+    place = np.asarray(channels["position"])[::4, :, segment]
     time = np.arange(len(place)) * 4 / making.PHYSICS
     turn = 10.0 * place
     return {

@@ -8,7 +8,8 @@ import pytest
 from tests.tuner.uncertainty.making import problem, truth, with_data
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.progress import Free, beginning
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning
 from tuner.search.stages import schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
@@ -21,12 +22,11 @@ def fit():
 
 def searched(fit, vectors, *, offsets=False):
     stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=30)
-    told = []
+    reports = []
     free = Free(np.ones(len(fit.space), bool), np.full((len(OFFSETS), 2), offsets))
     progress = beginning(fit, np.asarray(vectors))
-    for state in grow(fit, stages, progress, free=free, clipped=False, tell=told.append):
-        progress = state
-    return progress, told
+    progress = grow(fit, stages, progress, free=free, clipped=False, on_progress=reports.append)
+    return progress, reports
 
 
 def test_truth_is_recovered_from_every_start(fit):
@@ -36,14 +36,14 @@ def test_truth_is_recovered_from_every_start(fit):
         fit.space.vector_of({n: float(v) * wrong.get(n, 1.0) ** sign for n, v in values.items()})
         for sign in (1, -1)
     ]
-    progress, told = searched(fit, starts)
+    progress, reports = searched(fit, starts)
     for start in range(2):
         found = fit.space.values(progress.points.coefficients[start])
         for name, value in values.items():
             assert float(found[name]) == pytest.approx(float(value), rel=0.02), (start, name)
     assert progress.converged
-    assert len(told) == progress.evaluations
-    assert told[-1].iterations[-1].stage == "polish again"
+    assert len(reports) == progress.evaluations
+    assert reports[-1].iterations[-1].stage == "polish again"
 
 
 def test_a_flight_of_noise_is_weighed_down_and_the_others_are_fitted(fit):

@@ -20,6 +20,7 @@ from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
 from tuner.config.shipped import find_config
 from tuner.model import model_of, schedule_of
 from tuner.objective.criterion import Criterion, Point
+from tuner.objective.flier import Flier
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.search.fitted import Fitted
@@ -109,8 +110,17 @@ def with_data(
     return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
 
 
+_fly = eqx.filter_jit(Flier.fly)
+
+
 def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
-    trace = objective.simulate(point.coefficients, jnp.asarray(objective.samples))
+    trace = _fly(
+        objective.flier,
+        objective.tunable,
+        objective.segments,
+        point.coefficients,
+        jnp.asarray(objective.samples),
+    )
     return {name: np.asarray(series) for name, series in trace.channels.items()}
 
 
@@ -128,7 +138,7 @@ def criterion_of(objective: Objective, *, prior: float = 1.0) -> Criterion:
     return Criterion(
         horizon=jnp.asarray(objective.samples),
         scale={channel: jnp.ones(segments) for channel in objective.segments.measured},
-        held=jnp.zeros((2, segments)),
+        reference_offset=jnp.zeros((2, segments)),
         huber=jnp.asarray(jnp.inf),
         prior=jnp.asarray(prior),
     )

@@ -6,7 +6,8 @@ import pytest
 from tests.tuner.uncertainty.making import fitted_of, problem, truth, with_data
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.progress import Free, beginning, point_of
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning, point_of
 from tuner.search.stages import plan
 from tuner.uncertainty.estimates import uncertainty_of
 
@@ -33,8 +34,9 @@ def test_intervals_cover_the_truth():
     for repeat in range(REPEATS):
         noisy = with_data(exact, truth(exact), noise=np.random.default_rng(100 + repeat))
         progress = beginning(noisy, np.asarray(exact.space.initial)[None] + 0.02)
-        for reached in grow(noisy, stages, progress, free=free, clipped=False, tell=lambda _: None):
-            progress = reached
+        progress = grow(
+            noisy, stages, progress, free=free, clipped=False, on_progress=lambda _: None
+        )
         found = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
         for number, name in enumerate(FREE):
             low, high = found.estimates[name].ci95

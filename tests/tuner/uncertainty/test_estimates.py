@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import total
+from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.information import information_at
 from tuner.uncertainty.verdict import Verdict
@@ -48,7 +48,9 @@ def test_information_is_the_searchs_own_with_clock_offsets_eliminated(
     point = Point(making.truth(objective).coefficients + 0.01, jnp.asarray(offsets))
     criterion = making.criterion_of(objective)
     sums = objective.sums(point, criterion, derivatives=True)
-    _, _, hessian = total(objective.space, objective.segments.flight, point, criterion, sums)
+    _, _, hessian = normal_equations(
+        objective.space, objective.segments.flight, point, criterion, sums
+    )
     compared = sum(float(n.sum()) for n in sums.counts.values())
     count = len(objective.space)
     kept = np.concatenate([np.arange(count), count + np.flatnonzero(CLOCKS)])

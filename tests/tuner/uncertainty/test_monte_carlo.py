@@ -23,7 +23,7 @@ def refit(objective: Objective, start: Point) -> Point:
     offsets = np.asarray(start.offsets)
     free = np.concatenate([np.ones(len(objective.space)), np.zeros(offsets.size)])
     points = Point(np.asarray(start.coefficients)[None], offsets[None])
-    step = begin(points, free)
+    step = begin(points)
     for _ in range(ITERATIONS):
         step = advance(objective, step, criterion, free)
     return Point(jnp.asarray(step.point.coefficients[0]), jnp.asarray(offsets))

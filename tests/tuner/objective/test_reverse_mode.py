@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.tuner.objective.reverse_mode import gradients
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.objective.criterion import Point
-from tuner.objective.gradient import gradients
 
 FREE = ("inertia_xx", "time_constant_up", "motor_constant", "estimate_latency")
 

@@ -1,7 +1,7 @@
 """The gradient of the loss for a population of coefficient vectors, by reverse mode.
 
-Worth it where there are many more coefficients than a dozen, or where only the gradient is wanted:
-it costs five or six simulations however many coefficients there are.
+No search uses it: by a dozen coefficients forward mode is cheaper. It shows that the simulation can
+be differentiated backwards, at five or six simulations however many coefficients there are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.normal import Flier, Objective, robust_loss
+from tuner.objective.flier import Flier
+from tuner.objective.loss import robust_loss
+from tuner.objective.normal import Objective
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -47,7 +49,7 @@ def gradients(
 ) -> Gradients:
     """Return loss and gradient for every vector, computed on all devices.
 
-    Whole flights are flown; the stage's horizon says how much of them counts.
+    Whole flights are flown; the criterion's horizon says how much of them counts.
 
     Parameters
     ----------
@@ -74,7 +76,8 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
         vectors: Array, data: SegmentData, model: Tunable, horizon: Array, huber: Array
     ) -> Gradients:
         def loss(vector: Array) -> Array:
-            errors = flier.compared(data, model, vector, horizon, whole=True)[1]
+            trace = flier.fly(model, data.segments, vector, None, data.states)
+            errors = flier.residuals(data, horizon, trace, data.offsets)
             scaled = {name: error / data.scale[name] for name, error in errors.items()}
             return jnp.sum(robust_loss(scaled, huber))
 

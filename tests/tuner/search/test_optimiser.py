@@ -1,0 +1,116 @@
+"""An optimiser is added by one class: a stage names it, and so does a search's method."""
+
+import importlib
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import problem, truth, with_data
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
+from tuner.search.normal_equations import linear_residuals, residuals_at
+from tuner.search.optimiser import OPTIMISERS, Free
+from tuner.search.progress import beginning
+from tuner.search.stages import WHOLE, plan
+
+FREE = ("inertia_zz", "motor_constant")
+MODULE = '''
+import jax.numpy as jnp
+import numpy as np
+
+from tuner.objective.batch import evaluate
+from tuner.objective.criterion import Point
+from tuner.search.normal_equations import linear_residuals, residuals_at
+from tuner.search.optimiser import Iterate, Optimiser
+from tuner.search.progress import point_of
+
+
+class CoordinateSearch(Optimiser):
+    """Tries each coefficient a little higher and lower, and halves the step when none helps."""
+
+    name = "coordinate_search"
+
+    def init(self, problem):
+        return 0.2, np.inf, np.asarray(problem.points.coefficients[problem.best])
+
+    def step(self, problem, state):
+        width, least, vector = state
+        reach = width * np.eye(len(vector))[problem.free.coefficients]
+        tried = np.concatenate([vector[None], vector + reach, vector - reach])
+        point = point_of(problem.points, problem.best)
+        losses = np.asarray(evaluate(problem.objective, tried, point, problem.criterion).loss)
+        best = int(np.argmin(losses.sum(axis=-1)))
+        state = width if best else 0.5 * width, float(losses[best].sum()), tried[best]
+        iterate = Iterate(
+            points=Point(jnp.asarray(tried[best])[None], problem.points.offsets),
+            losses=np.array([state[1]]),
+            accepted=np.array([best > 0]),
+            position_rmse=float("nan"),
+        )
+        return state, iterate
+
+    def terminate(self, problem, state):
+        return state[0] < 1e-3
+'''
+
+
+@pytest.fixture
+def added(tmp_path, monkeypatch):
+    """The name of an optimiser that a module of its own adds."""
+    (tmp_path / "coordinate_search.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.import_module("coordinate_search")
+    yield "coordinate_search"
+    del OPTIMISERS["coordinate_search"], sys.modules["coordinate_search"]
+
+
+def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
+    fit = with_data(problem(FREE), truth(problem(FREE)))
+    rate = float(fit.schedule.log_rate)
+    stages = plan(added, fit.samples, rate, windows=False, robust=False, steps=40)
+    stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE)]
+    reports = []
+    start = np.asarray(fit.space.initial) + np.array([0.3, -0.2])
+    progress = grow(
+        fit,
+        tuple(stages),
+        beginning(fit, start[None]),
+        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        clipped=False,
+        on_progress=reports.append,
+    )
+    assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE}
+    assert reports[-1].iterate.points is progress.points
+    assert progress.points.coefficients[0] == pytest.approx(fit.space.initial, abs=0.01)
+    assert all(np.isnan(iteration.damping) for iteration in progress.iterations)
+
+
+def test_least_squares_reports_its_damping():
+    fit = with_data(problem(FREE), truth(problem(FREE)))
+    stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
+    progress = grow(
+        fit,
+        (stage,),
+        beginning(fit, np.asarray(fit.space.initial)[None] + 0.05),
+        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        clipped=False,
+        on_progress=lambda _: None,
+    )
+    first, second, *_ = (iteration.damping for iteration in progress.iterations)
+    assert first == 1.0
+    assert second == pytest.approx(0.2)  # the model predicted well: five times longer a step
+
+
+def test_the_linear_residuals_have_the_normal_equations():
+    random = np.random.default_rng(0)
+    root, origin = random.normal(size=(4, 9)), random.normal(size=4)
+    gradient, hessian, loss = root @ random.normal(size=9), root @ root.T, 40.0
+    linear = linear_residuals(*map(jnp.asarray, (origin, loss, gradient, hessian, np.ones(4))))
+    residual = residuals_at(jnp.asarray(origin), linear)[0]
+    jacobian = jax.jacfwd(lambda y: residuals_at(y, linear)[0])(jnp.asarray(origin))
+    assert 0.5 * float(residual @ residual) == pytest.approx(loss)
+    np.testing.assert_allclose(jacobian.T @ residual, gradient, rtol=1e-9)
+    np.testing.assert_allclose(jacobian.T @ jacobian, hessian, rtol=1e-9)

@@ -1,0 +1,193 @@
+"""A simulation of some segments, compared with their recordings and differentiated forwards.
+
+Everything here is a function of arrays, to be compiled; `tuner.objective.normal` gives it a fit's
+data, on all devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from sim_jax.crash import Limits
+from sim_jax.schedule import Schedule
+from tuner.objective.criterion import OFFSET_UNIT, Jacobian, SegmentData, SegmentSums
+from tuner.objective.initial_conditions import eliminated
+from tuner.objective.loss import count, gauss_newton, robust_loss
+from tuner.objective.residuals import Trace, fly, residuals
+from tuner.objective.segments import OFFSETS, Segments
+from tuner.objective.tunable import Tunable
+from tuner.parallel import piece_that_fits
+
+MEMORY = 2**30
+"""bytes that derivatives take at most by default while they are computed, on all devices."""
+
+
+@dataclass(frozen=True)
+class Flier:
+    """The static half of an objective: its methods are functions of arrays alone."""
+
+    schedule: Schedule
+    capacity: int
+    """Samples of a log, those that pad it included."""
+    limits: Limits
+    memory: int = MEMORY
+
+    def segments_at_once(self, data: SegmentData, moving: int) -> int:
+        """Return how many segments a device flies at a time: what fits its cache and the memory.
+
+        ``moving`` is how many parameters it differentiates by; zero if it does not.
+        """
+        starts = 0 if data.states is None else len(data.states)
+        columns = moving + starts if moving else 1
+        recorded = sum(
+            m.values.shape[0] * m.values.shape[1] for m in data.segments.measured.values()
+        )
+        logged = self.capacity * sum(m.values.shape[1] for m in data.segments.measured.values())
+        # the flown derivatives twice, those of the residuals as such and weighted
+        one = 8 * (columns + 1) * (2 * logged + 2 * recorded)
+        share = self.memory // len(jax.devices())
+        return max(1, min(piece_that_fits(8, columns), share // one))
+
+    def fly(
+        self,
+        model: Tunable,
+        segments: Segments,
+        coefficients: Array,
+        horizon: Array | None,
+        states: Array | None = None,
+    ) -> Trace:
+        """Simulate some segments with a search vector (K,) up to a horizon in samples, or whole."""
+        return fly(
+            model.at(coefficients),
+            segments,
+            self.schedule,
+            samples=self.capacity,
+            horizon=horizon,
+            limits=self.limits,
+            states=states,
+        )
+
+    def compared(
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
+    ) -> tuple[Trace, dict[str, Array]]:
+        """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
+        trace = self.fly(model, data.segments, coefficients, horizon, data.states)
+        return trace, self.residuals(data, horizon, trace, data.offsets)
+
+    def residuals(
+        self, data: SegmentData, horizon: Array, trace: Trace, offsets: Array
+    ) -> dict[str, Array]:
+        """Return channel -> (n, k, F) residuals of a simulation at some offsets (offsets, F)."""
+        return residuals(
+            trace,
+            data.segments,
+            offsets * OFFSET_UNIT,
+            data.reference_offset,
+            rate=float(self.schedule.log_rate),
+            horizon=horizon,
+        )
+
+    def sums(
+        self,
+        data: SegmentData,
+        model: Tunable,
+        coefficients: Array,
+        horizon: Array,
+        huber: Array,
+        *,
+        derivatives: bool,
+    ) -> SegmentSums:
+        """Return what some segments contribute; see `Objective.sums`."""
+        if derivatives or data.states is not None:
+            trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
+        else:
+            trace, errors = self.compared(data, model, coefficients, horizon)
+            columns = None
+        squares = {name: jnp.sum(e * e, axis=(0, 1)) for name, e in errors.items()}
+        rate = float(self.schedule.log_rate)
+        counts = {name: count(data.segments, name, rate, horizon) for name in errors}
+        scaled = {name: e / data.scale[name] for name, e in errors.items()}
+        loss = robust_loss(scaled, huber)
+        segments = jnp.shape(data.offsets)[-1]
+        size = len(coefficients) + len(OFFSETS)
+        gradient, hessian, states = (
+            jnp.zeros((size, segments)),
+            jnp.zeros((size, size, segments)),
+            None,
+        )
+        if columns is not None:
+            gradient, hessian = gauss_newton(columns, scaled, data.scale, huber)
+        if data.states is not None:
+            loss, gradient, hessian, states = eliminated(loss, gradient, hessian, data.states)
+            change = states - data.states
+            for name, column in (columns or {}).items():
+                there = errors[name] + jnp.einsum("lnkf,lf->nkf", column[size:], change)
+                squares[name] = jnp.sum(there * there, axis=(0, 1))
+        return SegmentSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
+
+    def jacobian(
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
+    ) -> Jacobian:
+        """Return every residual of some segments and its derivatives."""
+        trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
+        return Jacobian(errors, columns, trace.crash_time)
+
+    @partial(jax.jit, static_argnums=0)
+    def _with_columns(
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
+    ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
+        """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
+
+        An offset does not enter the simulation, so that its column costs an interpolation. Compiled
+        by name, so that all that builds on it is traced only once.
+        """
+        offsets = data.offsets
+        trace, moved = _jacobian_forward(
+            lambda vector, starts: self.fly(model, data.segments, vector, horizon, starts),
+            coefficients,
+            data.states,
+        )
+
+        def compare(flown: Trace, late: Array) -> dict[str, Array]:
+            return self.residuals(data, horizon, flown, late)
+
+        by_flight = jax.vmap(
+            lambda change: jax.jvp(lambda flown: compare(flown, offsets), (trace,), (change,))[1]
+        )(moved)
+        each = jnp.eye(len(offsets), dtype=offsets.dtype)[:, :, None] * jnp.ones_like(offsets)
+        by_offset = jax.vmap(
+            lambda change: jax.jvp(lambda late: compare(trace, late), (offsets,), (change,))[1]
+        )(each)
+        count = len(coefficients)
+        columns = {
+            name: jnp.concatenate([flown[:count], by_offset[name], flown[count:]])
+            for name, flown in by_flight.items()
+        }
+        return trace, compare(trace, offsets), columns
+
+
+def _jacobian_forward(
+    simulate: Callable[[Array, Array | None], Trace], vector: Array, states: Array | None
+) -> tuple[Trace, Trace]:
+    """Return a simulation and its derivatives, first by a vector (K,), then by starts (L, F).
+
+    All segments' starts move at once: a segment depends on its own alone.
+    """
+    basis = jnp.eye(len(vector) + (0 if states is None else len(states)), dtype=vector.dtype)
+
+    def push(direction: Array) -> tuple[Trace, Trace]:
+        if states is None:
+            flown, moved = jax.jvp(lambda v: simulate(v, None), (vector,), (direction,))
+            return flown, moved
+        turned = direction[len(vector) :, None] * jnp.ones_like(states)
+        flown, moved = jax.jvp(simulate, (vector, states), (direction[: len(vector)], turned))
+        return flown, moved
+
+    pushed: tuple[Trace, Trace] = jax.vmap(push, out_axes=(None, 0))(basis)
+    return pushed
