@@ -21,8 +21,8 @@ from tuner.runtime import configure
 if TYPE_CHECKING:
     from sim_jax.precision import Precision
     from tuner.comparison.table import Table
-    from tuner.export.export import Exported, Format
-    from tuner.export.sdf.snippet import Simulator
+    from tuner.exporters.export import Exported
+    from tuner.exporters.target import Simulator
     from tuner.job.sensitivity import SensitivityResult
     from tuner.simulation.simulate import Simulation
 
@@ -335,7 +335,7 @@ def simulate(
 
 def export(
     run: Run | Named,
-    format: Format,  # noqa: A002 (the option's name)
+    format: str,  # noqa: A002 (the option's name)
     *,
     into: Named | None = None,
     out: Named | None = None,
@@ -349,7 +349,7 @@ def export(
     run
         A run, or its result folder.
     format
-        ``yaml``, ``sdf`` or ``px4``.
+        The name of a target, as ``yaml``, ``sdf`` or ``px4``.
     into
         With ``sdf``, the model to put them into; None gives the tags alone.
     out
@@ -365,8 +365,8 @@ def export(
         A condition is not met, or the file cannot be written or does not read back.
     """
     configure()
-    from tuner.export.export import export as export_run  # noqa: PLC0415 (jax)
-    from tuner.export.refly import refly  # noqa: PLC0415
+    from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
+    from tuner.exporters.refly import refly  # noqa: PLC0415
 
     return export_run(
         run if isinstance(run, Run) else read_run(run),

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from tuner.config import read_vehicle
-from tuner.export.px4 import read_parameters
+from tuner.exporters.targets.px4 import read_parameters
 from tuner.result import read_run
 
 ROOT = Path(__file__).resolve().parents[2]

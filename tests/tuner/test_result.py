@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from tests.tuner.export.conftest import make_run  # noqa: F401 (a fixture)
+from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.errors import InputError
 from tuner.findings import Code, Finding
 from tuner.result import read_run, write_result

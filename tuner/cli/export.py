@@ -14,7 +14,7 @@ def export(
     run: Path,
     /,
     *,
-    format: Literal["yaml", "sdf", "px4"],  # noqa: A002 (the option's name)
+    format: str,  # noqa: A002 (the option's name)
     into: Path | None = None,
     out: Path | None = None,
     simulator: Literal["gazebo-classic", "gz-sim"] = "gazebo-classic",
@@ -28,7 +28,8 @@ def export(
     run
         Result folder.
     format
-        Vehicle file with confidences, SDF of Gazebo classic or gz-sim, or PX4 parameters.
+        yaml is the vehicle file with confidences, sdf a model of Gazebo classic or gz-sim, px4 the
+        parameters.
     into
         The model (.sdf or .sdf.jinja) to put the coefficients into; without, the tags alone.
     out
@@ -43,8 +44,8 @@ def export(
     from tuner.runtime import configure
 
     configure()
-    from tuner.export.export import export as export_run
-    from tuner.export.refly import refly
+    from tuner.exporters.export import export as export_run
+    from tuner.exporters.refly import refly
     from tuner.result import read_run
 
     done = export_run(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from tuner.comparison.table import Row
     from tuner.comparison.table import Table as Comparison
     from tuner.config import Settings
-    from tuner.export.export import Exported
+    from tuner.exporters.export import Exported
     from tuner.flights.inspection import Inspection
     from tuner.simulation.write import Summary
 

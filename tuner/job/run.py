@@ -95,8 +95,8 @@ def run(
     from tuner.runtime import configure  # noqa: PLC0415 (jax starts here)
 
     configure()
-    from tuner.export.after_run import export_as_asked  # noqa: PLC0415
-    from tuner.export.refly import refly  # noqa: PLC0415
+    from tuner.exporters.after_run import exports_of_job  # noqa: PLC0415
+    from tuner.exporters.refly import refly  # noqa: PLC0415
     from tuner.job.check import check  # noqa: PLC0415
     from tuner.job.cross_validation import cross_validate  # noqa: PLC0415
     from tuner.job.examination_files import write_knowledge, write_next_flight  # noqa: PLC0415
@@ -146,7 +146,7 @@ def run(
     background.begin(folder)
     write_next_flight(folder, job, examination, fitted)
     render(folder, drawn=background.drawn)
-    for line in export_as_asked(
+    for line in exports_of_job(
         folder, settings.job.export, refly=refly, today=datetime.date.today()
     ):
         listener.message(line)

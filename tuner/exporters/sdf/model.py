@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from tuner.errors import ExportError
-from tuner.export.sdf.composite import IDENTITY, Inertial, Pose, pose_of
-from tuner.export.sdf.spans import Element, content, number, parse
-
-ROTORS = 4
+from tuner.exporters.sdf.composite import IDENTITY, Inertial, Pose, pose_of
+from tuner.exporters.sdf.spans import Element, content, number, parse
 
 #: How each of the two simulators calls its motor model and its control channels.
 _CLASSIC_MOTOR = "gazebo_motor_model"
@@ -32,12 +30,15 @@ class Model:
         Its ``<model>``.
     base
         The ``<link>`` whose inertial is ours to set.
+    rotors
+        How many rotors the vehicle has.
     """
 
     path: Path
     text: str
     root: Element
     base: Element
+    rotors: int
 
     @property
     def links(self) -> list[Element]:
@@ -51,7 +52,7 @@ class Model:
         return [content(uri, self.text) for uri in uris if uri is not None]
 
     def motors(self) -> list[Element]:
-        """Return the motor plugins of the vehicle's four rotors.
+        """Return the motor plugins of the vehicle's rotors.
 
         Those of a template without a number of their own, as in a macro, count as well.
         """
@@ -61,19 +62,23 @@ class Model:
             names = names.replace("MulticopterMotorModel", _GZ_MOTOR)
             if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
                 index = self._number_in(plugin, "motorNumber")
-                if index is None or 0 <= index < ROTORS:
+                if index is None or 0 <= index < self.rotors:
                     found.append(plugin)
         return found
 
     def channels(self) -> list[Element]:
-        """Return the control channels of the vehicle's four rotors (Gazebo classic only)."""
+        """Return the control channels of the vehicle's rotors (Gazebo classic only)."""
         found = []
         for parent in self.root.all(_CLASSIC_CHANNELS):
             for channel in parent.children:
                 index = self._number_in(channel, "input_index")
                 kind = channel.find("joint_control_type")
                 drives = kind is None or content(kind, self.text).startswith("velocity")
-                if channel.tag == "channel" and drives and (index is None or 0 <= index < ROTORS):
+                if (
+                    channel.tag == "channel"
+                    and drives
+                    and (index is None or 0 <= index < self.rotors)
+                ):
                     found.append(channel)
         return found
 
@@ -160,7 +165,7 @@ class Model:
         return None if child is None else number(child, self.text)
 
 
-def read_model(text: str, path: Path) -> Model:
+def read_model(text: str, path: Path, rotors: int) -> Model:
     """Take a model file apart.
 
     Raises
@@ -175,7 +180,7 @@ def read_model(text: str, path: Path) -> Model:
     links = [child for child in found.children if child.tag == "link"]
     if not links:
         raise ExportError(path, "has no <link>", "give the SDF of a multirotor")
-    model = Model(path, text, found, _base(found, links))
+    model = Model(path, text, found, _base(found, links), rotors)
     if not model.motors():
         raise ExportError(
             path, "has no motor model plugin", "give a model for PX4's motor model plugins"

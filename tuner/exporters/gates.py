@@ -38,15 +38,15 @@ class Gate:
 
 
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
-    """Hold a run and the vehicle as exported against every condition."""
+    """Check a run and the vehicle as exported against every condition."""
     try:
         flown = refly(run, vehicle)
-        otherwise = _otherwise(run, flown)
+        differing = _differing(run, flown)
     except InputError as error:
-        flown, otherwise = {}, [f"the flights cannot be flown again ({error})"]
+        flown, differing = {}, [f"the flights cannot be flown again ({error})"]
     return (
         Gate("every trajectory of the run is flown without a crash", tuple(_crashes(flown))),
-        Gate("the exported numbers fly as the run says", tuple(otherwise)),
+        Gate("the exported numbers fly as the run says", tuple(differing)),
         Gate("no held-out flight is worse than before", tuple(_worse(run))),
         Gate("no coefficient sits on a bound", tuple(_on_bounds(run))),
     )
@@ -56,18 +56,18 @@ def _crashes(flown: Mapping[str, AxesRmse]) -> list[str]:
     return [f"{name} crashes" for name, rmse in flown.items() if rmse.x is None]
 
 
-def _otherwise(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
-    found = []
+def _differing(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
+    objections = []
     for flight in run.result.flights:
         again = flown.get(flight.name)
         if again is None:
-            found.append(f"{flight.name} was not flown again")
+            objections.append(f"{flight.name} was not flown again")
             continue
         for axis in (*POSITION, *ATTITUDE):
             then, now = getattr(flight.rmse_best, axis), getattr(again, axis)
             if then is not None and now is not None and not _same(then, now):
-                found.append(f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}")
-    return found
+                objections.append(f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}")
+    return objections
 
 
 def _same(then: float, now: float) -> bool:
@@ -75,15 +75,15 @@ def _same(then: float, now: float) -> bool:
 
 
 def _worse(run: Run) -> list[str]:
-    found = []
+    objections = []
     for flight in run.result.flights:
         if flight.split != "holdout":
             continue
         for what, axes, unit in (("position", POSITION, "m"), ("attitude", ATTITUDE, "degrees")):
             before, after = _length(flight.rmse_initial, axes), _length(flight.rmse_best, axes)
             if after > before * (1 + WORSE):
-                found.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
-    return found
+                objections.append(f"{flight.name} {what} {after:.4g} {unit}, before {before:.4g}")
+    return objections
 
 
 def _length(rmse: AxesRmse, axes: tuple[str, ...]) -> float:
@@ -93,14 +93,14 @@ def _length(rmse: AxesRmse, axes: tuple[str, ...]) -> float:
 
 
 def _on_bounds(run: Run) -> list[str]:
-    found = []
+    objections = []
     for name, coefficient in run.result.coefficients.items():
         lower, upper = coefficient.lower, coefficient.upper
-        if not coefficient.fitted:
-            continue
+        if not coefficient.fitted or coefficient.best == coefficient.initial:
+            continue  # the run held it at its initial value, which may well be a bound
         span = upper - lower if lower is not None and upper is not None else None
         for side, bound in (("lower", lower), ("upper", upper)):
             near = ON_BOUND * (abs(bound or 0.0) if span is None else span)
             if bound is not None and abs(coefficient.best - bound) <= near:
-                found.append(f"{name} {coefficient.best:g} is its {side} bound")
-    return found
+                objections.append(f"{name} {coefficient.best:g} is its {side} bound")
+    return objections

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.config import VehicleFile, values_of
+from tuner.config import VehicleFile
 from tuner.disk import make_folder, whole_file
 from tuner.errors import ConfigError, ExportError
 from tuner.files import read_bytes
@@ -39,13 +39,12 @@ class Draft:
     faults: Callable[[Path], Sequence[str]]
 
 
-def differences(wanted: VehicleFile, found: VehicleFile) -> list[str]:
-    """Return the coefficients that are not the wanted ones, in words."""
-    theirs = values_of(found)
+def differences(wanted: Mapping[str, float], held: Mapping[str, float]) -> list[str]:
+    """Return which of the wanted numbers, by name, a file does not hold, a sentence each."""
     return [
-        f"{name} is {theirs[name]!r}, not {value!r}"
-        for name, value in values_of(wanted).items()
-        if not math.isclose(theirs[name], value, rel_tol=TOLERANCE, abs_tol=1e-15)
+        f"{name} is {held[name]!r}, not {value!r}" if name in held else f"{name} is missing"
+        for name, value in wanted.items()
+        if name not in held or not math.isclose(held[name], value, rel_tol=TOLERANCE, abs_tol=1e-15)
     ]
 
 

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from jinja2 import Environment, StrictUndefined
 
 from tuner.config import VehicleFile
-from tuner.export.draft import Draft, differences, read_file
-from tuner.export.sdf.read_back import vehicle_in
-from tuner.export.sdf.tags import CHANNEL_TAGS, MOTOR_TAGS, as_flown, as_text, lost_in, values
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.sdf.read_back import values_in
+from tuner.exporters.sdf.tags import as_flown, as_text, carried_values, lost_in, values
+from tuner.exporters.target import Simulator
 
-Simulator = Literal["gazebo-classic", "gz-sim"]
 TEMPLATE = Path(__file__).parent / "snippet.sdf.jinja"
 
 
@@ -29,16 +28,17 @@ def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -
         One line that says where they come from.
     """
 
-    def found_in(text: str, path: Path) -> VehicleFile:
+    def held_by(text: str, path: Path) -> dict[str, float]:
         model = f"<model><link name='base_link'>{text}</link></model>"
-        return vehicle_in(model, path, vehicle)
+        return values_in(model, path, len(vehicle.rotors))
 
+    wanted = carried_values(vehicle, channels=simulator == "gazebo-classic")
     text = _text(vehicle, simulator, provenance)
     return Draft(
         text,
-        found_in(text, TEMPLATE),
+        as_flown(vehicle, wanted | held_by(text, TEMPLATE)),
         lost_in(vehicle),
-        lambda path: differences(as_flown(vehicle), found_in(read_file(path), path)),
+        lambda path: differences(wanted, held_by(read_file(path), path)),
     )
 
 
@@ -55,6 +55,6 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
         iyy=as_text(inertia.yy),
         izz=as_text(inertia.zz),
         rotors=vehicle.rotors,
-        motor={tag: as_text(value) for tag, value in values(vehicle, MOTOR_TAGS).items()},
-        channel={tag: as_text(value) for tag, value in values(vehicle, CHANNEL_TAGS).items()},
+        motor={tag: as_text(value) for tag, value in values(vehicle, "motor").items()},
+        channel={tag: as_text(value) for tag, value in values(vehicle, "channel").items()},
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tuner.coefficients import Written
 from tuner.config import VehicleFile, read_vehicle, vehicle_text
-from tuner.export.draft import Draft
+from tuner.exporters.draft import Draft
+from tuner.exporters.target import Choices, Target
 
 
-def yaml_draft(vehicle: VehicleFile, provenance: str) -> Draft:
+def yaml_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
     """Return a vehicle file that ``tune --vehicle`` reads.
 
     Parameters
@@ -23,3 +25,6 @@ def yaml_draft(vehicle: VehicleFile, provenance: str) -> Draft:
         return [] if read_vehicle(path) == vehicle else ["it holds another vehicle"]
 
     return Draft(vehicle_text(vehicle, header=provenance), vehicle, (), faults)
+
+
+TARGET = Target("yaml", ".yaml", yaml_draft, lambda row: Written(".".join(row.place)))

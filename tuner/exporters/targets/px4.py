@@ -18,7 +18,8 @@ from sim_jax.vehicle import Motor
 from tuner.config import VehicleFile
 from tuner.config.yaml_file import commented
 from tuner.errors import ExportError
-from tuner.export.draft import Draft, read_file
+from tuner.exporters.draft import Draft, read_file
+from tuner.exporters.target import Choices, Target, registered
 
 #: MAVLink's numbers of parameter types, as ground stations write them.
 INT32, FLOAT = 6, 9
@@ -42,8 +43,9 @@ def rotor_speed(vehicle: VehicleFile, command: float) -> float:
 
 
 def hover_speed(vehicle: VehicleFile) -> float:
-    """Return the rotor speed in rad/s at which four rotors carry the vehicle."""
-    return math.sqrt(vehicle.mass * GRAVITY / (4 * vehicle.aerodynamics.motor_constant))
+    """Return the rotor speed in rad/s at which the rotors carry the vehicle."""
+    lift = len(vehicle.rotors) * vehicle.aerodynamics.motor_constant
+    return math.sqrt(vehicle.mass * GRAVITY / lift)
 
 
 def hover_command(vehicle: VehicleFile) -> float | None:
@@ -79,7 +81,7 @@ def parameters(vehicle: VehicleFile) -> tuple[Parameter, ...]:
 
 def _allocation(vehicle: VehicleFile) -> list[Parameter]:
     """Return where the rotors are and what they give: thrust = CT·u², torque = KM·thrust."""
-    found: list[Parameter] = [Parameter("CA_ROTOR_COUNT", len(vehicle.rotors))]
+    parameters: list[Parameter] = [Parameter("CA_ROTOR_COUNT", len(vehicle.rotors))]
     for index, rotor in enumerate(vehicle.rotors):
         x, y, z = rotor.position
         sign = 1.0 if rotor.spin == "ccw" else -1.0
@@ -90,8 +92,8 @@ def _allocation(vehicle: VehicleFile) -> list[Parameter]:
             "PY": -y,
             "PZ": -z,
         }
-        found += [Parameter(f"CA_ROTOR{index}_{key}", value) for key, value in values.items()]
-    return found
+        parameters += [Parameter(f"CA_ROTOR{index}_{key}", value) for key, value in values.items()]
+    return parameters
 
 
 def _sih(vehicle: VehicleFile) -> list[Parameter]:
@@ -115,7 +117,7 @@ def _sih(vehicle: VehicleFile) -> list[Parameter]:
         "SIH_Q_MAX": full * aero.moment_constant,
         "SIH_L_ROLL": arms[0],
         "SIH_L_PITCH": arms[1],
-        "SIH_KDV": 4 * hover_speed(vehicle) * aero.rotor_drag_coefficient,
+        "SIH_KDV": len(vehicle.rotors) * hover_speed(vehicle) * aero.rotor_drag_coefficient,
         "SIH_T_TAU": (motor.time_constant_up + motor.time_constant_down) / 2,
     }
     return [Parameter(name, value) for name, value in values.items()]
@@ -136,7 +138,7 @@ def _full_thrust(vehicle: VehicleFile) -> float:
     return vehicle.aerodynamics.motor_constant * rotor_speed(vehicle, 1.0) ** 2
 
 
-def px4_draft(vehicle: VehicleFile, provenance: str) -> Draft:
+def px4_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
     """Return a ``.params`` file of a vehicle.
 
     Raises
@@ -164,7 +166,7 @@ def _notes(vehicle: VehicleFile) -> tuple[str, ...]:
     said = [
         f"CA_ROTOR*_CT is thrust in N at full command (idle {idle:.0f} rad/s: not CT·u² below)",
         "MPC_THR_HOVER holds for THR_MDL_FAC 0",
-        "the SIH model has no rolling moment and one drag and one lag for all directions",
+        "the SIH model has one drag and one lag for all directions",
     ]
     hover = hover_command(vehicle)
     if hover is not None and not HOVER_RANGE[0] <= hover <= HOVER_RANGE[1]:
@@ -206,3 +208,6 @@ def _value(parameter: Parameter) -> str:
 
 def _kind(parameter: Parameter) -> int:
     return INT32 if isinstance(parameter.value, int) else FLOAT
+
+
+TARGET = Target("px4", ".params", px4_draft, registered("px4"))

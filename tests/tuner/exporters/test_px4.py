@@ -3,8 +3,9 @@ import math
 import pytest
 
 from tuner.errors import ExportError
-from tuner.export.draft import write
-from tuner.export.px4 import Parameter, parameters, px4_draft, read_parameters
+from tuner.exporters.draft import write
+from tuner.exporters.target import Choices
+from tuner.exporters.targets.px4 import Parameter, parameters, px4_draft, read_parameters
 
 
 def value(vehicle):
@@ -66,12 +67,12 @@ def test_the_gz_bridge_gets_whole_speeds(vehicle):
 
 def test_a_vehicle_too_heavy_to_hover_is_refused(vehicle):
     with pytest.raises(ExportError, match="cannot hover"):
-        px4_draft(vehicle.replace(mass=20.0), "")
+        px4_draft(vehicle.replace(mass=20.0), "", Choices())
 
 
 def test_the_file_is_what_ground_stations_load(vehicle, tmp_path):
     path = tmp_path / "x.params"
-    draft = px4_draft(vehicle, "by a test")
+    draft = px4_draft(vehicle, "by a test", Choices())
     write(draft, path)
     lines = path.read_text().splitlines()
     assert lines[0] == "# by a test"
@@ -84,7 +85,7 @@ def test_the_file_is_what_ground_stations_load(vehicle, tmp_path):
 
 def test_a_changed_file_does_not_read_back(vehicle, tmp_path):
     path = tmp_path / "x.params"
-    draft = px4_draft(vehicle, "by a test")
+    draft = px4_draft(vehicle, "by a test", Choices())
     path.write_text(draft.text.replace("2.243", "2.244"))
     assert draft.faults(path) == ["SIH_MASS is 2.244, not 2.243"]
     path.write_text(draft.text.replace("1\t1\tSIH_MASS\t2.243\t9\n", ""))
@@ -95,7 +96,6 @@ def test_a_changed_file_does_not_read_back(vehicle, tmp_path):
 
 
 def test_a_hover_command_that_px4_refuses_is_said(vehicle):
-    assert any(
-        "outside what PX4 accepts" in n for n in px4_draft(vehicle.replace(mass=5.2), "").notes
-    )
-    assert not any("outside" in note for note in px4_draft(vehicle, "").notes)
+    heavy = px4_draft(vehicle.replace(mass=5.2), "", Choices())
+    assert any("outside what PX4 accepts" in note for note in heavy.notes)
+    assert not any("outside" in note for note in px4_draft(vehicle, "", Choices()).notes)

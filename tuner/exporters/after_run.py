@@ -8,25 +8,26 @@ from pathlib import Path
 
 from tuner.config.job import ExportSettings
 from tuner.errors import InputError
-from tuner.export.export import SUFFIX, export
-from tuner.export.gates import Refly
+from tuner.exporters.export import export
+from tuner.exporters.gates import Refly
+from tuner.exporters.targets import target_of
 from tuner.result import read_run
 
 FOLDER = "export"
 
 
-def export_as_asked(
-    folder: Path, asked: ExportSettings, *, refly: Refly, today: date
+def exports_of_job(
+    folder: Path, wanted: ExportSettings, *, refly: Refly, today: date
 ) -> Iterator[str]:
     """Write every format that a job asks for into its result folder.
 
-    A format that is refused is no failure of the run: it is said, with the reason.
+    A format that is refused is no failure of the run: the line gives the reason.
 
     Parameters
     ----------
     folder
         A finished result folder.
-    asked
+    wanted
         Formats, and the model for ``sdf``, which stays as it is.
     refly, today
         As of `export`.
@@ -37,9 +38,10 @@ def export_as_asked(
         One line a format.
     """
     run = read_run(folder)
-    for kind in asked.formats:
-        into = asked.into if kind == "sdf" else None
-        name = into.name if into else f"{run.vehicle.name}{SUFFIX[kind]}"
+    for kind in wanted.formats:
+        target = target_of(kind)
+        into = wanted.into if target.patches else None
+        name = into.name if into else f"{run.vehicle.name}{target.suffix}"
         out = folder / FOLDER / name
         try:
             done = export(run, kind, refly=refly, today=today, into=into, out=out)

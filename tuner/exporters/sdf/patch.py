@@ -10,13 +10,13 @@ import numpy as np
 
 from tuner.config import VehicleFile
 from tuner.errors import ExportError
-from tuner.export.draft import Draft, differences, read_file
-from tuner.export.sdf.composite import Array, Inertial, base_for, together
-from tuner.export.sdf.model import Model, inertials, read_model
-from tuner.export.sdf.read_back import vehicle_in
-from tuner.export.sdf.spans import Edit, Element, append_child, apply, number, set_value
-from tuner.export.sdf.tags import CHANNEL_TAGS, MOTOR_TAGS, as_flown, as_text, lost_in, values
-from tuner.export.sdf.template import blanked, rendered
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.sdf.composite import Array, Inertial, base_for, together
+from tuner.exporters.sdf.model import Model, inertials, read_model
+from tuner.exporters.sdf.read_back import values_in
+from tuner.exporters.sdf.spans import Edit, Element, append_child, apply, number, set_value
+from tuner.exporters.sdf.tags import as_flown, as_text, carried_values, lost_in, values
+from tuner.exporters.sdf.template import blanked, rendered
 
 #: Products of inertia below this part of the trace are taken as none.
 NO_PRODUCT = 1e-9
@@ -45,23 +45,25 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     """
     text = read_file(path)
     blank = blanked(text)
-    model = read_model(blank, path)
-    whole = read_model(rendered(text, path), path)
+    rotors = len(vehicle.rotors)
+    model = read_model(blank, path, rotors)
+    whole = read_model(rendered(text, path), path, rotors)
     base = _base(whole, vehicle)
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
     edits = [_through_variable(text, blank, edit, path) for edit in edits]
     edits.append(_provenance_edit(text, model, provenance))
     patched = apply(text, dict.fromkeys(edits))
-    found = vehicle_in(rendered(patched, path), path, vehicle)
-    wrong = differences(as_flown(vehicle), found)
+    wanted = carried_values(vehicle, channels=bool(whole.channels()))
+    held = values_in(rendered(patched, path), path, rotors)
+    wrong = differences(wanted, held)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
     return Draft(
         patched,
-        found,
+        as_flown(vehicle, held),
         tuple(_notes(whole, vehicle, base)),
         lambda written: differences(
-            as_flown(vehicle), vehicle_in(rendered(read_file(written), written), written, vehicle)
+            wanted, values_in(rendered(read_file(written), written), written, rotors)
         ),
     )
 
@@ -106,9 +108,9 @@ def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
 
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
     for motor in model.motors():
-        yield from _set(motor, model.text, values(vehicle, MOTOR_TAGS))
+        yield from _set(motor, model.text, values(vehicle, "motor"))
     for channel in model.channels():
-        yield from _set(channel, model.text, values(vehicle, CHANNEL_TAGS))
+        yield from _set(channel, model.text, values(vehicle, "channel"))
 
 
 def _set(parent: Element, text: str, values: dict[str, float]) -> Iterator[Edit]:
@@ -176,10 +178,11 @@ def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
         )
     motor = vehicle.motor
     if not model.channels():
+        last = len(vehicle.rotors)
         low = motor.input_offset * motor.input_scaling + motor.zero_position_armed
         yield (
             "the model has no control channels (gz-sim has them in PX4's parameters): set "
-            f"SIM_GZ_EC_MIN1..4 to {low:.0f} and SIM_GZ_EC_MAX1..4 to "
+            f"SIM_GZ_EC_MIN1..{last} to {low:.0f} and SIM_GZ_EC_MAX1..{last} to "
             f"{low + motor.input_scaling:.0f}, as the px4 export does"
         )
     yield from lost_in(vehicle)

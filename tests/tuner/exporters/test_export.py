@@ -3,14 +3,14 @@ from datetime import date
 
 import pytest
 
-from tests.tuner.export.conftest import MODELS, as_the_run_says, rmse
+from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
 from tuner.config import read_vehicle
 from tuner.config.job import ExportSettings
 from tuner.errors import ExportError, InputError
-from tuner.export.after_run import export_as_asked
-from tuner.export.draft import Draft, write
-from tuner.export.export import export
-from tuner.export.gates import check
+from tuner.exporters.after_run import exports_of_job
+from tuner.exporters.draft import Draft, write
+from tuner.exporters.export import export
+from tuner.exporters.gates import check
 
 TODAY = date(2024, 5, 6)
 
@@ -148,6 +148,13 @@ def test_a_crash_or_another_rmse_when_flown_again_is_refused(make_run):
             exported(make_run(), refly=refly)
 
 
+def test_a_coefficient_that_the_run_held_may_lie_on_its_bound(make_run):
+    held = {"fitted": True, "identifiable": False, "lower": 0.0, "upper": 0.04}
+    run = make_run(coefficients={"actuator_latency": held})
+    assert run.result.coefficients["actuator_latency"].best == 0.0
+    assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
+
+
 def test_a_fixed_coefficient_may_equal_its_bound(make_run):
     run = make_run(coefficients={"mass": {"fitted": False, "upper": 2.243}})
     assert all(gate.passed for gate in check(run, run.vehicle, as_the_run_says))
@@ -157,13 +164,13 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     run = make_run()
     model = MODELS / "quad_x.sdf"
     asked = ExportSettings(formats=("yaml", "sdf", "px4"), into=model)
-    lines = list(export_as_asked(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    lines = list(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
     folder = run.folder / "export"
     names = ["hovergames_updated.yaml", "quad_x.sdf", "hovergames_updated.params"]
     assert lines == [f"exported {folder / name}" for name in names]
     assert (folder / "quad_x.sdf").read_text() != model.read_text()
     make_run(**BAD[0][0])
-    lines = list(export_as_asked(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    lines = list(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
     assert all(line.startswith("not exported as ") and "held position" in line for line in lines)
 
 

@@ -5,22 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Literal
 
-from tuner.config import VehicleFile
 from tuner.disk import check_file
 from tuner.errors import ExportError
-from tuner.export.draft import Draft, write
-from tuner.export.gates import Gate, Refly, check
-from tuner.export.provenance import exported_vehicle, provenance
-from tuner.export.px4 import px4_draft
-from tuner.export.sdf.patch import sdf_draft
-from tuner.export.sdf.snippet import Simulator, snippet_draft
-from tuner.export.vehicle_yaml import yaml_draft
+from tuner.exporters.draft import write
+from tuner.exporters.gates import Gate, Refly, check
+from tuner.exporters.provenance import exported_vehicle, provenance
+from tuner.exporters.target import Choices, Simulator, check_every_coefficient, not_carried
+from tuner.exporters.targets import target_of
 from tuner.result import Run
-
-Format = Literal["yaml", "sdf", "px4"]
-SUFFIX: dict[Format, str] = {"yaml": ".yaml", "sdf": ".sdf", "px4": ".params"}
 
 
 @dataclass(frozen=True)
@@ -44,7 +37,7 @@ class Exported:
 
 def export(
     run: Run,
-    kind: Format,
+    kind: str,
     *,
     refly: Refly,
     today: date,
@@ -60,7 +53,7 @@ def export(
     run
         A result folder.
     kind
-        ``yaml``, ``sdf`` or ``px4``.
+        The name of a target, as ``yaml``, ``sdf`` or ``px4``.
     refly
         Flies the run's flights with a vehicle.
     today
@@ -81,12 +74,14 @@ def export(
     OutputError
         The file cannot be written.
     """
-    path = out or into or run.folder / "export" / f"{run.vehicle.name}{SUFFIX[kind]}"
+    target = target_of(kind)
+    path = out or into or run.folder / "export" / f"{run.vehicle.name}{target.suffix}"
     check_file(path, folder_is_made=True)
-    if into is not None and kind != "sdf":
+    if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
     vehicle, decided = exported_vehicle(run, today)
-    draft = _draft(kind, vehicle, provenance(run, today, accept), into, simulator)
+    check_every_coefficient(vehicle, target)
+    draft = target.draft(vehicle, provenance(run, today, accept), Choices(into, simulator))
     gates = check(run, draft.vehicle, refly)
     refused = [objection for gate in gates for objection in gate.objections]
     if refused and not accept:
@@ -96,18 +91,4 @@ def export(
             "fit again, or export with --accept 'REASON'",
         )
     write(draft, path)
-    return Exported(path, gates, (*decided, *draft.notes))
-
-
-def _draft(
-    kind: Format, vehicle: VehicleFile, provenance: str, into: Path | None, simulator: Simulator
-) -> Draft:
-    match kind:
-        case "yaml":
-            return yaml_draft(vehicle, provenance)
-        case "px4":
-            return px4_draft(vehicle, provenance)
-        case "sdf" if into is None:
-            return snippet_draft(vehicle, simulator, provenance)
-        case "sdf":
-            return sdf_draft(into, vehicle, provenance)
+    return Exported(path, gates, (*decided, *draft.notes, *not_carried(vehicle, target)))

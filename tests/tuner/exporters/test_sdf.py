@@ -1,18 +1,23 @@
 import difflib
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from lxml import etree
 
-from tests.tuner.export.conftest import MODELS
+from tests.tuner.exporters.conftest import MODELS
+from tuner.coefficients import REGISTRY, Written
 from tuner.errors import ExportError
-from tuner.export.draft import write
-from tuner.export.sdf.model import read_model
-from tuner.export.sdf.patch import sdf_draft
-from tuner.export.sdf.read_back import composite, vehicle_in
-from tuner.export.sdf.snippet import snippet_draft
-from tuner.export.sdf.template import blanked, rendered
+from tuner.exporters.draft import write
+from tuner.exporters.sdf.model import read_model
+from tuner.exporters.sdf.patch import sdf_draft
+from tuner.exporters.sdf.read_back import composite, values_in
+from tuner.exporters.sdf.snippet import snippet_draft
+from tuner.exporters.sdf.tags import carried_values
+from tuner.exporters.sdf.template import blanked, rendered
+from tuner.exporters.target import not_carried
+from tuner.exporters.targets.sdf import TARGET
 
 CLASSIC, GZ, TEMPLATE = (
     MODELS / "quad_x.sdf",
@@ -90,7 +95,7 @@ def test_a_variable_that_several_rotors_use_is_set_once(vehicle, tmp_path):
 @ALL
 def test_links_together_weigh_and_turn_like_the_vehicle(path, vehicle):
     draft = sdf_draft(path, vehicle, "by a test")
-    whole = composite(read_model(rendered(draft.text, path), path))
+    whole = composite(read_model(rendered(draft.text, path), path, 4))
     assert whole.mass == pytest.approx(2.243, rel=1e-11)
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("'base_link' gets 2.204 kg" in note and "rotor_3" in note for note in draft.notes)
@@ -120,6 +125,22 @@ def test_what_was_written_is_read_back(path, vehicle, tmp_path):
     assert any("rotor_drag_coefficient" in fault for fault in draft.faults(target))
     target.write_text(draft.text.replace("2.204", "2.205"), encoding="utf-8")
     assert any(fault.startswith("mass is 2.24") for fault in draft.faults(target))
+
+
+@pytest.mark.parametrize("tag", ["momentConstant", "input_scaling"])
+def test_a_model_that_lacks_a_tag_does_not_read_back(tag, vehicle, tmp_path):
+    draft = sdf_draft(CLASSIC, vehicle, "by a test")
+    target = tmp_path / "model.sdf"
+    target.write_text(re.sub(rf" *<{tag}>.*\n", "", draft.text), encoding="utf-8")
+    (fault,) = draft.faults(target)
+    assert fault.endswith(" is missing")
+
+
+def test_a_coefficient_for_which_nothing_is_written_is_no_verified_export(vehicle, monkeypatch):
+    row = replace(REGISTRY["moment_constant"], exported_as={"sdf": Written("x", "joint")})
+    monkeypatch.setitem(REGISTRY, "moment_constant", row)
+    with pytest.raises(ExportError, match="moment_constant is missing"):
+        sdf_draft(CLASSIC, vehicle, "by a test")
 
 
 def test_comments_formatting_and_line_ends_survive(vehicle, tmp_path):
@@ -177,7 +198,7 @@ def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
         "<pose degrees='true'>0 0.01 0 0 0 30</pose>",
     ).replace("<pose>0 0 0 0 0 0</pose>", "<pose>0 0 0.2 0 0 0.3</pose>", 1)
     draft = patched(tmp_path, vehicle, text)
-    whole = composite(read_model(draft.text, CLASSIC))
+    whole = composite(read_model(draft.text, CLASSIC, 4))
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
     assert any("rotor_0 sits at" in note or "rotor_0 sits" in note for note in draft.notes)
 
@@ -189,10 +210,10 @@ def test_what_has_no_tag_is_said(vehicle):
         setup=vehicle.setup.replace(estimate_latency=0.012),
     )
     draft = sdf_draft(CLASSIC, vehicle, "by a test")
-    said = " / ".join(draft.notes)
-    assert "no tag for quadratic" in said
-    assert "25 m/s built in" in said
-    assert "estimate_latency (0.012 s)" in said
+    notes = " / ".join(not_carried(vehicle, TARGET))
+    assert "quadratic -50 rad/s is not exported: the control channels map" in notes
+    assert "25 m/s built in" in notes
+    assert "estimate_latency 0.012 s is not exported: it belongs to the set-up" in notes
     assert draft.vehicle.motor.quadratic == 0
     assert draft.vehicle.aerodynamics.max_relative_airspeed == 25
 
@@ -256,7 +277,9 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     path = tmp_path / "snippet.sdf"
     write(draft, path)
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
-    assert vehicle_in(model, path, vehicle) == vehicle
+    classic = simulator == "gazebo-classic"
+    assert values_in(model, path, 4) == carried_values(vehicle, channels=classic)
+    assert draft.vehicle == vehicle
     assert draft.text.count("<channel ") == (4 if simulator == "gazebo-classic" else 0)
     path.write_text(draft.text.replace("1.45e-05", "1.46e-05"), encoding="utf-8")
     assert draft.faults(path)

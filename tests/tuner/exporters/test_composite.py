@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tuner.export.sdf.composite import Inertial, Pose, base_for, pose_of, together
+from tuner.exporters.sdf.composite import Inertial, Pose, base_for, pose_of, together
 
 
 def solid_box(mass, pose, sides):

@@ -2,7 +2,7 @@ from datetime import date
 
 import pytest
 
-from tests.tuner.export.conftest import MODELS
+from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
 from tuner.comparison.comparison import Comparison
 from tuner.config import (
@@ -15,8 +15,8 @@ from tuner.config import (
     write_vehicle,
 )
 from tuner.errors import ExportError
-from tuner.export.export import export
-from tuner.export.refly import refly
+from tuner.exporters.export import export
+from tuner.exporters.refly import refly
 from tuner.recordings import Recording
 from tuner.result import (
     CoefficientResult,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from tuner.errors import ExportError
-from tuner.export.sdf.spans import Edit, append_child, apply, number, parse, set_value
+from tuner.exporters.sdf.spans import Edit, append_child, apply, number, parse, set_value
 
 PATH = Path("model.sdf")
 

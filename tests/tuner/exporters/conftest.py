@@ -2,7 +2,14 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import COEFFICIENTS, configs_folder, read_vehicle, values_of, write_vehicle
+from tuner.config import (
+    COEFFICIENTS,
+    configs_folder,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
 from tuner.result import (
     AxesRmse,
     CoefficientResult,
@@ -29,9 +36,10 @@ def rmse(scale):
 def make_run(tmp_path):
     """Return a function that writes a result folder; what it is given replaces what is usual."""
 
-    def make(*, coefficients=None, flights=None, vehicle="hovergames_updated"):
+    def make(*, coefficients=None, flights=None, vehicle="hovergames_updated", values=None):
         start = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
         best = read_vehicle(configs_folder() / "vehicles" / f"{vehicle}.yaml")
+        best = with_values(best, values or {})
         found = {}
         for name, initial in values_of(start).items():
             value = values_of(best)[name]

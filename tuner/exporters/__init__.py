@@ -1,0 +1,1 @@
+"""The best-fit coefficients into the formats that simulators and autopilots read."""

@@ -1,0 +1,80 @@
+"""A written model read again by another parser: the numbers in it, and no others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from lxml import etree
+
+from tuner.errors import ExportError
+from tuner.exporters.sdf.composite import Inertial, together
+from tuner.exporters.sdf.model import Model, inertials, read_model
+from tuner.exporters.sdf.spans import without_comments
+from tuner.exporters.sdf.tags import tags_in
+
+
+def values_in(text: str, path: Path, rotors: int) -> dict[str, float]:
+    """Return what a rendered model holds, name -> value; what it does not hold is not there.
+
+    Parameters
+    ----------
+    text, path
+        The model and its name for messages.
+    rotors
+        How many rotors the vehicle has.
+
+    Raises
+    ------
+    ExportError
+        It is not well-formed, or its rotors do not agree with each other.
+    """
+    try:
+        parser = etree.XMLParser(resolve_entities=False, no_network=True)
+        tree = etree.fromstring(without_comments(text).encode(), parser)
+    except etree.XMLSyntaxError as error:
+        raise ExportError(path, f"is not well-formed XML ({error})", "correct it") from None
+    ours = {str(number) for number in range(rotors)}
+    plugins = [e for e in tree.iter("plugin") if _text(e, "motorNumber") in ours]
+    channels = [
+        e
+        for e in tree.iter("channel")
+        if _text(e, "input_index") in ours
+        and (_text(e, "joint_control_type") or "velocity").startswith("velocity")
+    ]
+    held = _agreed(plugins, tags_in("motor"), path) | _agreed(channels, tags_in("channel"), path)
+    whole = composite(read_model(text, path, rotors))
+    body = {"mass": whole.mass}
+    body |= {f"i{axis}{axis}": float(whole.inertia[i, i]) for i, axis in enumerate("xyz")}
+    tags = tags_in("inertial") | tags_in("inertia")
+    return held | {name: body[tag] for tag, name in tags.items() if tag in body}
+
+
+def _text(element: etree._Element, tag: str) -> str:
+    return (element.findtext(tag) or "").strip()
+
+
+def _agreed(
+    elements: Iterable[etree._Element], tags: dict[str, str], path: Path
+) -> dict[str, float]:
+    """Return the values that elements share."""
+    held: dict[str, float] = {}
+    for tag, name in tags.items():
+        texts = {_text(element, tag) for element in elements}
+        try:
+            values = {float(text) if text else None for text in texts}
+        except ValueError:
+            raise ExportError(
+                path, f"has the <{tag}> {' and '.join(sorted(texts))}", "write a number"
+            ) from None
+        if len(values) > 1:
+            raise ExportError(path, f"has rotors of different {tag}", "give them one value")
+        for value in values:
+            if value is not None:
+                held[name] = value
+    return held
+
+
+def composite(model: Model) -> Inertial:
+    """Return all links of a model as one body."""
+    return together([body for _, body in inertials(model)])

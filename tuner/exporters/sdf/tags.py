@@ -1,0 +1,86 @@
+"""The tags that are ours, as the registry of coefficients has them, and their values."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from tuner.coefficients import COEFFICIENTS, NotCarried, Written
+from tuner.config import VehicleFile, values_of, with_values
+
+Parent = Literal["inertial", "inertia", "motor", "channel"]
+
+#: A motor plugin's tag that is no coefficient, as flights do not show it -> key of `Motor`.
+SPEED_LIMIT, SPEED_LIMIT_KEY = "maxRotVelocity", "max_rotor_velocity"
+
+
+def tags_in(parent: Parent) -> dict[str, str]:
+    """Return tag -> name of the number that it holds.
+
+    Parameters
+    ----------
+    parent
+        The element that the tags stand in: ``motor`` is a motor model plugin, of Gazebo classic and
+        gz-sim alike, ``channel`` a control channel of PX4's interface plugin for Gazebo classic.
+    """
+    tags = {SPEED_LIMIT: SPEED_LIMIT_KEY} if parent == "motor" else {}
+    for name, row in COEFFICIENTS.items():
+        entry = row.exported_as.get("sdf")
+        if isinstance(entry, Written) and entry.parent == parent:
+            tags[entry.tag] = name
+    return tags
+
+
+def numbers_of(vehicle: VehicleFile) -> dict[str, float]:
+    """Return name -> value of all that may have a tag."""
+    return values_of(vehicle) | {SPEED_LIMIT_KEY: vehicle.motor.max_rotor_velocity}
+
+
+def values(vehicle: VehicleFile, parent: Parent) -> dict[str, float]:
+    """Return tag to value for a vehicle; not those of coefficients that it leaves out."""
+    numbers = numbers_of(vehicle)
+    return {tag: numbers[name] for tag, name in tags_in(parent).items() if name in numbers}
+
+
+def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
+    """Return name -> value of what a model of a vehicle must hold.
+
+    Parameters
+    ----------
+    channels
+        Whether it has control channels, as models for Gazebo classic have.
+    """
+    carried: set[str] = set()
+    for name, row in COEFFICIENTS.items():
+        entry = row.exported_as.get("sdf")
+        if isinstance(entry, Written) and (channels or entry.parent != "channel"):
+            carried.add(name)
+    carried.add(SPEED_LIMIT_KEY)
+    return {name: value for name, value in numbers_of(vehicle).items() if name in carried}
+
+
+def as_text(value: float) -> str:
+    """Return a number as it is written into a model: twelve digits at most, no needless ones."""
+    return format(value, ".12g")
+
+
+def as_flown(vehicle: VehicleFile, held: dict[str, float]) -> VehicleFile:
+    """Return the vehicle that the plugins fly: what a model holds, and what they have built in."""
+    built_in = {}
+    for name in values_of(vehicle):
+        entry = COEFFICIENTS[name].exported_as.get("sdf")
+        if isinstance(entry, NotCarried) and entry.built_in is not None:
+            built_in[name] = entry.built_in
+    limit = held[SPEED_LIMIT_KEY]
+    coefficients = {name: value for name, value in held.items() if name != SPEED_LIMIT_KEY}
+    flown = with_values(vehicle, built_in | coefficients)
+    return flown.replace(
+        motor=flown.motor.replace(max_rotor_velocity=limit),
+        aerodynamics=flown.aerodynamics.replace(reaction_torque="body"),
+    )
+
+
+def lost_in(vehicle: VehicleFile) -> tuple[str, ...]:
+    """Return what of a vehicle, beside coefficients, the plugins fly otherwise."""
+    if vehicle.aerodynamics.reaction_torque == "body":
+        return ()
+    return ("the plugins' reaction torque acts about the body's z axis, not the world's",)
