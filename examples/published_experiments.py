@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import tuner
 from tuner.config import ControllerFile, VehicleFile, find_config, read_controller, read_vehicle
-from tuner.config.job import TrajectoryName
+from tuner.trajectory_settings import TrajectoryName
 
 LAWS: tuple[Literal["quaternion", "rotation_matrix"], ...] = ("quaternion", "rotation_matrix")
 

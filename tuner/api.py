@@ -12,11 +12,12 @@ from tuner.config import (
     Options,
     VehicleFile,
 )
-from tuner.config.job import Method, TrajectoryName
+from tuner.config.job import Method
 from tuner.flights.flight import Array
 from tuner.flights.load import load_flight
 from tuner.result import Run, read_run
 from tuner.runtime import configure
+from tuner.trajectory_settings import TrajectoryName
 
 if TYPE_CHECKING:
     from sim_jax.precision import Precision

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from tuner.config import Settings, TrajectorySettings
-from tuner.config.model import build
 from tuner.errors import InputError, did_you_mean
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.objective.inlets import InletName, inlet_for
 from tuner.simulation.trajectory import with_named_reference
+from tuner.yaml_files.section import build
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from tuner.coefficients.space import space_of
 from tuner.config import ControllerFile, JobFile, initial_values, read_vehicle, with_values
 from tuner.config.controller import Filters
 from tuner.config.job import CoefficientSettings
-from tuner.config.shipped import find_config
 from tuner.errors import ConfigError
 from tuner.model import coefficients_in, model_of, with_coefficients
 from tuner.objective.tunable import tunable_of
+from tuner.yaml_files.shipped import find_config
 
 
 @pytest.fixture(scope="module")

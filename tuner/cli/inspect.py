@@ -24,7 +24,7 @@ def inspect(
         Print JSON instead of tables.
     """
     from tuner.flights.inspection import as_json, inspect_recordings
-    from tuner.flights.paths import find_flights
+    from tuner.recording_paths import find_flights
 
     found, errors = inspect_recordings(
         find_flights(flights), topics=topics, namespace=namespace or ""

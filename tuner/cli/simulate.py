@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from tuner.cli.options import ControllerName, Many, Quiet, VehicleName
-from tuner.config.job import TrajectoryName
+from tuner.trajectory_settings import TrajectoryName
 
 
 def simulate(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from annotated_types import Interval
 from pydantic import model_validator
 
-from tuner.config.model import (
+from tuner.yaml_files.section import (
     Flag,
     NonNegative,
     Number,

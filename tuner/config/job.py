@@ -9,7 +9,10 @@ from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.config.model import (
+from tuner.errors import ConfigError, did_you_mean
+from tuner.exporters.targets import NAMES
+from tuner.trajectory_settings import TrajectorySettings
+from tuner.yaml_files.section import (
     Flag,
     Number,
     Positive,
@@ -18,15 +21,13 @@ from tuner.config.model import (
     read_model,
     refuse,
 )
-from tuner.config.shipped import Kind, find_config
-from tuner.errors import ConfigError, did_you_mean
+from tuner.yaml_files.shipped import Kind, find_config
 
 #: Recorded signals whose residuals a fit can weigh, by their names in a `Flight`.
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 
 InletName = Literal["auto", "reference", "body_rate", "actuator", "rotor_speed"]
 Method = Literal["auto", "gradient", "cma", "hybrid"]
-TrajectoryName = Literal["circle", "lemniscate", "straight", "diagonal", "yaw_spin", "hover"]
 
 
 def _known(word: str, known: tuple[str, ...], kind: str) -> str:
@@ -37,6 +38,9 @@ def _known(word: str, known: tuple[str, ...], kind: str) -> str:
 
 CoefficientName = Annotated[
     str, AfterValidator(lambda name: _known(name, tuple(COEFFICIENTS), "coefficient"))
+]
+FormatName = Annotated[
+    str, AfterValidator(lambda name: _known(name, tuple(NAMES), "export format"))
 ]
 ChannelName = Annotated[str, AfterValidator(lambda name: _known(name, CHANNELS, "channel"))]
 
@@ -116,30 +120,6 @@ class Search(Section):
     max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100
 
 
-class TrajectorySettings(Section):
-    """The trajectory of a recording that holds no reference; keys and units of ``tune simulate``.
-
-    Attributes
-    ----------
-    name
-        Which shape.
-    radius
-        m.
-    omega
-        rad/s.
-    speed_scale
-        The publisher's velocity scaler.
-    yaw_rate
-        rad/s, of a yaw spin.
-    """
-
-    name: TrajectoryName
-    radius: Positive = 2.0
-    omega: Positive = 0.7
-    speed_scale: Positive = 2.1
-    yaw_rate: Number = 2.0
-
-
 class FlightSettings(Section):
     """What holds for one flight alone; None leaves what holds for all.
 
@@ -168,12 +148,12 @@ class ExportSettings(Section):
     ----------
     formats
         ``yaml`` is the vehicle file with source and confidence of each coefficient, ``sdf`` the
-        model or, without one, its tags, ``px4`` the parameters.
+        model or, without one, its tags, ``px4`` the parameters; all by default.
     into
         The SDF model that ``sdf`` starts from; the original stays as it is.
     """
 
-    formats: tuple[Literal["yaml", "sdf", "px4"], ...] = ("yaml", "sdf", "px4")
+    formats: tuple[FormatName, ...] = Field(default_factory=lambda: tuple(NAMES))
     into: Path | None = None
 
 

@@ -13,13 +13,13 @@ from pydantic import ValidationError
 
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import JobFile, Method, read_job
-from tuner.config.shipped import Kind, find_config
 from tuner.config.values import check_names, with_values
 from tuner.config.vehicle import VehicleFile, read_vehicle
 from tuner.disk import exists
 from tuner.errors import ConfigError, InputError, did_you_mean
-from tuner.flights.paths import find_flights
+from tuner.recording_paths import find_flights
 from tuner.validation import config_error
+from tuner.yaml_files.shipped import Kind, find_config
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"

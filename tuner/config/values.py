@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.config.controller import ControllerFile
-from tuner.config.model import build
 from tuner.config.vehicle import VehicleFile
 from tuner.errors import ConfigError, did_you_mean
+from tuner.yaml_files.section import build
 
 
 def check_names(names: Iterable[str], where: str) -> None:

@@ -8,7 +8,8 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.config.model import (
+from tuner.errors import did_you_mean
+from tuner.yaml_files.section import (
     NonNegative,
     Number,
     Positive,
@@ -17,7 +18,6 @@ from tuner.config.model import (
     read_model,
     refuse,
 )
-from tuner.errors import did_you_mean
 
 #: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
 QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.config.vehicle import VehicleFile
-from tuner.config.yaml_file import commented, dump_yaml
 from tuner.disk import write_text
+from tuner.yaml_files.document import commented, dump_yaml
 
 UNIT_COLUMN = 44
 

@@ -10,7 +10,7 @@ from tuner.config.job import ExportSettings
 from tuner.errors import InputError
 from tuner.exporters.export import export
 from tuner.exporters.gates import Refly
-from tuner.exporters.targets import target_of
+from tuner.exporters.target import target_of
 from tuner.result import read_run
 
 FOLDER = "export"

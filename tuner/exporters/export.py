@@ -11,8 +11,13 @@ from tuner.errors import ExportError
 from tuner.exporters.draft import write
 from tuner.exporters.gates import Gate, Refly, check
 from tuner.exporters.provenance import exported_vehicle, provenance
-from tuner.exporters.target import Choices, Simulator, check_every_coefficient, not_carried
-from tuner.exporters.targets import target_of
+from tuner.exporters.target import (
+    Choices,
+    Simulator,
+    check_every_coefficient,
+    not_carried,
+    target_of,
+)
 from tuner.result import Run
 
 

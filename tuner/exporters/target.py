@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Literal
 
 from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried, Written
 from tuner.config import VehicleFile, values_of
-from tuner.errors import ExportError
+from tuner.errors import ExportError, did_you_mean
+from tuner.exporters import targets
 from tuner.exporters.draft import Draft
 
 Simulator = Literal["gazebo-classic", "gz-sim"]
@@ -57,6 +59,21 @@ class Target:
     draft: Callable[[VehicleFile, str, Choices], Draft]
     entry: Callable[[Coefficient], Entry | None]
     patches: bool = False
+
+
+def target_of(name: str) -> Target:
+    """Return the target of a name.
+
+    Raises
+    ------
+    ExportError
+        There is none.
+    """
+    if name not in targets.NAMES:
+        remedy = did_you_mean(name, targets.NAMES)
+        raise ExportError("--format", f"unknown export format '{name}'", remedy)
+    target: Target = import_module(f"{targets.__name__}.{name}").TARGET
+    return target
 
 
 def registered(target: str) -> Callable[[Coefficient], Entry | None]:

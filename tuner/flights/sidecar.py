@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.config.job import TrajectorySettings
-from tuner.config.model import Number, Section, read_model
+from tuner.trajectory_settings import TrajectorySettings
+from tuner.yaml_files.section import Number, Section, read_model
 
 
 class Sidecar(Section):

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, model_validator
 
-from tuner.config.model import Section, Whole, read_model, refuse
-from tuner.config.shipped import configs_folder, find_config
 from tuner.errors import ConfigError, did_you_mean
 from tuner.flights.flight import SIGNALS
 from tuner.flights.recording import Clock
 from tuner.flights.units import UNITS
+from tuner.yaml_files.section import Section, Whole, read_model, refuse
+from tuner.yaml_files.shipped import configs_folder, find_config
 
 #: Maps may extend maps this often.
 DEEPEST = 3

@@ -18,12 +18,12 @@ from tuner.config import (
     read_controller,
     read_vehicle,
 )
-from tuner.config.model import Number, Section, build
 from tuner.flights.flight import Array
 from tuner.simulation.simulate import Simulation, simulate
 from tuner.simulation.sweep import grid_of
 from tuner.simulation.trajectory import at_speed
 from tuner.simulation.write import Summary, write_flights
+from tuner.yaml_files.section import Number, Section, build
 
 
 class Plan(Section):

@@ -1,3 +1,3 @@
-from tests.tuner.export.conftest import make_run
+from tests.tuner.exporters.conftest import make_run
 
 __all__ = ["make_run"]

@@ -8,10 +8,10 @@ import yaml
 
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, read_vehicle, with_values
-from tuner.config.shipped import find_config
 from tuner.flights.load import load_flight
 from tuner.objective.segments import noise_of
 from tuner.recordings import Recording
+from tuner.yaml_files.shipped import find_config
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 NAMES = sorted(path.stem for path in FLIGHTS.glob("*.bag"))

@@ -4,7 +4,7 @@ import pytest
 
 from tuner.config import Options, configs_folder, find_job_file, settle
 from tuner.errors import ConfigError, InputError
-from tuner.flights.paths import find_flights
+from tuner.recording_paths import find_flights
 
 
 @pytest.fixture

@@ -3,9 +3,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tuner.config import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
-from tuner.config.shipped import configs_folder
 from tuner.config.vehicle import Aerodynamics, Inertia, Motor, Setup
 from tuner.errors import ConfigError
+from tuner.yaml_files.shipped import configs_folder
 
 SHIPPED = sorted((configs_folder() / "vehicles").glob("*.yaml"))
 ORIGINAL = configs_folder() / "vehicles" / "hovergames.yaml"

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tuner.config.shipped import configs_folder
 from tuner.errors import ConfigError
 from tuner.flights import SIGNALS
 from tuner.flights.sidecar import read_sidecar
 from tuner.flights.topics import load_topic_map, shipped_maps
 from tuner.flights.units import UNITS, to_enu_flu
+from tuner.yaml_files.shipped import configs_folder
 
 
 def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:

@@ -16,10 +16,10 @@ from sim_jax.motor import reference_speed
 from sim_jax.numeric import GRAVITY
 from sim_jax.vehicle import Motor
 from tuner.config import VehicleFile
-from tuner.config.yaml_file import commented
 from tuner.errors import ExportError
 from tuner.exporters.draft import Draft, read_file
 from tuner.exporters.target import Choices, Target, registered
+from tuner.yaml_files.document import commented
 
 #: MAVLink's numbers of parameter types, as ground stations write them.
 INT32, FLOAT = 6, 9

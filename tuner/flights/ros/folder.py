@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from tuner.config.yaml_file import read_yaml
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import (
@@ -25,6 +24,7 @@ from tuner.flights.ros.container import (
 from tuner.flights.ros.db3 import Db3
 from tuner.flights.ros.mcap import Mcap
 from tuner.flights.ros.wire import Block
+from tuner.yaml_files.document import read_yaml
 
 #: Files compressed as a whole are unpacked beside the others up to this size.
 LARGEST_UNPACKED = 32 << 30

@@ -2,8 +2,8 @@ import re
 
 import pytest
 
-from tuner.config.yaml_file import MAX_BYTES, dump_yaml, read_yaml, write_yaml
 from tuner.errors import ConfigError, OutputError
+from tuner.yaml_files.document import MAX_BYTES, dump_yaml, read_yaml, write_yaml
 
 
 def refusal(tmp_path, text):

@@ -10,9 +10,9 @@ from annotated_types import Ge, Gt
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Strict, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from tuner.config.yaml_file import read_yaml
 from tuner.errors import did_you_mean
 from tuner.validation import config_error
+from tuner.yaml_files.document import read_yaml
 
 Number = Annotated[float, Strict(), AllowInfNan(False)]
 Positive = Annotated[Number, Gt(0)]

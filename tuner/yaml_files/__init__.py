@@ -1,0 +1,1 @@
+"""YAML files of settings: bounded reading, validated sections, and those that ship."""
