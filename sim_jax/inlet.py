@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from sim_jax.control.mixer import PerRotor
 from sim_jax.control.position import ReferencePoint
 from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor
 
 
 class ReferenceInlet(eqx.Module):

@@ -13,7 +13,6 @@ from jaxtyping import Int, PyTree
 
 from sim_jax.control import attitude, mixer, rate
 from sim_jax.control.gains import Controller
-from sim_jax.control.mixer import PerRotor
 from sim_jax.control.position import (
     attitude_from_acceleration,
     heading_of,
@@ -30,15 +29,16 @@ from sim_jax.inlet import (
     RotorSpeedInlet,
 )
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
-from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
+from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_rk4, step_semi_implicit
 from sim_jax.rotation import Quaternion
-from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switched, unpacked
 from sim_jax.state import Setpoints, State
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
 from sim_jax.trees import forgetful, like, repeat, replaced, row_of, where
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Vehicle
+from sim_jax.vehicle import PerRotor, Vehicle
 
 T = TypeVar("T")
 
@@ -212,15 +212,9 @@ class Plant(eqx.Module):
         """Advance rotors and body by one step."""
         speeds, acting = self.spin_up(state, step)
 
-        def wrench_at(attitude: Quaternion, velocity: Vec3, body_rate: Vec3) -> Wrench:
-            return vehicle_wrench(
-                self.vehicle.aerodynamics,
-                self.vehicle.rotors,
-                speeds=acting,
-                air_velocity=attitude.to_body(velocity),
-                body_rate=body_rate,
-                world_up=attitude.world_up(),
-            )
+        def wrench_at(motion: Motion) -> Wrench:
+            air = Air.around(self.vehicle, motion)
+            return total_wrench(self.vehicle, motion, acting, air)
 
         advance = _INTEGRATORS[self.schedule.integrator]
         motion = advance(

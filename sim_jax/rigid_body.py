@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -10,7 +11,6 @@ import jax.numpy as jnp
 
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rotation import Quaternion
-from sim_jax.rotor import Wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
 
@@ -34,8 +34,32 @@ class Motion(eqx.Module):
     body_rate: Vec3
 
 
-#: (attitude, world velocity, body rate) -> wrench in body axes
-WrenchAt = Callable[[Quaternion, Vec3, Vec3], Wrench]
+class Wrench(eqx.Module):
+    """Force and moment, in body axes.
+
+    Attributes
+    ----------
+    force
+        N, at the centre of mass.
+    moment
+        N m, about the centre of mass.
+    at_rotors
+        N, forces that act at the centre of each rotor; they are not part of the other two.
+    """
+
+    force: Vec3
+    moment: Vec3
+    at_rotors: tuple[Vec3, ...] = ()
+
+    @staticmethod
+    def at_each_rotor(forces: tuple[Vec3, ...]) -> Wrench:
+        """Return forces in N at the rotors alone."""
+        zero = Vec3.zeros(forces[0].x)
+        return Wrench(zero, zero, forces)
+
+
+WrenchAt: TypeAlias = Callable[[Motion], Wrench]
+"""Motion -> what acts in it on the centre of mass."""
 
 
 def acceleration(
@@ -67,7 +91,7 @@ def step_semi_implicit(
 
     First order in the step. ``step`` in s, ``gravity`` in m/s².
     """
-    wrench = wrench_at(motion.attitude, motion.velocity, motion.body_rate)
+    wrench = wrench_at(motion)
     pull = acceleration(body, motion.attitude, wrench.force, gravity=gravity)
     velocity = motion.velocity + pull * step
     body_rate = (
@@ -93,7 +117,7 @@ def step_midpoint(
     half = 0.5 * step
 
     def slope(at: Motion) -> tuple[Vec3, Vec3]:
-        wrench = wrench_at(at.attitude, at.velocity, at.body_rate)
+        wrench = wrench_at(at)
         return (
             acceleration(body, at.attitude, wrench.force, gravity=gravity),
             angular_acceleration(body, at.body_rate, wrench.moment),
@@ -101,7 +125,7 @@ def step_midpoint(
 
     pull, turn = slope(motion)
     middle = Motion(
-        position=motion.position,
+        position=motion.position + motion.velocity * half,
         velocity=motion.velocity + pull * half,
         attitude=motion.attitude.advanced(motion.attitude, motion.body_rate, half),
         body_rate=motion.body_rate + turn * half,
@@ -125,7 +149,7 @@ def step_rk4(
     """
 
     def slope(at: Motion) -> Motion:
-        wrench = wrench_at(at.attitude, at.velocity, at.body_rate)
+        wrench = wrench_at(at)
         return Motion(
             position=at.velocity,
             velocity=acceleration(body, at.attitude, wrench.force, gravity=gravity),

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from sim_jax.control.mixer import PerRotor
 from sim_jax.motor import reference_speed
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.rigid_body import Motion
@@ -16,7 +15,7 @@ from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, GyroMemory, history_length, past_of
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Motor, Vehicle
+from sim_jax.vehicle import Motor, PerRotor, Vehicle
 
 
 class Start(eqx.Module):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,6 +10,9 @@ from jax.typing import ArrayLike
 
 from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
+
+PerRotor: TypeAlias = tuple[Scalar, ...]
+"""One value per rotor, in the vehicle's order of rotors."""
 
 
 def _number(value: ArrayLike) -> Scalar:
@@ -87,8 +90,8 @@ class Vehicle(eqx.Module):
     """One vehicle, or a batch of them when its leaves have a trailing batch axis."""
 
     body: Body
-    rotors: tuple[Rotor, Rotor, Rotor, Rotor]
-    """PX4 order: front right ccw, rear left ccw, front left cw, rear right cw."""
+    rotors: tuple[Rotor, ...]
+    """Of a quad X in PX4's order: front right ccw, rear left ccw, front left cw, rear right cw."""
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup

@@ -15,9 +15,8 @@ import jax.numpy as jnp
 
 from sim_jax.numeric import Scalar, safe_sqrt, saturate
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor
 
-#: One value per rotor, PX4 order: front right, rear left, front left, rear right.
-PerRotor: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 Scales: TypeAlias = tuple[float, float, float, float]
 Rounding: TypeAlias = Callable[[Scalar], Scalar]
 

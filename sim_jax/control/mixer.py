@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from sim_jax.control.desaturation import (
     HALF_SQRT2,
     YAW_HEADROOM,
-    PerRotor,
     desaturated,
     exact,
     linearised,
@@ -24,8 +23,7 @@ from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
 from sim_jax.numeric import Flag, Scalar, anyone, larger, magnitude, saturate, smaller
 from sim_jax.vector import Vec3
-
-__all__ = ["PerRotor", "mix", "saturation"]
+from sim_jax.vehicle import PerRotor
 
 LOW_CLIP = 0.00499998
 """A command below this counts as clipped low. PX4 asks for output < -0.99 on its -1..1 scale in

@@ -7,14 +7,18 @@ import jax.numpy as jnp
 from jax import Array
 
 from sim_jax.motor import Lag, reference_speed
+from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.rotation import Matrix3
-from sim_jax.rotor import Wrench, vehicle_wrench
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Aerodynamics, Motor, Rotor
+from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 EXACT = 1e-12
 SINGLE = 1e-6
+BODY = Body(1.0, 1.0, 1.0, 1.0)
+"""Any: what acts on it does not depend on its mass."""
 
 
 def command_map(table: Table) -> list[Deviation]:
@@ -61,8 +65,9 @@ def motor_model(table: Table) -> list[Deviation]:
 
 def _motor_model(table: Table) -> list[Deviation]:
     spin = int(table.only("dir"))
-    axes = table.quaternion("rotor_q").matrix()
-    air = axes.to_body(table.vector("v") - table.vector("wind_"))
+    attitude = table.quaternion("rotor_q")
+    axes = attitude.matrix()
+    through_air = table.vector("v") - table.vector("wind_")
     speed = table.column("omega_signed")
     # A reversible rotor pushes the other way when it turns backwards; all else is the same.
     backwards = table.flag("reversible") & (speed < 0)
@@ -81,14 +86,9 @@ def _motor_model(table: Table) -> list[Deviation]:
             *(coefficients.get(name, zero) for name in names), reaction_torque=axis
         )
         centre = Vec3.zeros(zero)
-        return vehicle_wrench(
-            aerodynamics,
-            [Rotor(centre, spin)],
-            speeds=[jnp.abs(speed)],
-            air_velocity=air,
-            body_rate=centre,
-            world_up=Vec3(axes.x_axis.z, axes.y_axis.z, axes.z_axis.z),
-        )
+        vehicle = Vehicle(BODY, (Rotor(centre, spin),), _motor(), aerodynamics, Setup())
+        motion = Motion(centre, through_air, attitude, centre)
+        return total_wrench(vehicle, motion, (jnp.abs(speed),), Air.around(vehicle, motion))
 
     drag = {"rotor_drag_coefficient": table.column("rotor_drag")}
     rolling = {"rolling_moment_coefficient": table.column("rolling_moment")}

@@ -11,10 +11,10 @@ from sim_jax.control.gains import Filters, MixerSettings
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.rigid_body import Motion, acceleration, angular_acceleration
 from sim_jax.rollout import rollout
-from sim_jax.rotation import Quaternion
-from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
@@ -42,19 +42,6 @@ def _vehicle(table: Table) -> Vehicle:
     )
 
 
-def _wrench_of(
-    vehicle: Vehicle, speeds: tuple[jax.Array, ...], at: Quaternion, velocity: Vec3, rate: Vec3
-) -> Wrench:
-    return vehicle_wrench(
-        vehicle.aerodynamics,
-        vehicle.rotors,
-        speeds=speeds,
-        air_velocity=at.to_body(velocity),
-        body_rate=rate,
-        world_up=at.world_up(),
-    )
-
-
 def wrench(table: Table) -> list[Deviation]:
     return merged([_wrench(part) for part in table.split(*KINDS)])
 
@@ -62,7 +49,9 @@ def wrench(table: Table) -> list[Deviation]:
 def _wrench(table: Table) -> list[Deviation]:
     vehicle = _vehicle(table)
     attitude, body_rate = table.quaternion("q"), table.vector("w")
-    acting = _wrench_of(vehicle, table.four("Om"), attitude, table.vector("v"), body_rate)
+    velocity = table.vector("v")
+    motion = Motion(Vec3.zeros(velocity.x), velocity, attitude, body_rate)
+    acting = total_wrench(vehicle, motion, table.four("Om"), Air.around(vehicle, motion))
     fall = acceleration(vehicle.body, attitude, acting.force, gravity=GOLDEN_GRAVITY)
     now = jnp.zeros(len(table))
     turning = jax.jvp(

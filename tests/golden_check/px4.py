@@ -10,6 +10,7 @@ from sim_jax.control import mixer, rate
 from sim_jax.control.gains import Filters, MixerSettings, RateGains
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor
 from tests.golden_check.controllers import hovergames_rates
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
@@ -127,7 +128,7 @@ def _mixer_part(table: Table) -> list[Deviation]:
     ]
 
 
-def _outputs(commands: mixer.PerRotor) -> tuple[Array, ...]:
+def _outputs(commands: PerRotor) -> tuple[Array, ...]:
     return tuple(2.0 * command - 1.0 for command in commands)
 
 
@@ -145,8 +146,8 @@ def _rate_and_mixer(table: Table) -> list[Deviation]:
     gains = hovergames_rates()
 
     def step(
-        carry: tuple[Vec3, mixer.PerRotor], row: tuple[Vec3, Vec3, Vec3, Array]
-    ) -> tuple[tuple[Vec3, mixer.PerRotor], tuple[Vec3, Vec3, mixer.PerRotor]]:
+        carry: tuple[Vec3, PerRotor], row: tuple[Vec3, Vec3, Vec3, Array]
+    ) -> tuple[tuple[Vec3, PerRotor], tuple[Vec3, Vec3, mixer.PerRotor]]:
         integral, commands = carry
         measured, setpoint, acceleration, thrust = row
         torque = rate.torque_setpoint(

@@ -15,13 +15,14 @@ from sim_jax.control.desaturation import HALF_SQRT2
 from sim_jax.control.gains import Filters, MixerSettings, PositionGains
 from sim_jax.control.position import ReferencePoint
 from sim_jax.motor import Lag, reference_speed
-from sim_jax.rigid_body import Motion, step_midpoint, step_semi_implicit
+from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.rotation import Quaternion
-from sim_jax.rotor import Wrench, vehicle_wrench
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
 from sim_jax.trajectory import Shape, publish
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Rotor
+from sim_jax.vehicle import PerRotor, Rotor, Vehicle
 from tests.sim_jax.derivatives import Differences, assert_derivatives
 from tests.sim_jax.support import controller, hover, quaternion, vec, vehicle
 
@@ -157,14 +158,14 @@ def test_integrator_at_its_limit_at_the_fade_and_when_saturated() -> None:
 # mixer
 
 
-def mixed(torque: Vec3, thrust: Array, **settings: object) -> mixer.PerRotor:
+def mixed(torque: Vec3, thrust: Array, **settings: object) -> PerRotor:
     return mixer.mix(MixerSettings(**settings), torque, thrust)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("airmode", [0, 1, 2])
 @pytest.mark.parametrize("thrust_factor", [0.0, 0.3])
 def test_mixer(airmode: int, thrust_factor: float) -> None:
-    def mix(torque: Vec3, thrust: Array) -> mixer.PerRotor:
+    def mix(torque: Vec3, thrust: Array) -> PerRotor:
         return mixed(torque, thrust, airmode=airmode, thrust_factor=thrust_factor)
 
     mixing = Differences(mix, STILL, HALF)
@@ -185,7 +186,7 @@ def test_mixer(airmode: int, thrust_factor: float) -> None:
 @pytest.mark.parametrize("airmode", [0, 1, 2])
 @pytest.mark.parametrize("thrust", [0.0, 1.0])
 def test_mixer_at_no_and_full_thrust(airmode: int, thrust: float) -> None:
-    def mix(thrust: Array) -> mixer.PerRotor:
+    def mix(thrust: Array) -> PerRotor:
         return mixed(STILL, thrust, airmode=airmode)
 
     assert_derivatives(mix, jnp.asarray(thrust), kink=True)
@@ -193,7 +194,7 @@ def test_mixer_at_no_and_full_thrust(airmode: int, thrust: float) -> None:
 
 @pytest.mark.parametrize("axis", ["x", "y", "z"])
 def test_mixer_where_a_torque_stops_to_count(axis: str) -> None:
-    def mix(amount: Array) -> mixer.PerRotor:
+    def mix(amount: Array) -> PerRotor:
         parts = {name: jnp.zeros(()) for name in "xyz"} | {axis: amount * 0.2}
         return mixed(Vec3(**parts), HALF, airmode=0)
 
@@ -248,14 +249,9 @@ def test_lag_at_rest_rising_and_falling() -> None:
 def blown(speed: Array, air: Vec3, *coefficients: Array) -> Wrench:
     names = lambda a: (a.motor_constant, a.moment_constant, a.rotor_drag_coefficient)  # noqa: E731
     aerodynamics = eqx.tree_at(names, CRAFT.aerodynamics, coefficients)
-    return vehicle_wrench(
-        aerodynamics,
-        [Rotor(STILL, -1)],
-        speeds=[speed],
-        air_velocity=air,
-        body_rate=STILL,
-        world_up=LEVEL.world_up(),
-    )
+    vehicle = Vehicle(CRAFT.body, (Rotor(STILL, -1),), CRAFT.motor, aerodynamics, CRAFT.setup)
+    motion = Motion(STILL, air, LEVEL, STILL)
+    return total_wrench(vehicle, motion, (speed,), Air.around(vehicle, motion))
 
 
 COEFFICIENTS = (jnp.asarray(1.45e-5), jnp.asarray(0.033), jnp.asarray(1.45e-4))
@@ -286,15 +282,8 @@ def test_body_at_rest_and_tumbling(advance: Callable[..., Motion]) -> None:
     speeds = hover(CRAFT, STILL).rotor_speed
 
     def moved(motion: Motion) -> Motion:
-        def wrench_at(attitude: Quaternion, velocity: Vec3, body_rate: Vec3) -> Wrench:
-            return vehicle_wrench(
-                CRAFT.aerodynamics,
-                CRAFT.rotors,
-                speeds=speeds,
-                air_velocity=attitude.to_body(velocity),
-                body_rate=body_rate,
-                world_up=attitude.world_up(),
-            )
+        def wrench_at(motion: Motion) -> Wrench:
+            return total_wrench(CRAFT, motion, speeds, Air.around(CRAFT, motion))
 
         return advance(CRAFT.body, motion, wrench_at, 0.0025)
 

@@ -8,9 +8,7 @@ import jax
 import pytest
 
 from sim_jax.numeric import GRAVITY
-from sim_jax.rigid_body import Motion, step_midpoint, step_rk4, step_semi_implicit
-from sim_jax.rotation import Quaternion
-from sim_jax.rotor import Wrench
+from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_rk4, step_semi_implicit
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
 from tests.sim_jax.support import apart, quaternion, vec
@@ -23,8 +21,8 @@ TUMBLING = Motion(
 )
 
 
-def nothing(_attitude: Quaternion, velocity: Vec3, _body_rate: Vec3) -> Wrench:
-    zero = Vec3.zeros(velocity.x)
+def nothing(motion: Motion) -> Wrench:
+    zero = Vec3.zeros(motion.velocity.x)
     return Wrench(zero, zero)
 
 
@@ -103,7 +101,7 @@ def test_order_of_each_step_under_a_moment(advance: Step, order: int) -> None:
     """A moment about a principal axis and thrust: what the midpoint step is made for."""
     still = Motion(vec(0, 0, 0), vec(1, 0, 0), quaternion(1, 0, 0, 0), vec(0.0, 0.5, 0.0))
 
-    def push(_attitude: Quaternion, _velocity: Vec3, _body_rate: Vec3) -> Wrench:
+    def push(_: Motion) -> Wrench:
         return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
 
     def at(step: Step, count: int) -> Motion:

@@ -1,0 +1,1 @@
+"""What pushes and turns the vehicle: one pure function for each force or moment."""

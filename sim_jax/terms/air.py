@@ -1,0 +1,34 @@
+"""How the vehicle and each of its rotors move through the air: worked out once for all terms."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from sim_jax.rigid_body import Motion
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+
+
+class Air(eqx.Module):
+    """Velocities through the air, and where they are taken; all in body axes."""
+
+    velocity: Vec3
+    """m/s, of the centre of mass through the air."""
+    arms: tuple[Vec3, ...]
+    """m, from the centre of mass to each rotor's centre."""
+    at_rotors: tuple[Vec3, ...]
+    """m/s, of each rotor's centre through the air: velocity + ω × arm."""
+    up: Vec3
+    """The world's z axis."""
+
+    @staticmethod
+    def around(vehicle: Vehicle, motion: Motion) -> Air:
+        """Return the air as a vehicle meets it in a motion."""
+        velocity = motion.attitude.to_body(motion.velocity)
+        arms = tuple(rotor.position for rotor in vehicle.rotors)
+        return Air(
+            velocity=velocity,
+            arms=arms,
+            at_rotors=tuple(velocity + motion.body_rate.cross(arm) for arm in arms),
+            up=motion.attitude.world_up(),
+        )

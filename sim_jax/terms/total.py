@@ -1,0 +1,41 @@
+"""All terms, and their sum about the centre of mass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from sim_jax.rigid_body import Motion, Wrench
+from sim_jax.terms import rotor
+from sim_jax.terms.air import Air
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor, Vehicle
+
+Term: TypeAlias = Callable[[Vehicle, Motion, PerRotor, Air], Wrench]
+"""(vehicle, motion, rotor speeds in rad/s, air) -> what acts, in body axes."""
+
+TERMS: tuple[Term, ...] = (
+    rotor.thrust,
+    rotor.rotor_drag,
+    rotor.rolling_moment,
+    rotor.drag_torque,
+)
+"""Everything that acts on the vehicle besides gravity; a term that is added here flies."""
+
+
+def total_wrench(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) -> Wrench:
+    """Return the sum of all terms, as force and moment about the centre of mass, body axes.
+
+    Forces at one rotor are added up before the arm multiplies them, and rotors are taken one after
+    the other: so those of opposite rotors cancel to the last bit, which a sum over rotors term by
+    term does not give where the processor rounds a product and a sum at once.
+    """
+    wrenches = [term(vehicle, motion, rotor_speed, air) for term in TERMS]
+    force = moment = Vec3.zeros(air.velocity.x)
+    for number, arm in enumerate(air.arms):
+        forces = [wrench.at_rotors[number] for wrench in wrenches if wrench.at_rotors]
+        at_rotor = sum(forces, start=Vec3.zeros(air.velocity.x))
+        force, moment = force + at_rotor, moment + arm.cross(at_rotor)
+    for wrench in wrenches:
+        force, moment = force + wrench.force, moment + wrench.moment
+    return Wrench(force, moment)
