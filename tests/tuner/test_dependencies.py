@@ -1,0 +1,83 @@
+"""What pyproject.toml declares is imported, and what is imported is declared, extra by extra."""
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+#: Import packages whose distribution is named otherwise.
+DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports-zstd"}
+#: Distributions that work without being imported: plugins of pytest, and what `make lint` runs.
+NOT_IMPORTED = {"pytest-xdist", "ruff", "mypy", "import-linter", "types-pyyaml", "lxml-stubs"}
+OURS = {"sim_jax", "tuner", "tests", "benchmarks", "examples"}
+
+#: Folders -> the extra that they need beside what is always installed.
+USES = {
+    None: ("sim_jax", "tuner", "examples"),
+    "test": ("tests",),
+    "bench": ("benchmarks",),
+}
+
+
+def normalised(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def declared(extra: str | None) -> set[str]:
+    requirements = (
+        PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
+    )
+    return {normalised(re.match(r"[\w.-]+", line)[0]) for line in requirements}
+
+
+def modules(tree: ast.AST) -> Iterator[str]:
+    """Yield the modules that a file imports, those named to `importlib` and `importorskip` too."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Import(names=names):
+                yield from (alias.name for alias in names)
+            case ast.ImportFrom(module=str(module), level=0):
+                yield module
+            case ast.Call(
+                func=ast.Attribute(attr="import_module" | "importorskip"),
+                args=[ast.Constant(value=str(module)), *_],
+            ):
+                yield module
+
+
+def imported(*folders: str) -> set[str]:
+    packages = {
+        module.split(".")[0]
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        for module in modules(ast.parse(path.read_text(encoding="utf-8")))
+    }
+    outside = packages - sys.stdlib_module_names - OURS - {"compression"}  # of Python 3.14
+    return {normalised(DISTRIBUTIONS.get(package, package)) for package in outside}
+
+
+@pytest.mark.parametrize("extra", USES, ids=str)
+def test_everything_imported_is_declared(extra):
+    assert imported(*USES[extra]) <= declared(None) | declared(extra)
+
+
+@pytest.mark.parametrize("extra", USES, ids=str)
+def test_everything_declared_is_imported(extra):
+    assert declared(extra) - NOT_IMPORTED <= imported(*USES[extra])
+
+
+def test_no_extra_but_the_tools_goes_unchecked():
+    assert set(PROJECT["optional-dependencies"]) - set(USES) == {"dev"}
+    assert declared("dev") <= NOT_IMPORTED
+
+
+def test_an_import_is_seen_however_it_is_written():
+    source = "import a.b\nfrom c import d\nfrom . import e\nimportlib.import_module('f.g')"
+    assert set(modules(ast.parse(source))) == {"a.b", "c", "f.g"}
