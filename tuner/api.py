@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from tuner.config import (
     ControllerFile,
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tuner.simulation.simulate import Simulation
 
 Named = str | Path
+T = TypeVar("T")
 
 __all__ = [
     "compare",
@@ -58,7 +59,7 @@ def fit(
     force: bool = False,
     cross_validate: bool = False,
 ) -> Run:
-    """Fit the coefficients of a vehicle to recordings; what ``tune --flights`` does.
+    """Fit the coefficients of a vehicle to recordings, as ``tune --flights`` does.
 
     Parameters
     ----------
@@ -75,7 +76,7 @@ def fit(
     config
         Job file; None takes the ``tune.yaml`` beside the flights, if there is one.
     free, fixed
-        Coefficients: exactly those to fit, or those to leave alone.
+        Coefficients: fit exactly the former, or the usual ones except the latter.
     method, seed
         Of the search.
     topics, namespace
@@ -83,11 +84,11 @@ def fit(
     out
         Result folder; None makes one under ``runs/``.
     resume
-        Go on from the folder's checkpoint.
+        Whether to continue from the folder's checkpoint.
     force
-        Search although the check before it failed.
+        Whether to search even where the check before the search reports a failure.
     cross_validate
-        Also leave each fitted flight out in turn, into ``cross_validation.csv``.
+        Whether to fit without each flight in turn as well, into ``cross_validation.csv``.
 
     Returns
     -------
@@ -104,15 +105,15 @@ def fit(
     options = Options(
         flights=[str(path) for path in flights],
         holdout=holdout,
-        vehicle=str(vehicle) if isinstance(vehicle, Path) else vehicle,
-        controller=str(controller) if isinstance(controller, Path) else controller,
+        vehicle=_text(vehicle),
+        controller=_text(controller),
         mass=mass,
-        config=None if config is None else str(config),
+        config=_text(config),
         fit=free,
         fix=fixed,
         method=method,
         seed=seed,
-        topics=None if topics is None else str(topics),
+        topics=_text(topics),
         namespace=namespace,
     )
     folder, _ = run(
@@ -136,7 +137,7 @@ def compare(
     namespace: str | None = None,
     out: Sequence[Named] = (),
 ) -> Table:
-    """Fly recordings with several vehicles and tabulate the RMSE; what ``tune compare`` does.
+    """Simulate recorded flights with several vehicles and tabulate the RMSE, as ``tune compare``.
 
     Parameters
     ----------
@@ -164,15 +165,16 @@ def compare(
 
     options = Options(
         flights=[str(path) for path in flights],
-        controller=str(controller) if isinstance(controller, Path) else controller,
-        config=None if config is None else str(config),
-        topics=None if topics is None else str(topics),
+        controller=_text(controller),
+        config=_text(config),
+        topics=_text(topics),
         namespace=namespace,
     )
-    if not isinstance(vehicles, Mapping):
-        vehicles = {str(word): word for word in vehicles}
-    named = {label: str(v) if isinstance(v, Path) else v for label, v in vehicles.items()}
-    table, _ = compare_vehicles(options, named, [Path(path) for path in out])
+    labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
+    sets: dict[str, str | VehicleFile] = {}
+    for label, vehicle in labelled.items():
+        sets[label] = _text(vehicle)
+    table, _ = compare_vehicles(options, sets, [Path(path) for path in out])
     return table
 
 
@@ -194,7 +196,7 @@ def sensitivity(
     profile: Sequence[str] | None = None,
     out: Named | None = None,
 ) -> SensitivityResult:
-    """Tell what recordings say of each coefficient of a vehicle; what ``tune sensitivity`` does.
+    """Report what recordings say about each coefficient of a vehicle, as ``tune sensitivity`` does.
 
     Parameters
     ----------
@@ -203,20 +205,20 @@ def sensitivity(
     vehicle, controller, mass, config, topics, namespace
         As of `fit`; nothing is fitted, held-out flights are examined like the others.
     free, fixed
-        Coefficients that are taken to be fitted together, as of `fit`.
+        Coefficients that are judged as if they were fitted together, as of `fit`.
     arena
-        m from wall to wall along x and y, about the origin, and up: where the next flight must
-        fit. None takes what the recorded flights took, and some more.
+        m from wall to wall along x and y, about the origin, and up: what the next flight must fit
+        into. None takes what the recorded flights took, and a little more.
     global_method
-        Whose indices over the range of the coefficients to tell too.
+        Also computes the indices of Morris or Sobol over the range of the coefficients.
     samples
-        For them: trajectories of Morris, base points of Sobol.
+        Trajectories (Morris) or base points (Sobol) that they are computed from.
     span
-        Percent by which coefficients are varied for them, where the job file gives no bounds.
+        Percent by which coefficients are varied for them where the job file gives no bounds.
     profile
-        Coefficients for which the others are fitted again along a grid of values.
+        Coefficients whose likelihood is profiled: the others are fitted again along a grid.
     out
-        Folder for the tables and the report; None makes one under ``runs/``.
+        Folder that tables and report are written into; None makes one under ``runs/``.
 
     Returns
     -------
@@ -236,13 +238,13 @@ def sensitivity(
 
     options = Options(
         flights=[str(path) for path in flights],
-        vehicle=str(vehicle) if isinstance(vehicle, Path) else vehicle,
-        controller=str(controller) if isinstance(controller, Path) else controller,
+        vehicle=_text(vehicle),
+        controller=_text(controller),
         mass=mass,
-        config=None if config is None else str(config),
+        config=_text(config),
         fit=free,
         fix=fixed,
-        topics=None if topics is None else str(topics),
+        topics=_text(topics),
         namespace=namespace,
     )
     return examine_vehicle(
@@ -274,7 +276,7 @@ def simulate(
     grid: Mapping[str, Array] | None = None,
     precision: Precision = "float64",
 ) -> tuple[Simulation, ...]:
-    """Fly a trajectory; what ``tune simulate`` does.
+    """Simulate a trajectory, as ``tune simulate`` does.
 
     Parameters
     ----------
@@ -313,7 +315,7 @@ def simulate(
     configure()
     from tuner.simulation.plan import fly  # noqa: PLC0415 (jax)
 
-    said = {
+    shape = {
         "name": trajectory,
         "radius": radius,
         "omega": omega,
@@ -322,9 +324,9 @@ def simulate(
     }
     return tuple(
         fly(
-            str(vehicle) if isinstance(vehicle, Path) else vehicle,
-            str(controller) if isinstance(controller, Path) else controller,
-            said,
+            _text(vehicle),
+            _text(controller),
+            shape,
             speed=speed,
             duration=duration,
             rate=rate,
@@ -343,7 +345,7 @@ def export(
     simulator: Simulator = "gazebo-classic",
     accept: str = "",
 ) -> Exported:
-    """Write a run's coefficients for a simulator, if they hold there; what ``tune export`` does.
+    """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
 
     Parameters
     ----------
@@ -363,7 +365,9 @@ def export(
     Raises
     ------
     ExportError
-        A condition is not met, or the file cannot be written or does not read back.
+        A condition is not met, or the file would not read back.
+    OutputError
+        The file cannot be written.
     """
     configure()
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
@@ -379,3 +383,8 @@ def export(
         simulator=simulator,
         accept=accept,
     )
+
+
+def _text(named: Path | T) -> str | T:
+    """Return a path as text, and anything else as it is."""
+    return str(named) if isinstance(named, Path) else named

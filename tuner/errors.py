@@ -1,4 +1,4 @@
-"""The errors that a user can cause: each is one line saying where, what is wrong, what to do."""
+"""The errors that a user can cause: each is one line, and says where, what is wrong, what to do."""
 
 from __future__ import annotations
 

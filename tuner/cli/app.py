@@ -39,29 +39,29 @@ app = App(
 #: Command -> what it does, and examples.
 COMMANDS = {
     "inspect": (
-        "Say what recordings hold and what they are good for.",
+        "Report what recordings hold and what can be fitted to them.",
         "tune inspect lab/*.bag",
         "tune inspect 'lab/*.bag' --json",
     ),
     "compare": (
-        "Tabulate how closely several coefficient sets meet recordings; nothing is fitted.",
+        "Tabulate the RMSE of several coefficient sets on recordings; nothing is fitted.",
         "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --out c.html",
     ),
     "export": (
-        "Write the coefficients of a run for a simulator, if they hold there.",
+        "Write the coefficients of a run for a simulator, once they fly there as in the run.",
         "tune export runs/x --format sdf --into models/quad.sdf",
         "tune export runs/x --format px4 --out quad.params",
     ),
     "sensitivity": (
-        "Tell what each coefficient does, how well it is known, and what to fly next.",
+        "Report the effect of each coefficient, how well it is known, and what to fly next.",
         "tune sensitivity --flights lab/*.bag --vehicle runs/x/best_fit.yaml --arena 8,6,3",
     ),
     "report": (
-        "Render the page of a run again.",
+        "Render the report of a run again.",
         "tune report runs/demo",
     ),
     "simulate": (
-        "Fly a trajectory and write the flight as CSV or ROS 1 bag.",
+        "Simulate a trajectory and write the flight as CSV or ROS 1 bag.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",
         "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
     ),

@@ -22,16 +22,16 @@ def compare(
     laps: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Fly recordings with several coefficient sets and tabulate the RMSE, nothing fitted.
+    """Simulate the recorded flights with several coefficient sets and tabulate the RMSE.
 
     Parameters
     ----------
     vehicle
-        Vehicle files, or names of shipped ones, to compare.
+        Compare these vehicle files, or shipped vehicles by their names.
     out
-        Files to write: .csv, .json or .html.
+        Write the table into these files: .csv, .json or .html.
     laps
-        Show every lap on the terminal too.
+        Show each lap on the terminal, too.
     """
     from tuner.cli.tables import print_comparison
     from tuner.runtime import configure

@@ -21,23 +21,23 @@ def export(
     accept: Annotated[str, Parameter(name="--accept")] = "",
     quiet: Quiet = False,
 ) -> None:
-    """Write the coefficients of a run for a simulator, if they hold there.
+    """Write the coefficients of a run for a simulator, once its flights fly there as in the run.
 
     Parameters
     ----------
     run
-        Result folder.
+        Export from this result folder.
     format
-        yaml is the vehicle file with confidences, sdf a model of Gazebo classic or gz-sim, px4 the
-        parameters.
+        Write a vehicle file with confidence intervals (yaml), a model of Gazebo classic or gz-sim
+        (sdf), or parameters of PX4 (px4).
     into
-        The model (.sdf or .sdf.jinja) to put the coefficients into; without, the tags alone.
+        Put the coefficients into this model (.sdf or .sdf.jinja). Default: write the tags alone.
     out
-        File to write. Default: the model itself, or export/ in the result folder.
+        Write this file. Default: the model itself, or export/ in the result folder.
     simulator
-        Whose plugins tags without a model are for.
+        Write tags without a model for the plugins of this simulator.
     accept
-        Export in spite of conditions that are not met, for this reason.
+        Export although a condition is not met, and record this reason in the file.
     """
     from datetime import date
 

@@ -11,12 +11,12 @@ from tuner.cli.options import Namespace, Topics
 
 
 def inspect(
-    *flights: Annotated[str, Parameter(help="Recordings, or a quoted glob.")],
+    *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
     topics: Topics = None,
     namespace: Namespace = None,
     json: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
-    """Say what recordings hold and what they are good for, without simulating anything.
+    """Report what recordings hold and what can be fitted to them, without simulating anything.
 
     Parameters
     ----------
@@ -26,15 +26,15 @@ def inspect(
     from tuner.flights.inspection import as_json, inspect_recordings
     from tuner.recording_paths import find_flights
 
-    found, errors = inspect_recordings(
+    inspections, errors = inspect_recordings(
         find_flights(flights), topics=topics, namespace=namespace or ""
     )
     if json:
-        print(as_json(found, errors))
+        print(as_json(inspections, errors))
     else:
         from tuner.cli.tables import print_inspections
 
-        print_inspections(found)
+        print_inspections(inspections)
     if errors:
         for error in errors[:-1]:
             sys.stderr.write(f"tune: {error}\n")

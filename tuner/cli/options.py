@@ -8,38 +8,59 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-#: What the user typed, for the record of a run.
+#: The command line as the user typed it, for the record of a run.
 TYPED: ContextVar[str] = ContextVar("TYPED", default="")
 
-#: An option that takes all words up to the next option.
+#: The option takes all words up to the next option.
 Many = Parameter(consume_multiple=True, negative=())
 
 Flights = Annotated[
-    list[str], Many, Parameter(help="Recordings, as the shell expands them or a quoted glob.")
+    list[str],
+    Many,
+    Parameter(help="Use these recordings: paths as the shell expands them, or a quoted glob."),
 ]
 VehicleName = Annotated[
-    str, Parameter(help="Vehicle file, or the name of a shipped one such as hovergames_updated.")
+    str,
+    Parameter(help="Fly this vehicle file, or a shipped one by its name, say hovergames_updated."),
 ]
 ControllerName = Annotated[
-    str, Parameter(help="Controller file, or the name of a shipped one such as hovergames_sitl.")
+    str,
+    Parameter(help="Fly this controller file, or a shipped one by its name: hovergames_sitl."),
 ]
 VehicleChoice = Annotated[
     str | None,
-    Parameter(help="Vehicle file to start from. Default: the job file's, else hovergames."),
+    Parameter(
+        help="Start from this vehicle file or shipped vehicle. Default: the job file's, else "
+        "hovergames."
+    ),
 ]
 ControllerChoice = Annotated[
     str | None,
-    Parameter(help="Controller file that flew. Default: the job file's, else hovergames."),
+    Parameter(
+        help="Simulate this controller file or shipped controller, the one that flew. Default: "
+        "the job file's, else hovergames."
+    ),
+]
+Mass = Annotated[
+    float | None,
+    Parameter(help="Use this weighed take-off mass in kg instead of the vehicle file's."),
 ]
 JobChoice = Annotated[
-    str | None, Parameter(help="Job file. Default: tune.yaml beside the flights, if there is one.")
+    str | None,
+    Parameter(
+        help="Read the settings from this job file. Default: tune.yaml beside the flights, if "
+        "there is one."
+    ),
 ]
 Topics = Annotated[
     str | None,
-    Parameter(help="Topic map, or the name of a shipped one. Default: the one that finds most."),
+    Parameter(
+        help="Find signals by this topic map, or a shipped one by its name. Default: the shipped "
+        "map that finds the most signals."
+    ),
 ]
 Namespace = Annotated[
-    str | None, Parameter(help="Prefix of the recorded topics that the topic map does not have.")
+    str | None, Parameter(help="Expect this prefix before the topics that the topic map names.")
 ]
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.", negative=())]
 
@@ -50,7 +71,7 @@ def lengths(option: str, word: str) -> tuple[float, ...]:
     Raises
     ------
     InputError
-        One is no number above zero.
+        The word holds anything but numbers above zero.
     """
     from tuner.errors import InputError
 
@@ -59,5 +80,5 @@ def lengths(option: str, word: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if not numbers or not all(math.isfinite(n) and n > 0 for n in numbers):
-        raise InputError(option, f"'{word}' is no list of lengths in m", "write it as 8,6,3")
+        raise InputError(option, f"'{word}' is not a list of lengths in m", "write it as 8,6,3")
     return numbers

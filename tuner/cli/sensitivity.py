@@ -1,4 +1,4 @@
-"""``tune sensitivity``: what recordings tell of each coefficient."""
+"""``tune sensitivity``: what recordings say about each coefficient, nothing fitted."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from tuner.cli.options import (
     Flights,
     JobChoice,
     Many,
+    Mass,
     Namespace,
     Quiet,
     Topics,
@@ -25,7 +26,7 @@ def sensitivity(
     flights: Flights,
     vehicle: VehicleChoice = None,
     controller: ControllerChoice = None,
-    mass: float | None = None,
+    mass: Mass = None,
     config: JobChoice = None,
     topics: Topics = None,
     namespace: Namespace = None,
@@ -41,29 +42,27 @@ def sensitivity(
     out: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Tell what each coefficient does, how well it is known and from what, nothing fitted.
+    """Report the effect of each coefficient, how well it is known and from which flights.
 
     Parameters
     ----------
-    mass
-        The weighed take-off mass in kg, instead of the vehicle file's.
     fit
-        Exactly these coefficients are taken to be fitted together.
+        Judge exactly these coefficients, as if they were fitted together.
     fix
-        The usual coefficients are, without these.
+        Judge the usual coefficients except these.
     arena
-        X,Y,Z in m from wall to wall and up, about the origin: where the next flight must fit.
-        Default: what the recorded flights took, and some more.
+        Propose next flights that fit into X,Y,Z in m: from wall to wall, and up. Default: what the
+        recorded flights took, and a little more.
     global_method
-        Tell the indices of one of them over the range of the coefficients, too.
+        Also compute the indices of Morris or Sobol over the range of the coefficients.
     samples
-        For them: trajectories of Morris (default 16), base points of Sobol (default 64).
+        Compute them from this many trajectories (Morris, default 16) or base points (Sobol, 64).
     span
-        Percent by which coefficients are varied for them, where the job file gives no bounds.
+        Vary coefficients without bounds in the job file by this many percent for them.
     profile
-        Coefficients for which the others are fitted again along a grid of values.
+        Profile the likelihood of these coefficients: fit the others again along a grid of values.
     out
-        Folder for the tables and the report; default runs/ and the time.
+        Write tables and report into this folder. Default: runs/ and the time.
     """
     from tuner.cli.options import lengths
     from tuner.cli.progress import listening, print_examined
@@ -93,8 +92,8 @@ def sensitivity(
         profiles=profile or (),
     )
     with listening(quiet=quiet) as listener:
-        found = examine_vehicle(
+        result = examine_vehicle(
             options, request, out=folder_for(out), command=TYPED.get(), on_message=listener.message
         )
     if not quiet:
-        print_examined(found)
+        print_examined(result)

@@ -26,32 +26,32 @@ def simulate(
     precision: Literal["float32", "float64"] = "float64",
     quiet: Quiet = False,
 ) -> None:
-    """Fly a trajectory with a vehicle and a controller, and write the flight.
+    """Simulate a vehicle and its controller on a trajectory, and write the flight.
 
     Parameters
     ----------
     trajectory
-        What is flown, from rest, with the publisher's wind-up of ten seconds.
+        Fly this trajectory from rest, with the publisher's wind-up of ten seconds.
     out
-        FILE.csv, or FILE.bag with the topics of a MAVROS lab.
+        Write FILE.csv, or FILE.bag with the topics of a MAVROS lab.
     radius
-        m.
+        Set the radius in m.
     omega
-        rad/s.
+        Set the angular rate of the trajectory in rad/s.
     speed_scale
-        The publisher's velocity scaler.
+        Set the publisher's velocity scaler.
     speed
-        m/s at which the reference peaks; instead of the velocity scaler.
+        Choose the velocity scaler so that the reference peaks at this speed in m/s.
     yaw_rate
-        rad/s, of the yaw spin.
+        Set the rate of the yaw spin in rad/s.
     duration
-        s.
+        Fly for this many s.
     rate
-        Hz of the written samples.
+        Write samples at this rate in Hz.
     sweep
-        NAME=LOW:HIGH:COUNT of a coefficient; several give every combination.
+        Vary a coefficient: NAME=LOW:HIGH:COUNT. Several of them give all combinations.
     precision
-        What to compute in: float32 is twice as fast for many vehicles, and 0.02 mm off.
+        Compute in this precision. float32 is twice as fast for many vehicles, and 0.02 mm off.
     """
     from tuner.cli.tables import print_flights
     from tuner.runtime import configure

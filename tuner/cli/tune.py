@@ -13,6 +13,7 @@ from tuner.cli.options import (
     Flights,
     JobChoice,
     Many,
+    Mass,
     Namespace,
     Quiet,
     Topics,
@@ -21,7 +22,7 @@ from tuner.cli.options import (
 
 Method = Annotated[
     Literal["auto", "gradient", "cma", "hybrid"] | None,
-    Parameter(help="How the minimum is looked for. Default: the job file's, else auto."),
+    Parameter(help="Search with this method. Default: the job file's, else auto."),
 ]
 
 
@@ -31,7 +32,7 @@ def tune(
     holdout: Annotated[list[str] | None, Many] = None,
     vehicle: VehicleChoice = None,
     controller: ControllerChoice = None,
-    mass: float | None = None,
+    mass: Mass = None,
     config: JobChoice = None,
     topics: Topics = None,
     namespace: Namespace = None,
@@ -45,28 +46,26 @@ def tune(
     seed: int | None = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fit, validate and report.
+    """Fit the coefficients, validate them on held-out flights, and write the report.
 
     Parameters
     ----------
     holdout
-        Flights that are evaluated, never fitted.
-    mass
-        The weighed take-off mass in kg, instead of the vehicle file's.
+        Evaluate these flights without fitting them.
     fit
-        Exactly these coefficients are free.
+        Fit exactly these coefficients.
     fix
-        The usual coefficients are free, without these.
+        Fit the usual coefficients except these.
     out
-        Result folder; default runs/ and the time.
+        Write into this result folder. Default: runs/ and the time.
     resume
-        Go on from the checkpoint in the result folder.
+        Continue the search that was interrupted in the result folder from its checkpoint.
     force
-        Search although the check before it failed.
+        Search even where the check before the search reports a failure.
     cross_validate
-        Also leave each fitted flight out in turn, and tabulate how the others predict it.
+        Also fit without each flight in turn, and tabulate how well the other flights predict it.
     seed
-        Of everything random.
+        Start the random numbers from this seed. Default: the job file's, else 0.
     """
     from tuner.cli.progress import listening, print_run
     from tuner.config import Options

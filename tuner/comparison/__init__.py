@@ -1,1 +1,1 @@
-"""How closely sets of coefficients meet recordings: nothing is fitted here."""
+"""Simulated compared with recorded for given coefficients: nothing is fitted here."""

@@ -1,4 +1,4 @@
-"""From what a user names to the table of several coefficient sets."""
+"""The command ``tune compare`` as a function: recordings and vehicles to the table of RMSE."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def compare(
     vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
     out: Sequence[Path] = (),
 ) -> tuple[Table, Settings]:
-    """Fly recordings with several vehicles, and tabulate how closely each meets them.
+    """Simulate recorded flights with several vehicles, and tabulate the RMSE of each.
 
     Parameters
     ----------
@@ -37,13 +37,13 @@ def compare(
     Raises
     ------
     InputError
-        Something named does not exist, cannot be read, or holds no reference.
+        Something named does not exist or cannot be used, or a file cannot be written.
     """
     for path in out:
         check_table_file(path)
     settings = settle(options, fits=False)
     if not vehicles:
-        raise InputError("--vehicle", "names no vehicle", "name those to compare")
+        raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
     sets = {label: _vehicle(named) for label, named in vehicles.items()}

@@ -1,4 +1,4 @@
-"""The RMSE of several coefficient sets: per flight, per lap, overall, the best one marked."""
+"""The RMSE of several coefficient sets: per flight, per lap and overall, the lowest marked."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tuner.result import AxesRmse
 
 UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 OVERALL = "all"
-#: A lap in which fewer poses were recorded than this is none.
+#: A lap in which fewer poses were recorded than this is left out.
 FEWEST_POSES = 10
 
 
@@ -43,9 +43,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of every stretch with every vehicle, and which vehicle meets the flights best.
+    """The rows of all stretches and vehicles, and which vehicle is closest to the recordings.
 
-    ``best`` is None where every vehicle crashed on some flight.
+    ``best`` is None where each vehicle crashed on some flight.
     """
 
     rows: tuple[Row, ...]
