@@ -34,14 +34,14 @@ from tuner.config import ControllerFile, VehicleFile
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.criterion import Criterion
-from tuner.objective.inlets import InletName
+from tuner.objective.inlets import INLETS, InletName
+from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import fly, simulated_at_stamps
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
     Segments,
-    noise_of,
     segments_of,
     window_segments,
 )
@@ -112,7 +112,7 @@ class _Group:
     ) -> None:
         self._recordings, self._controller = tuple(recordings), controller
         self._schedule = schedule_of(controller)
-        self._windowed = inlet != "reference"
+        self._windowed = not INLETS[inlet].closed_loop
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self._windowed:
             self._windows = [windows_of(flight, seconds) for flight in flights]

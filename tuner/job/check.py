@@ -11,7 +11,7 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
-from tuner.objective.inlets import NEEDS, sparse
+from tuner.objective.inlets import INLETS, sparse
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
 
@@ -73,15 +73,12 @@ def _is_number(value: object) -> bool:
 
 def _sparse_inputs(job: Job) -> Iterator[Finding]:
     """Warn of inputs that were recorded less often than the loop that computes them ran."""
-    rates = {
-        "body_rate": job.objective.schedule.position_control_rate,
-        "actuator": job.objective.schedule.rate_control_rate,
-    }
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
-        signal = NEEDS[inlet][0]
-        if inlet in rates and sparse([flight], signal, rates[inlet]):
+        signal, *_ = INLETS[inlet].needs
+        rate = INLETS[inlet].update_rate(job.objective.schedule)
+        if rate is not None and sparse([flight], signal, rate):
             recorded = 1.0 / float(np.median(np.diff(flight.series[signal].time)))
-            numbers = {"recorded": recorded, "needed": float(rates[inlet])}
+            numbers = {"recorded": recorded, "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
 
 

@@ -14,10 +14,11 @@ from tuner.config import Settings
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
-from tuner.objective.inlets import InletName
-from tuner.objective.noise import CHANNELS
+from tuner.objective.inlets import INLETS, InletName
+from tuner.objective.noise import CHANNELS, noise_of
 from tuner.objective.normal import Objective
-from tuner.objective.segments import Segments, begins_gently, noise_of, segments_of, window_segments
+from tuner.objective.segments import Segments, segments_of, window_segments
+from tuner.objective.start import begins_gently
 from tuner.recordings import Recording, read_recordings
 
 #: What a yaw spin is compared by: nothing holds its position, so that a gust or a tilt of a
@@ -128,7 +129,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     space = space_of(settings.vehicle, settings.controller, job)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(recording.flight, recording.time_offset or 0.0) for recording in to_fit]
-    closed = set(inlets) == {"reference"}
+    closed = all(INLETS[inlet].closed_loop for inlet in inlets)
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
 

@@ -17,6 +17,7 @@ from tuner.job.findings import end_findings, offset_findings, unmatched
 from tuner.job.prepare import Job
 from tuner.job.starts import starting_vectors
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
+from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
@@ -98,7 +99,7 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     if len(losses) > 2 and (losses < (1.0 + AGREE) * losses.min()).sum() < 2:
         return Finding(Code.STARTS_DISAGREE, "info", "search", {"starts": len(losses)})
     lost = unmatched(fitted.scales)
-    if set(job.inlets) == {"reference"} and len(lost) > len(job.fitted) / 2:
+    if all(INLETS[inlet].closed_loop for inlet in job.inlets) and len(lost) > len(job.fitted) / 2:
         numbers = {"far_off": len(lost), "flights": len(job.fitted)}
         return Finding(Code.FLIGHTS_FAR_OFF, "info", "search", numbers)
     return None
@@ -230,7 +231,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     """
     free = np.ones((len(OFFSETS), len(job.fitted)), bool)
     free[: len(CLOCKS), list(job.offset_is_fixed)] = False
-    fed = [inlet != "reference" for inlet in job.inlets]
+    fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
     return free
 

@@ -8,7 +8,7 @@ segment, and what is left of the normal equations speaks of the coefficients alo
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, RotorSpeedInlet
+from sim_jax.inlet import Inlet, MixedInlet
 from sim_jax.motor import reference_speed
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
@@ -25,6 +25,7 @@ from sim_jax.state import Start
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tuner.coefficients import of_scope
+from tuner.objective.inlets import recorded_inlet_of
 
 STATES: Mapping[str, tuple[int, float]] = {
     name: (row.count, row.prior_sd) for name, row in of_scope("window").items()
@@ -38,19 +39,10 @@ closed loop the integrator takes it; where commands are fed in, it is a part of 
 COUNT = sum(count for count, _ in STATES.values())
 
 
-def freedom_of(free: Mapping[str, bool]) -> NDArray[np.float64]:
-    """Return the standard deviations (L,) of a start; zero for what cannot matter.
-
-    Parameters
-    ----------
-    free
-        Name of `STATES` -> whether it acts on the segment; those not named do.
-    """
+def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
+    """Return the standard deviations (L,) of a start; zero where one is ignored."""
     return np.concatenate(
-        [
-            np.full(count, sd if free.get(name, True) else 0.0)
-            for name, (count, sd) in STATES.items()
-        ]
+        [np.full(count, 0.0 if name in ignored else sd) for name, (count, sd) in STATES.items()]
     )
 
 
@@ -83,28 +75,22 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
 
 
 def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inlet:
-    """Return an inlet whose rotors are told a steady difference about roll, pitch and yaw."""
+    """Return an inlet whose rotors differ steadily from what was recorded, about three axes."""
     if isinstance(inlet, MixedInlet):
         parts = (trimmed(part, vehicle, change) for part in inlet.parts)
         changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
         return changed
-    if not isinstance(inlet, ActuatorInlet | RotorSpeedInlet):
-        return inlet
     first = COUNT - STATES["trim"][0]
     arms = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
     width = sum(abs(y) for _, y in arms) / len(arms)
     length = sum(abs(x) for x, _ in arms) / len(arms)
-    extra = [
+    trim = [
         change[first] * (y / width)
         - change[first + 1] * (x / length)
         - change[first + 2] * rotor.spin
         for (x, y), rotor in zip(arms, vehicle.rotors, strict=True)
     ]
-    if isinstance(inlet, ActuatorInlet):
-        a, b, c, d = (one + more for one, more in zip(inlet.command, extra, strict=True))
-        return ActuatorInlet((a, b, c, d))
-    a, b, c, d = (one * (1.0 + more) for one, more in zip(inlet.speed, extra, strict=True))
-    return RotorSpeedInlet((a, b, c, d))
+    return recorded_inlet_of(inlet).trimmed(inlet, trim)
 
 
 def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Start:

@@ -1,10 +1,16 @@
-"""Which recorded signal is fed into the simulated loop, and as what."""
+"""Which recorded signal is fed into the simulated loop, and as what.
+
+Each inlet of the simulator (`sim_jax.inlet`) has one class here that says what a recording must
+hold to feed it, what the simulation then cannot be compared with, and how the recording is laid
+out. An inlet is added by one more class; `INLETS` lists them.
+"""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -31,57 +37,213 @@ InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""
 
-#: What must have been recorded for each, the upstream ones first.
-NEEDS: Mapping[InletName, tuple[str, ...]] = {
-    "reference": ("reference_position",),
-    "body_rate": ("rate_setpoint", "thrust_setpoint"),
-    "actuator": ("command",),
-    "rotor_speed": ("rotor_speed",),
+
+class RecordedInlet(ABC):
+    """How recordings feed an inlet of the simulator."""
+
+    name: ClassVar[InletName]
+    feeds: ClassVar[type[SingleInlet]]
+    """The simulator's inlet."""
+    needs: ClassVar[tuple[str, ...]]
+    """Signals that a recording must hold, the characteristic one first."""
+    silences: ClassVar[tuple[str, ...]] = ()
+    """Channels that are fed in or left out, so that the simulation says nothing about them."""
+    ignores: ClassVar[tuple[str, ...]]
+    """Parts of a segment's start (`tuner.objective.initial_conditions.STATES`) that do not act."""
+    closed_loop: ClassVar[bool] = False
+    """Whether the position controller is simulated: it keeps a whole flight to its path, and the
+    recording's clock is the reference's rather than the flight controller's."""
+    remedy: ClassVar[str] = "use inlet: auto"
+    """What to do where a signal is missing."""
+
+    def can_be_fed(self, flight: Flight) -> bool:
+        """Return whether a flight holds every column of what the inlet needs."""
+        return all(
+            flight.has(signal) and bool(np.isfinite(flight.signals[signal]).any(axis=0).all())
+            for signal in self.needs
+        )
+
+    def is_preferred(self, flight: Flight) -> bool:
+        """Return whether ``auto`` takes this inlet, if no inlet upstream of it is preferred."""
+        return self.can_be_fed(flight)
+
+    def update_rate(self, schedule: Schedule) -> float | None:
+        """Return the Hz at which the flight controller computes the signal; None if measured."""
+        del schedule
+        return None
+
+    @abstractmethod
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> SingleInlet:
+        """Lay what was recorded side by side; after its end the last value holds.
+
+        Set-points and commands hold until the loop that computes them runs again. Where they were
+        recorded less often than that, they are taken to move steadily from one sample to the next:
+        a zero-order hold would make them late.
+
+        Parameters
+        ----------
+        flights
+            F segments.
+        schedule
+            All but the reference enter at its ``physics_rate``.
+        """
+
+    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
+        """Return the simulator's inlet with a steady difference (F,) of each rotor."""
+        del trim
+        return inlet
+
+    def _resampled(
+        self, signal: str, flights: Sequence[Flight], schedule: Schedule
+    ) -> list[jax.Array]:
+        """Return a signal's columns, each (steps, F), at the physics rate."""
+        longest = max(flight.duration for flight in flights)
+        steps = padded_size(int(np.ceil(longest * schedule.physics_rate)) + 2)
+        clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
+        moves = rate is None or sparse(flights, signal, rate)
+        read = linear_interpolation if moves else zero_order_hold
+        table = np.stack([read(flight.series[signal], clock) for flight in flights], axis=-1)
+        return [jnp.asarray(table[:, column]) for column in range(table.shape[1])]
+
+
+class RecordedReference(RecordedInlet):
+    """The reference trajectory: the whole loop is simulated."""
+
+    name = "reference"
+    feeds = ReferenceInlet
+    needs = ("reference_position",)
+    ignores = ("trim",)
+    closed_loop = True
+    remedy = "name its trajectory in the job file"
+
+    def is_preferred(self, flight: Flight) -> bool:
+        """Return whether a reference with velocities is known.
+
+        Without velocities it is a list of set-points to some other controller, not the reference of
+        ours, so that it is only used where it is asked for.
+        """
+        return self.can_be_fed(flight) and flight.has("reference_velocity")
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ReferenceInlet:
+        """Lay the reference out tick by tick, its last point repeated."""
+        del schedule
+        length = padded_size(max(len(flight.time) for flight in flights))
+        columns = [_points(flight, length) for flight in flights]
+        position, velocity, acceleration = (
+            Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
+        )
+        spins = [flight.yaw_rate_setpoint for flight in flights]
+        return ReferenceInlet(
+            ReferencePoint(position, velocity, acceleration),
+            spins=jnp.asarray([spin is not None for spin in spins]),
+            yaw_rate=jnp.asarray([spin or 0.0 for spin in spins]),
+        )
+
+
+class RecordedBodyRate(RecordedInlet):
+    """Rate and thrust set-points, from the rate controller on."""
+
+    name = "body_rate"
+    feeds = BodyRateInlet
+    needs = ("rate_setpoint", "thrust_setpoint")
+    ignores = ("trim",)
+
+    def update_rate(self, schedule: Schedule) -> float:
+        """Return the rate of the position controller."""
+        return schedule.position_control_rate
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> BodyRateInlet:
+        """Lay both set-points out step by step."""
+        (thrust,) = self._resampled("thrust_setpoint", flights, schedule)
+        return BodyRateInlet(Vec3(*self._resampled("rate_setpoint", flights, schedule)), thrust)
+
+
+class RecordedCommand(RecordedInlet):
+    """Motor commands, from the motors on."""
+
+    name = "actuator"
+    feeds = ActuatorInlet
+    needs = ("command",)
+    silences = ("command",)
+    ignores = ("rate_integral",)
+
+    def update_rate(self, schedule: Schedule) -> float:
+        """Return the rate of the rate controller."""
+        return schedule.rate_control_rate
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
+        """Lay the commands out step by step."""
+        a, b, c, d = self._resampled("command", flights, schedule)
+        return ActuatorInlet((a, b, c, d))
+
+    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
+        """Add the trim to the commands."""
+        assert isinstance(inlet, ActuatorInlet)
+        a, b, c, d = (command + more for command, more in zip(inlet.command, trim, strict=True))
+        return ActuatorInlet((a, b, c, d))
+
+
+class RecordedRotorSpeed(RecordedInlet):
+    """Measured rotor speeds, into the aerodynamics."""
+
+    name = "rotor_speed"
+    feeds = RotorSpeedInlet
+    needs = ("rotor_speed",)
+    silences = ("command", "rotor_speed")
+    ignores = ("rotor_speed", "rate_integral")
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
+        """Lay the speeds out step by step."""
+        a, b, c, d = self._resampled("rotor_speed", flights, schedule)
+        return RotorSpeedInlet((a, b, c, d))
+
+    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
+        """Change the speeds by the trim's share."""
+        assert isinstance(inlet, RotorSpeedInlet)
+        a, b, c, d = (speed * (1.0 + more) for speed, more in zip(inlet.speed, trim, strict=True))
+        return RotorSpeedInlet((a, b, c, d))
+
+
+#: Every inlet, the upstream ones first.
+INLETS: Mapping[InletName, RecordedInlet] = {
+    inlet.name: inlet
+    for inlet in (
+        RecordedReference(),
+        RecordedBodyRate(),
+        RecordedCommand(),
+        RecordedRotorSpeed(),
+    )
 }
-#: What a simulation through each inlet says nothing about, since it was fed in or left out.
-SILENT: Mapping[InletName, tuple[str, ...]] = {
-    "reference": (),
-    "body_rate": (),
-    "actuator": ("command",),
-    "rotor_speed": ("command", "rotor_speed"),
-}
 
 
-def inlet_for(flight: Flight, said: str) -> InletName:
-    """Return the inlet of a flight: the one named, or the most upstream one that it can feed.
-
-    A reference without velocities is a list of set-points to some other controller, not the
-    reference of ours, so that it is only used where it is asked for.
+def inlet_for(flight: Flight, requested: str) -> InletName:
+    """Return the inlet of a flight: the one requested, or for ``auto`` the first preferred one.
 
     Raises
     ------
     RecordingError
         The recording does not hold what the inlet needs.
     """
-    for name, needs in NEEDS.items():
-        fits = all(_complete(flight, signal) for signal in needs)
-        if said == name and not fits:
-            raise RecordingError(
-                flight.path,
-                f"holds no {' and no '.join(needs)} for the {name} inlet",
-                "name its trajectory in the job file" if name == "reference" else "use inlet: auto",
-            )
-        told = name != "reference" or flight.has("reference_velocity")
-        if said == name or (said == "auto" and fits and told):
-            return name
-    raise RecordingError(
-        flight.path,
-        "holds neither a reference with velocities, nor rate set-points, nor four motor commands, "
-        "nor four rotor speeds",
-        "name its trajectory in the job file",
-    )
+    if requested == "auto":
+        for inlet in INLETS.values():
+            if inlet.is_preferred(flight):
+                return inlet.name
+        raise RecordingError(
+            flight.path,
+            "holds neither a reference with velocities, nor rate set-points, nor four motor "
+            "commands, nor four rotor speeds",
+            "name its trajectory in the job file",
+        )
+    (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)
+    if not inlet.can_be_fed(flight):
+        missing = " and no ".join(inlet.needs)
+        raise RecordingError(
+            flight.path, f"holds no {missing} for the {inlet.name} inlet", inlet.remedy
+        )
+    return inlet.name
 
 
-def _complete(flight: Flight, signal: str) -> bool:
-    return flight.has(signal) and bool(np.isfinite(flight.signals[signal]).any(axis=0).all())
-
-
-def inlets_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
+def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
     """Lay what was recorded side by side, each segment's for its own inlet.
 
     Parameters
@@ -89,22 +251,29 @@ def inlets_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: S
     names
         F inlets.
     flights, schedule
-        As of `inlet_of`.
+        As of `RecordedInlet.lay`.
     """
-    kinds = [name for name in NEEDS if name in names]
-    if len(kinds) == 1:
-        return inlet_of(kinds[0], flights, schedule)
+    used = [inlet for inlet in INLETS.values() if inlet.name in names]
+    if len(used) == 1:
+        return used[0].lay(flights, schedule)
     parts = []
-    for kind in kinds:
+    for inlet in used:
         feeding = [
-            flight if name == kind else _silent(flight, NEEDS[kind])
+            flight if name == inlet.name else _zeroed(flight, inlet.needs)
             for name, flight in zip(names, flights, strict=True)
         ]
-        parts.append(inlet_of(kind, feeding, schedule))
-    return MixedInlet(tuple(parts), jnp.asarray([kinds.index(name) for name in names]))
+        parts.append(inlet.lay(feeding, schedule))
+    order = [inlet.name for inlet in used]
+    return MixedInlet(tuple(parts), jnp.asarray([order.index(name) for name in names]))
 
 
-def _silent(flight: Flight, signals: Sequence[str]) -> Flight:
+def recorded_inlet_of(inlet: SingleInlet) -> RecordedInlet:
+    """Return what feeds an inlet of the simulator."""
+    (recorded,) = (r for r in INLETS.values() if isinstance(inlet, r.feeds))
+    return recorded
+
+
+def _zeroed(flight: Flight, signals: Sequence[str]) -> Flight:
     """Return a flight whose signals are zero throughout."""
     widths = {name: SIGNALS[name][0] for name in signals}
     ends = np.array([0.0, flight.duration])
@@ -117,51 +286,14 @@ def _silent(flight: Flight, signals: Sequence[str]) -> Flight:
     )
 
 
-def inlet_of(name: InletName, flights: Sequence[Flight], schedule: Schedule) -> SingleInlet:
-    """Lay what was recorded side by side; after its end the last value holds.
-
-    Set-points and commands hold until the loop that makes them runs again. Where they were recorded
-    less often than that, they are taken to move steadily from one sample to the next: holding them
-    would make them late.
-
-    Parameters
-    ----------
-    name
-        Which inlet.
-    flights
-        F segments.
-    schedule
-        All but the reference enter at its ``physics_rate``.
-    """
-    if name == "reference":
-        return _reference(flights)
-    physics_rate = schedule.physics_rate
-    longest = max(flight.duration for flight in flights)
-    clock = np.arange(padded_size(int(np.ceil(longest * physics_rate)) + 2)) / physics_rate
-
-    def laid(signal: str, update_rate: float | None) -> list[jax.Array]:
-        read = between if update_rate is None or sparse(flights, signal, update_rate) else held
-        table = np.stack([read(flight.series[signal], clock) for flight in flights], axis=-1)
-        return [jnp.asarray(table[:, column]) for column in range(table.shape[1])]
-
-    if name == "body_rate":
-        (thrust,) = laid("thrust_setpoint", schedule.position_control_rate)
-        return BodyRateInlet(Vec3(*laid("rate_setpoint", schedule.position_control_rate)), thrust)
-    if name == "actuator":
-        a, b, c, d = laid("command", schedule.rate_control_rate)
-        return ActuatorInlet((a, b, c, d))
-    a, b, c, d = laid("rotor_speed", None)
-    return RotorSpeedInlet((a, b, c, d))
-
-
 def sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
-    """Tell whether a signal was recorded less often than it was made, at a rate in Hz."""
+    """Return whether a signal was recorded less often than it was computed, at a rate in Hz."""
     gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in flights])
     return bool(np.median(gaps) * update_rate > MISSED)
 
 
-def held(series: Series, clock: Array) -> Array:
-    """Read a signal (n, k) that holds until its next sample, at (m,) times."""
+def zero_order_hold(series: Series, clock: Array) -> Array:
+    """Read a signal (n, k) that holds until its next sample, at (m,) times in s."""
     columns = []
     for column in series.values.T:
         known = np.isfinite(column)
@@ -170,8 +302,8 @@ def held(series: Series, clock: Array) -> Array:
     return np.column_stack(columns)
 
 
-def between(series: Series, clock: Array) -> Array:
-    """Read a signal (n, k) that moves linearly between its samples, at (m,) times."""
+def linear_interpolation(series: Series, clock: Array) -> Array:
+    """Read a signal (n, k) that moves linearly between its samples, at (m,) times in s."""
     columns = []
     for column in series.values.T:
         known = np.isfinite(column)
@@ -179,22 +311,8 @@ def between(series: Series, clock: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _reference(flights: Sequence[Flight]) -> ReferenceInlet:
-    length = padded_size(max(len(flight.time) for flight in flights))
-    columns = [_points(flight, length) for flight in flights]
-    position, velocity, acceleration = (
-        Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
-    )
-    spins = [flight.yaw_rate_setpoint for flight in flights]
-    return ReferenceInlet(
-        ReferencePoint(position, velocity, acceleration),
-        spins=jnp.asarray([spin is not None for spin in spins]),
-        yaw_rate=jnp.asarray([spin or 0.0 for spin in spins]),
-    )
-
-
 def _points(flight: Flight, length: int) -> list[Array]:
-    """Return position, velocity and acceleration, each (3, length), the last point held."""
+    """Return position, velocity and acceleration, each (3, length), the last point repeated."""
     parts = []
     for name in ("reference_position", "reference_velocity", "reference_acceleration"):
         values = flight.signals.get(name)

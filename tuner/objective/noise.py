@@ -1,4 +1,4 @@
-"""How noisy each recorded signal is, told from the recording itself."""
+"""How noisy each recorded signal is, estimated from the recording itself."""
 
 from __future__ import annotations
 
@@ -59,6 +59,12 @@ def _third_difference(
     weights = 1.0 / gaps.prod(axis=1)
     scaled = (weights * samples).sum(axis=0) / np.sqrt((weights**2).sum(axis=0))
     return np.asarray(scaled)
+
+
+def noise_of(flights: Sequence[Flight], channels: Sequence[str] = CHANNELS) -> dict[str, float]:
+    """Return the measurement noise of every channel that some flight recorded."""
+    recorded = [c for c in channels if any(flight.has(c) for flight in flights)]
+    return {channel: channel_noise(flights, channel) for channel in recorded}
 
 
 def channel_noise(flights: Sequence[Flight], channel: str) -> float:

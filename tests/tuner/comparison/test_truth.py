@@ -9,7 +9,7 @@ import yaml
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, read_vehicle, with_values
 from tuner.flights.load import load_flight
-from tuner.objective.segments import noise_of
+from tuner.objective.noise import noise_of
 from tuner.recordings import Recording
 from tuner.yaml_files.shipped import find_config
 

@@ -56,7 +56,7 @@ def test_a_start_moves_by_what_it_is_told(still):
 
 
 def test_what_cannot_matter_is_not_free():
-    free = freedom_of({"rotor_speed": False})
+    free = freedom_of(("rotor_speed",))
     assert np.count_nonzero(free) == COUNT - 4
 
 

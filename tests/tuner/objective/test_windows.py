@@ -9,7 +9,7 @@ from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.errors import RecordingError
 from tuner.flights.flight import Series
-from tuner.objective.inlets import between, held, inlet_for, inlet_of
+from tuner.objective.inlets import INLETS, inlet_for, linear_interpolation, zero_order_hold
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 
@@ -37,7 +37,7 @@ def test_a_stretch_without_poses_is_no_window(flight):
 
 
 def test_a_flight_without_poses_is_refused(flight):
-    series = {name: one for name, one in flight.series.items() if name != "position"}
+    series = {name: signal for name, signal in flight.series.items() if name != "position"}
     with pytest.raises(RecordingError, match="poses throughout"):
         windows_of(replace(flight, series=series), 1.0)
 
@@ -59,13 +59,13 @@ def test_auto_takes_the_most_upstream_inlet_that_can_be_fed(flight):
 def test_commands_recorded_in_full_are_held_and_sparse_ones_joined():
     series = Series(np.array([0.0, 0.1, 0.2]), np.array([[0.0], [1.0], [np.nan]]))
     clock = np.array([0.0, 0.05, 0.1, 0.3])
-    assert held(series, clock)[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
-    assert between(series, clock)[:, 0].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
+    assert zero_order_hold(series, clock)[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0]
+    assert linear_interpolation(series, clock)[:, 0].tolist() == pytest.approx([0.0, 0.5, 1.0, 1.0])
 
 
 def test_the_actuator_inlet_holds_what_was_recorded(flight):
     schedule = Schedule()
-    inlet = inlet_of("actuator", [flight], schedule)
+    inlet = INLETS["actuator"].lay([flight], schedule)
     assert isinstance(inlet, ActuatorInlet)
     series = flight.series["command"]
     at = 4.0
@@ -75,7 +75,7 @@ def test_the_actuator_inlet_holds_what_was_recorded(flight):
 
 
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
-def test_every_inlet_makes_lanes_whose_starts_are_free(flight, inlet):
+def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet):
     segments = window_segments(
         [flight],
         inlets=[inlet],

@@ -1,0 +1,40 @@
+"""Every inlet of the simulator has one class that feeds it, and every table names the same ones."""
+
+from typing import get_args
+
+import pytest
+
+from sim_jax.inlet import SingleInlet
+from tuner.config.job import InletName
+from tuner.errors import RecordingError
+from tuner.flights.informs import inlets
+from tuner.objective.initial_conditions import STATES
+from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.noise import CHANNELS
+
+
+def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
+    names = list(INLETS)
+    assert sorted(get_args(InletName)) == sorted(["auto", *names])
+    assert [inlet.name for inlet in inlets({}, trajectory=False)] == names
+
+
+def test_every_inlet_of_the_simulator_is_fed_by_one_class():
+    feeds = [inlet.feeds for inlet in INLETS.values()]
+    assert len(set(feeds)) == len(feeds)
+    assert set(feeds) == set(get_args(SingleInlet))
+
+
+@pytest.mark.parametrize("inlet", INLETS.values(), ids=lambda inlet: inlet.name)
+def test_what_an_inlet_silences_and_ignores_exists(inlet, flight):
+    assert set(inlet.silences) <= set(CHANNELS)
+    assert set(inlet.ignores) <= set(STATES)
+    assert inlet.can_be_fed(flight) == all(flight.has(signal) for signal in inlet.needs)
+
+
+def test_an_inlet_that_a_recording_cannot_feed_names_what_is_missing(flight):
+    without = type(flight)(**(vars(flight) | {"signals": {}}))
+    with pytest.raises(RecordingError, match="no rate_setpoint and no thrust_setpoint"):
+        inlet_for(without, "body_rate")
+    with pytest.raises(RecordingError, match="neither a reference"):
+        inlet_for(without, "auto")
