@@ -75,8 +75,10 @@ def rank_next_flights(
     point, weights = _candidate_point(full_problem.point, criterion, objective)
     jacobian = objective.jacobian(point, weights)
     kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
-    clocks = np.repeat(kinds[:, None], len(flights), axis=1)
-    information = information_from_jacobian(objective, point, weights, jacobian, clocks=clocks)
+    fitted_offsets = np.repeat(kinds[:, None], len(flights), axis=1)
+    information = information_from_jacobian(
+        objective, point, weights, jacobian, offsets_fitted=fitted_offsets
+    )
     flown = ~information.crashed & _inside(objective, jacobian.residuals, arena)
     gain = information.blocks.sum(axis=(0, 2))
     now = examination.information.data + examination.information.prior / WIDE**2

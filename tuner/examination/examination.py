@@ -1,4 +1,4 @@
-"""Everything that one Jacobian at the end of a fit can tell."""
+"""Everything that follows from one Jacobian at the end of a fit."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Examination:
-    """What the flights say about every coefficient, the fixed ones too.
+    """Uncertainty and sensitivity of every coefficient, the fixed ones too.
 
     Attributes
     ----------
     uncertainty
         Of the fitted ones.
     freed
-        Fixed coefficient -> what would be known, had it been fitted beside the others; it is the
-        last parameter there.
+        Fixed coefficient -> the uncertainty had it been fitted beside the others; it is the last
+        parameter there.
     bias
         (L, K): percent by which each fitted coefficient is wrong for each percent by which a fixed
         one is; the fixed ones in the order of ``freed``, the fitted in that of ``uncertainty``.
@@ -37,7 +37,7 @@ class Examination:
         Of the flights to all, the fitted first.
     residuals
         Of every flight and channel.
-    every, evidence
+    full_problem, information
         The problem in all coefficients, the fitted first, and the information about them.
     """
 
@@ -54,9 +54,9 @@ def examine(
     fitted: Fitted,
     *,
     names: Sequence[str] | None = None,
-    clocks: NDArray[np.bool_] | None = None,
+    offsets_fitted: NDArray[np.bool_] | None = None,
 ) -> Examination:
-    """Look at a fit, or at a point where nothing was fitted, from all sides.
+    """Examine a fit, or a point where nothing was fitted.
 
     Flights whose Jacobian would not fit the objective's memory take turns.
 
@@ -65,29 +65,31 @@ def examine(
     fitted
         A search's result.
     names
-        Of the fitted flights in the order of the objective; ``fitted.scales``' by default.
-    clocks
+        Of the fitted flights in the order of the objective; those of ``fitted.scales`` by default.
+    offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
     reference = references(objective.space, np.asarray(point.coefficients))
-    evidences, sensitivities = [], []
+    informations, sensitivities = [], []
     residuals: list[Residual] = []
     for flights in portions(objective, point, criterion):
-        some = portion(objective, point, criterion, flights)
-        jacobian = some[0].jacobian(*some[1:], columns=full_problem.columns)
-        own = [names[number] for number in flights]
-        free = None if clocks is None else clocks[:, flights]
-        evidences.append(information_from_jacobian(*some, jacobian, clocks=free))
-        sensitivities.append(local_sensitivity(*some, jacobian, reference=reference, flights=own))
-        residuals.extend(whiteness(some[0], jacobian, some[2], own))
-    information = FisherInformation.joined(evidences)
+        batch = portion(objective, point, criterion, flights)
+        jacobian = batch[0].jacobian(*batch[1:], columns=full_problem.columns)
+        flight_names = [names[number] for number in flights]
+        free = None if offsets_fitted is None else offsets_fitted[:, flights]
+        informations.append(information_from_jacobian(*batch, jacobian, offsets_fitted=free))
+        sensitivities.append(
+            local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
+        )
+        residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
+    information = FisherInformation.joined(informations)
     return Examination(
-        uncertainty=_judged(full_problem, information, full_problem.fitted, names),
+        uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
         freed={
-            name: _judged(full_problem, information, (*full_problem.fitted, name), names)
+            name: _uncertainty_of(full_problem, information, (*full_problem.fitted, name), names)
             for name in full_problem.fixed
         },
         bias=_bias(full_problem, information, reference),
@@ -98,25 +100,25 @@ def examine(
     )
 
 
-def _judged(
+def _uncertainty_of(
     full_problem: FullProblem,
     information: FisherInformation,
     names: tuple[str, ...],
     flights: Sequence[str],
 ) -> Uncertainty:
-    space, places = full_problem.only(names)
-    vector = np.asarray(full_problem.point.coefficients)[places]
-    return uncertainty_at(space, vector, part(information, places), flights)
+    space, indices = full_problem.subspace(names)
+    vector = np.asarray(full_problem.point.coefficients)[indices]
+    return uncertainty_at(space, vector, _restricted(information, indices), flights)
 
 
-def part(information: FisherInformation, places: NDArray[np.intp]) -> FisherInformation:
-    """Return what the data say about some coefficients while the others stay as they are."""
-    square = np.ix_(places, places)
+def _restricted(information: FisherInformation, indices: NDArray[np.intp]) -> FisherInformation:
+    """Return the information about some coefficients while the others are fixed."""
+    square = np.ix_(indices, indices)
     return replace(
         information,
-        blocks=information.blocks[..., places, :][..., places],
-        score=information.score[..., places],
-        clock_prior=information.clock_prior[square],
+        blocks=information.blocks[..., indices, :][..., indices],
+        score=information.score[..., indices],
+        nuisance_prior=information.nuisance_prior[square],
         prior=information.prior[square],
     )
 

@@ -1,8 +1,8 @@
-"""An examination as the plain data that is written, tabulated and plotted."""
+"""An examination as the data that are written, tabulated and plotted."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,48 +26,48 @@ Array = NDArray[np.float64]
 
 
 def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowledge:
-    """Return what an examination of a fit found.
+    """Return the content of ``sensitivity.json`` for an examination of a fit.
 
     Parameters
     ----------
     examination
-        What was found.
+        Of the fit.
     space, point
-        The fit's own coefficients and where it ended.
+        The fitted coefficients and where the fit ended.
     """
-    found = examination.uncertainty
-    worth = _worth(space, point)
-    count = len(found.names)
+    uncertainty = examination.uncertainty
+    units = _units(space, point)
+    count = len(uncertainty.names)
     information = examination.information.data[:count, :count]
     return Knowledge(
         coefficients=_coefficients(examination, space),
-        flights=list(found.flights),
-        channels=list(found.channels),
+        flights=list(uncertainty.flights),
+        channels=list(uncertainty.channels),
         outputs=_outputs(examination),
-        acting=_acting(examination),
+        acting=_effects_over_time(examination),
         residuals=[
             ResidualWhiteness(
-                flight=one.flight,
-                channel=one.channel,
-                rms=one.rms,
-                spacing=float(one.lag[1]),
-                autocorrelation=one.autocorrelation.round(4).tolist(),
-                limit=one.limit,
-                memory=one.memory,
-                white=one.white,
+                flight=residual.flight,
+                channel=residual.channel,
+                rms=residual.rms,
+                spacing=float(residual.lag[1]),
+                autocorrelation=residual.autocorrelation.round(4).tolist(),
+                limit=residual.limit,
+                memory=residual.memory,
+                white=residual.white,
             )
-            for one in examination.residuals
+            for residual in examination.residuals
         ],
-        directions=list(found.directions),
-        names=list(found.names),
-        correlation=found.correlation.tolist(),
-        covariance=(found.covariance.matrix * np.outer(worth, worth)).tolist(),
-        information=(information / np.outer(worth, worth)).tolist(),
+        directions=list(uncertainty.directions),
+        names=list(uncertainty.names),
+        correlation=uncertainty.correlation.tolist(),
+        covariance=(uncertainty.covariance.matrix * np.outer(units, units)).tolist(),
+        information=(information / np.outer(units, units)).tolist(),
     )
 
 
-def _worth(space: Space, point: Point) -> Array:
-    """Return (K,) units of each parameter in one of its scaled coordinate."""
+def _units(space: Space, point: Point) -> Array:
+    """Return (K,) the change of each parameter, in its unit, for one of its scaled coordinate."""
     scaled = np.asarray(space.scaled(jnp.asarray(point.coefficients)))
     return np.array(
         [
@@ -78,31 +78,31 @@ def _worth(space: Space, point: Point) -> Array:
 
 
 def _coefficients(examination: Examination, space: Space) -> dict[str, CoefficientKnowledge]:
-    found = examination.uncertainty
+    uncertainty = examination.uncertainty
     steps = dict(zip(examination.sensitivity.names, examination.sensitivity.step, strict=True))
     known = {}
     for index, parameter in enumerate(space.parameters):
         for name, ratio in parameter.ratios.items():
             step = float(steps[parameter.name] * abs(ratio))
-            known[name] = _known(name, found, index, step, fitted=True, bias={})
+            known[name] = _coefficient(name, uncertainty, index, step, fitted=True, bias={})
     for row, (name, freed) in enumerate(examination.freed.items()):
-        bias = dict(zip(found.names, examination.bias[row].tolist(), strict=True))
-        known[name] = _known(
+        bias = dict(zip(uncertainty.names, examination.bias[row].tolist(), strict=True))
+        known[name] = _coefficient(
             name, freed, len(freed.names) - 1, float(steps[name]), fitted=False, bias=bias
         )
     return known
 
 
-def _known(
+def _coefficient(
     name: str,
-    found: Uncertainty,
+    uncertainty: Uncertainty,
     index: int,
     step: float,
     *,
     fitted: bool,
     bias: Mapping[str, float],
 ) -> CoefficientKnowledge:
-    estimate = found.estimates[name]
+    estimate = uncertainty.estimates[name]
     error, low, high = numbers(np.array([estimate.std_error, *estimate.ci95]))
     return CoefficientKnowledge(
         unit=COEFFICIENTS[name].unit,
@@ -114,10 +114,10 @@ def _known(
         reason=estimate.reason,
         step=step,
         shares={
-            channel: dict(zip(found.flights, row[:, index].tolist(), strict=True))
-            for channel, row in zip(found.channels, found.shares, strict=True)
+            channel: dict(zip(uncertainty.flights, row[:, index].tolist(), strict=True))
+            for channel, row in zip(uncertainty.channels, uncertainty.shares, strict=True)
         },
-        prior_share=float(found.prior_share[index]),
+        prior_share=float(uncertainty.prior_share[index]),
         bias=dict(bias),
     )
 
@@ -140,7 +140,7 @@ def _outputs(examination: Examination) -> list[OutputSensitivity]:
     ]
 
 
-def _acting(examination: Examination) -> list[EffectOverTime]:
+def _effects_over_time(examination: Examination) -> list[EffectOverTime]:
     sensitivity = examination.sensitivity
     return [
         EffectOverTime(
@@ -148,11 +148,11 @@ def _acting(examination: Examination) -> list[EffectOverTime]:
             windowed=sensitivity.windowed,
             time=sensitivity.time[row].round(3).tolist(),
             change={
-                name: sensitivity.acts[index, row].tolist()
+                name: sensitivity.effect[index, row].tolist()
                 for index, name in enumerate(sensitivity.names)
             },
             span={
-                name: shortest_half(sensitivity.time[row], sensitivity.acts[index, row])
+                name: shortest_half(sensitivity.time[row], sensitivity.effect[index, row])
                 for index, name in enumerate(sensitivity.names)
             },
         )
@@ -160,14 +160,13 @@ def _acting(examination: Examination) -> list[EffectOverTime]:
     ]
 
 
-def shortest_half(time: Sequence[float] | Array, acts: Array) -> tuple[float, float]:
+def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
     """Return the shortest stretch, from and to in s, with half of the squared effect."""
-    middles = np.asarray(time)
-    width = float(middles[1] - middles[0])
-    cumulative = np.concatenate([[0.0], np.cumsum(np.square(acts))])
+    width = float(time[1] - time[0])
+    cumulative = np.concatenate([[0.0], np.cumsum(np.square(effect))])
     if cumulative[-1] <= 0.0:
-        return 0.0, float(middles[-1] + width / 2)
+        return 0.0, float(time[-1] + width / 2)
     ends = np.searchsorted(cumulative, cumulative[:-1] + cumulative[-1] / 2)
-    lengths = np.where(ends < len(cumulative), ends - np.arange(len(acts)), len(cumulative))
+    lengths = np.where(ends < len(cumulative), ends - np.arange(len(effect)), len(cumulative))
     first = int(np.argmin(lengths))
     return round(first * width, 3), round(int(ends[first]) * width, 3)

@@ -1,4 +1,4 @@
-"""What was found about every coefficient, as ``sensitivity.json`` holds it."""
+"""The content of ``sensitivity.json``: uncertainty and sensitivity of every coefficient."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ SCHEMA_VERSION = 2
 KNOWLEDGE_FILE = "sensitivity.json"
 
 Number = float | None
-"""None stands for what cannot be told: a simulation that crashed, an interval without end."""
+"""None stands for a simulation that crashed, or an interval without end."""
 
 
 class CoefficientKnowledge(Part):
-    """One coefficient.
+    """Uncertainty of one coefficient, and where the information about it comes from.
 
     Attributes
     ----------
     unit
-        Of everything said about it.
+        Of the value and all that is derived from it.
     fitted
-        Whether it was fitted; of a fixed one is said what would be known, were it fitted too.
+        Whether it was fitted; for a fixed one, all is given as if it had been fitted, too.
     value, std_error, ci95
         See `tuner.uncertainty.estimates.Estimate`.
     verdict, reason
         How well it is known, and why.
     step
-        One hundred percent: its value, or its usual uncertainty where that is larger.
+        Change that counts as one hundred percent, see `tuner.sensitivity.local`.
     shares
-        Channel -> flight -> share of what is known of it that came from there.
+        Channel -> flight -> share in the information about it.
     prior_share
-        The rest: from the priors.
+        The priors' share, which is the rest.
     bias
         Of a fixed one: fitted coefficient -> percent by which that is wrong for each percent by
         which this one is.
@@ -57,7 +57,7 @@ class CoefficientKnowledge(Part):
 
 
 class OutputSensitivity(Part):
-    """What the coefficients do to one recorded signal: an axis of a channel of a flight.
+    """Effects of the coefficients on one recorded signal: an axis of a channel of a flight.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class OutputSensitivity(Part):
 
 
 class EffectOverTime(Part):
-    """When coefficients act during one flight.
+    """Effects of the coefficients over the time of one flight.
 
     Attributes
     ----------
@@ -95,7 +95,8 @@ class EffectOverTime(Part):
     change
         Coefficient -> RMS change of all channels for +1 % in each stretch, in standard deviations.
     span
-        Coefficient -> s from and to which half of its effect is felt; the shortest such stretch.
+        Coefficient -> s from and to which half of its squared effect falls; the shortest such
+        stretch.
     """
 
     flight: str
@@ -124,7 +125,7 @@ class Knowledge(Part):
     Attributes
     ----------
     coefficients
-        Name -> what is known; the fitted ones first.
+        Name -> what is known of it; the fitted ones first.
     flights, channels
         Names.
     outputs, acting, residuals
@@ -136,8 +137,8 @@ class Knowledge(Part):
     correlation
         Of their estimates.
     covariance, information
-        Of their estimates, flights and priors together, and what the flights alone say; in the
-        coefficients' units.
+        Covariance of their estimates, flights and priors together, and Fisher information of the
+        flights alone; in the coefficients' units.
     """
 
     schema_version: int = SCHEMA_VERSION

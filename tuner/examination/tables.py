@@ -1,4 +1,4 @@
-"""What is known of the coefficients as tables for other programs: long CSV and matrices."""
+"""An examination as tables for other programs: long CSV files and matrices."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
     for name in MATRICES:
         rows = zip(knowledge.names, getattr(knowledge, name), strict=True)
         header = ("coefficient", *knowledge.names)
-        texts[f"{name}.csv"] = csv_text(header, ([one, *row] for one, row in rows))
+        texts[f"{name}.csv"] = csv_text(header, ([coefficient, *row] for coefficient, row in rows))
     for name, text in texts.items():
         write_text(folder / name, text)
     return tuple(folder / name for name in texts)
 
 
 def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
-    spans = {one.flight: one.span for one in knowledge.acting}
+    spans = {flight.flight: flight.span for flight in knowledge.acting}
     for name, known in knowledge.coefficients.items():
         for output in knowledge.outputs:
             if name not in output.change:
-                continue  # tied to another, which speaks for both
+                continue  # tied to another, whose rows hold for both
             yield [
                 name,
                 int(known.fitted),

@@ -1,8 +1,8 @@
-"""What the flights cannot tell is held where the user had it, and the rest fitted around it.
+"""Coefficients that the flights do not identify are held at initial values, the rest refitted.
 
-Coefficients that trade off exactly keep their product right however far they wander. Setting each
-back to its start would break what the fit found; so one of every such group is set back, and the
-others follow.
+Coefficients that trade off exactly keep their product however far they drift. Setting each back to
+its initial value would worsen the fit; so one of every such group, the stand-in, is held, and the
+others are fitted given its value.
 """
 
 from __future__ import annotations
@@ -25,44 +25,50 @@ from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.wording.phrases import listed
 
-MOST_ROUNDS = 3
-"""What is held may leave something else undetermined; this often, at most."""
+MAX_ROUNDS = 3
+"""Largest number of rounds: what is held may leave something else undetermined."""
 
 
 def with_undetermined_held(
     job: Job,
     fitted: Fitted,
-    tell: Callable[[Job, Progress], None],
-    message: Callable[[str], None],
+    on_progress: Callable[[Job, Progress], None],
+    on_message: Callable[[str], None],
 ) -> tuple[Fitted, Examination]:
-    """Return the fit once all that it leaves open is held, and what its end says."""
+    """Return the fit once all that it does not identify is held, and its examination."""
     examination = examine(fitted)
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         held = held_by(examination.uncertainty) | dict(fitted.held)
         names = sorted(set(held.values()))
         if set(names) <= set(fitted.held.values()):
             break
-        message(f"the flights do not tell {', '.join(names)}: kept as given")
-        fitted = hold(job, fitted, held, tell)
+        on_message(
+            f"the flights do not identify {listed(names)}: held at the initial value, "
+            "and the others are fitted again"
+        )
+        fitted = hold(job, fitted, held, on_progress)
         examination = examine(fitted)
     return fitted, examination
 
 
 def held_by(uncertainty: Uncertainty) -> dict[str, str]:
-    """Return each coefficient that the flights do not tell -> the one held in its place.
+    """Return each coefficient that the flights do not identify -> the one held in its place.
 
     A coefficient is held itself unless it trades off against one that is.
     """
-    open_ones = [name for name in uncertainty.names if not uncertainty.estimates[name].identifiable]
+    undetermined = [
+        name for name in uncertainty.names if not uncertainty.estimates[name].identifiable
+    ]
     held: dict[str, str] = {}
     for direction in uncertainty.directions:
-        members = [name for name in direction.moves if name in open_ones and name not in held]
+        members = [name for name in direction.moves if name in undetermined and name not in held]
         if not direction.null or len(members) < 2:
             continue
         ranked = sorted(members, key=lambda name: _rank(name, direction.moves))
         held |= dict.fromkeys(members, ranked[0])
-    return held | {name: name for name in open_ones if name not in held}
+    return held | {name: name for name in undetermined if name not in held}
 
 
 def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
@@ -74,7 +80,7 @@ def hold(
     job: Job,
     fitted: Fitted,
     held: Mapping[str, str],
-    tell: Callable[[Job, Progress], None],
+    on_progress: Callable[[Job, Progress], None],
 ) -> Fitted:
     """Return the fit with the held coefficients at their initial values and the others polished.
 
@@ -83,23 +89,23 @@ def hold(
     job, fitted
         The problem and where its search ended.
     held
-        As of `held_by`; what stands on the left but not on the right stays free.
-    tell
+        Coefficient -> stand-in, as of `held_by`; the stand-ins are held, the others stay free.
+    on_progress
         Called after every iteration.
     """
     names, space = set(held.values()), job.space
-    keeps = np.array([name in names for name in space.names])
-    if not keeps.any():
+    is_held = np.array([name in names for name in space.names])
+    if not is_held.any():
         return fitted
     clock = time.perf_counter()
-    vector = np.where(keeps, space.initial, np.asarray(fitted.point.coefficients))
-    free = Free(~keeps, free_offsets(job))
+    vector = np.where(is_held, space.initial, np.asarray(fitted.point.coefficients))
+    free = Free(~is_held, free_offsets(job))
     point = Point(jnp.asarray(vector), fitted.point.offsets)
     end = polished(
         job,
         replace(fitted, point=point),
         free=free,
         title=f"with {len(names)} held",
-        on_progress=lambda now: tell(job, now),
+        on_progress=lambda progress: on_progress(job, progress),
     )
     return replace(end, held=dict(held), wall_time=fitted.wall_time + time.perf_counter() - clock)

@@ -1,1 +1,1 @@
-"""What each coefficient does to each signal: locally by Jacobians, globally by Morris and Sobol."""
+"""Effect of each coefficient on each signal: local by Jacobians, global by Morris or Sobol."""

@@ -1,4 +1,4 @@
-"""Which coefficients matter anywhere between their bounds, not just around one point.
+"""Global sensitivity: which coefficients matter anywhere between their bounds.
 
 Morris' elementary effects (Morris, "Factorial sampling plans for preliminary computational
 experiments", 1991) or Sobol's indices (Sobol, "Global sensitivity indices for nonlinear
@@ -24,11 +24,11 @@ from tuner.sensitivity.global_sensitivity_json import GlobalSensitivity, Method,
 Array = NDArray[np.float64]
 
 LEVELS = 4
-"""Of Morris' grid."""
+"""Number of levels of Morris' grid."""
 FLOOR = 1e-3
-"""RMSE below this many standard deviations counts as this: nothing is met better than noise."""
+"""Lower limit of an RMSE in standard deviations, below which its logarithm means nothing."""
 SAMPLES = {"morris": 16, "sobol": 64}
-"""Trajectories, or base points; a coefficient more costs so many simulations more."""
+"""Default number of trajectories, or base points; each coefficient adds so many simulations."""
 
 
 def global_sensitivity(
@@ -42,7 +42,7 @@ def global_sensitivity(
     samples: int | None = None,
     seed: int = 0,
 ) -> GlobalSensitivity:
-    """Return each coefficient's index for every channel of every flight and over all.
+    """Return each coefficient's index for every channel of every flight, and for their mean.
 
     Parameters
     ----------
@@ -66,24 +66,24 @@ def global_sensitivity(
         "bounds": [[p.scaled(end) for end in bounds[p.name]] for p in space.parameters],
     }
     count = samples or SAMPLES[method]
-    places = _places(problem, method, count, seed)
-    vectors = np.stack([_vector(space, row) for row in places])
+    points = _samples(problem, method, count, seed)
+    vectors = np.stack([_vector(space, row) for row in points])
     batch = evaluate(objective, vectors, point, criterion)
     crashed = np.isfinite(np.asarray(batch.crash_time))
     outputs, values = _outputs(objective, batch.squares, crashed, flights)
-    found = []
+    indices = []
     for (flight, channel), column in zip(outputs, values.T, strict=True):
-        found += _indices(problem, method, places, column, seed, flight=flight, channel=channel)
+        indices += _indices(problem, method, points, column, seed, flight=flight, channel=channel)
     return GlobalSensitivity(
         method=method,
         bounds={name: bounds[name] for name in space.names},
-        simulations=len(places),
+        simulations=len(points),
         crashed=int(crashed.any(axis=1).sum()),
-        indices=found,
+        indices=indices,
     )
 
 
-def _places(problem: dict[str, Any], method: Method, count: int, seed: int) -> Array:
+def _samples(problem: dict[str, Any], method: Method, count: int, seed: int) -> Array:
     """Return the sampled scaled coordinates (S, K)."""
     if method == "morris":
         from SALib.sample import morris  # noqa: PLC0415 (pandas and scipy)
@@ -114,7 +114,7 @@ def _outputs(
     names, columns = [], []
     for number, name in enumerate(flights):
         segments = np.flatnonzero(flight == number)
-        fell = crashed[:, segments].any(axis=1)
+        crashed_here = crashed[:, segments].any(axis=1)
         for channel, measured in objective.segments.measured.items():
             count = int((np.asarray(measured.weight)[..., segments] > 0).sum())
             if count == 0:
@@ -122,9 +122,9 @@ def _outputs(
             total = np.asarray(squares[channel])[..., segments].sum(axis=(1, 2))
             rms = np.sqrt(total / count)
             usable = np.isfinite(rms)
-            worst = float(rms[usable & ~fell].max(initial=FLOOR))
+            worst = float(rms[usable & ~crashed_here].max(initial=FLOOR))
             rms = np.where(usable, rms, worst)
-            rms = np.where(fell, np.maximum(rms, worst), rms)
+            rms = np.where(crashed_here, np.maximum(rms, worst), rms)
             names.append((name, channel))
             columns.append(np.log10(np.maximum(rms, FLOOR)))
     table = np.stack(columns, axis=-1)
@@ -134,7 +134,7 @@ def _outputs(
 def _indices(
     problem: dict[str, Any],
     method: Method,
-    places: Array,
+    points: Array,
     values: Array,
     seed: int,
     *,
@@ -142,21 +142,20 @@ def _indices(
     channel: str,
 ) -> list[SensitivityIndex]:
     if np.ptp(values) == 0.0:
-        nothing = np.zeros(len(problem["names"]))
-        main, total, spread = nothing, nothing, nothing
+        main = total = spread = np.zeros(len(problem["names"]))
     elif method == "morris":
         from SALib.analyze import morris  # noqa: PLC0415
 
-        found = morris.analyze(problem, places, values, num_levels=LEVELS, seed=seed)
-        main, total, spread = found["mu"], found["mu_star"], found["sigma"]
+        analysis = morris.analyze(problem, points, values, num_levels=LEVELS, seed=seed)
+        main, total, spread = analysis["mu"], analysis["mu_star"], analysis["sigma"]
     else:
         from SALib.analyze import sobol  # noqa: PLC0415
 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # an output that hardly varies
             # SALib takes a seed of 0 for none
-            found = sobol.analyze(problem, values, calc_second_order=False, seed=seed + 1)
-        main, total, spread = found["S1"], found["ST"], found["ST_conf"]
+            analysis = sobol.analyze(problem, values, calc_second_order=False, seed=seed + 1)
+        main, total, spread = analysis["S1"], analysis["ST"], analysis["ST_conf"]
     return [
         SensitivityIndex(
             coefficient=name,

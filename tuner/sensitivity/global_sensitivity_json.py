@@ -1,4 +1,4 @@
-"""Indices of global sensitivity, as ``global_sensitivity.json`` holds them."""
+"""The content of ``global_sensitivity.json``: indices of global sensitivity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MEANING = {
 
 
 class SensitivityIndex(Part):
-    """What one coefficient does to the logarithm of one RMSE; see `MEANING`.
+    """Effect of one coefficient on the logarithm of one RMSE; see `MEANING`.
 
     ``flight`` and ``channel`` are empty for the mean over all of them.
     """
@@ -39,11 +39,11 @@ class GlobalSensitivity(Part):
     Attributes
     ----------
     method
-        Whose indices.
+        Of Morris or of Sobol.
     bounds
         Coefficient -> between which values it was varied.
     simulations, crashed
-        How many vehicles were flown, and how many of them crashed on some flight.
+        How many vehicles were simulated, and how many of them crashed on some flight.
     indices
         Coefficient by coefficient, output by output.
     """
@@ -56,20 +56,20 @@ class GlobalSensitivity(Part):
     indices: list[SensitivityIndex]
 
 
-def write_global(found: GlobalSensitivity, folder: Path) -> None:
+def write_global(indices: GlobalSensitivity, folder: Path) -> None:
     """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
-    write_text(folder / GLOBAL_FILE, found.model_dump_json(indent=1) + "\n")
-    header = ("coefficient", "flight", "channel", *(text for text in MEANING[found.method]))
+    write_text(folder / GLOBAL_FILE, indices.model_dump_json(indent=1) + "\n")
+    header = ("coefficient", "flight", "channel", *MEANING[indices.method])
     rows = [
         [
-            one.coefficient,
-            one.flight or "all",
-            one.channel or "all",
-            one.main,
-            one.total,
-            one.spread,
+            index.coefficient,
+            index.flight or "all",
+            index.channel or "all",
+            index.main,
+            index.total,
+            index.spread,
         ]
-        for one in found.indices
+        for index in indices.indices
     ]
     write_text(folder / GLOBAL_TABLE, csv_text(header, rows))
 

@@ -1,4 +1,4 @@
-"""What each coefficient does: by how much, to which signal of which flight, and when."""
+"""Local sensitivity: how much each coefficient changes which signal of which flight, and when."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tuner.objective.normal import Objective
 
 Array = NDArray[np.float64]
 
-SMALL = 0.01
-"""Change whose effect is told from the derivative."""
-LARGE = 0.1
-"""Change whose effect is simulated."""
+SMALL_STEP = 0.01
+"""Relative change whose effect is computed from the derivative."""
+LARGE_STEP = 0.1
+"""Relative change whose effect is simulated."""
 BINS = 40
-"""Stretches into which a flight is cut to tell when a coefficient acts."""
+"""Number of stretches of time that a flight is cut into."""
 
 #: Channel -> its axes, its unit, and that unit's size in the unit of the residuals.
 AXES = {
@@ -41,7 +41,7 @@ class Output:
     flight, channel, axis
         Names. Attitude's axes are small rotations about the body's.
     unit
-        Of everything said about it.
+        Of its values and changes.
     rmse
         Simulated minus recorded.
     """
@@ -55,7 +55,7 @@ class Output:
 
 @dataclass(frozen=True)
 class LocalSensitivity:
-    """What K coefficients do to R outputs of F flights.
+    """Effects of K coefficients on R outputs of F flights.
 
     Attributes
     ----------
@@ -64,8 +64,8 @@ class LocalSensitivity:
     outputs
         R outputs.
     step
-        (K,) one hundred percent: of the value, or, on a linear scale, of the larger of the value
-        and the coefficient's usual uncertainty; in the coefficient's unit.
+        (K,) change that counts as one hundred percent, in the coefficient's unit: the value, or,
+        on a linear scale, the larger of the value and the standard deviation of its prior.
     change
         (K, R) RMS change of an output for +1 %, in its unit.
     rmse_up, rmse_down
@@ -77,9 +77,9 @@ class LocalSensitivity:
     windowed
         Whether flights were cut into windows, so that ``time`` counts from a window's start.
     time
-        (F, B) s, middles of the stretches.
-    acts
-        (K, F, B) RMS change of all channels for +1 % during a stretch, in standard deviations.
+        (F, B) s, middles of the stretches of time.
+    effect
+        (K, F, B) RMS change of all channels for +1 % in each stretch, in standard deviations.
     """
 
     names: tuple[str, ...]
@@ -92,28 +92,28 @@ class LocalSensitivity:
     flights: tuple[str, ...]
     windowed: bool
     time: Array
-    acts: Array
+    effect: Array
 
     @staticmethod
     def joined(parts: Sequence[LocalSensitivity]) -> LocalSensitivity:
-        """Return the sensitivity of flights of which each part holds the next ones."""
+        """Return the sensitivity of all flights from that of consecutive groups of them."""
         first = parts[0]
 
-        def beside(name: str, axis: int = -1) -> Array:
+        def concatenated(name: str, axis: int = -1) -> Array:
             return np.concatenate([getattr(part, name) for part in parts], axis=axis)
 
         return LocalSensitivity(
             names=first.names,
             outputs=tuple(output for part in parts for output in part.outputs),
             step=first.step,
-            change=beside("change"),
-            rmse_up=beside("rmse_up"),
-            rmse_down=beside("rmse_down"),
+            change=concatenated("change"),
+            rmse_up=concatenated("rmse_up"),
+            rmse_down=concatenated("rmse_down"),
             crashed=np.sum([part.crashed for part in parts], axis=0),
             flights=tuple(name for part in parts for name in part.flights),
             windowed=any(part.windowed for part in parts),
-            time=beside("time", 0),
-            acts=beside("acts", 1),
+            time=concatenated("time", 0),
+            effect=concatenated("effect", 1),
         )
 
 
@@ -126,14 +126,14 @@ def local_sensitivity(
     reference: Array,
     flights: Sequence[str],
 ) -> LocalSensitivity:
-    """Return what each coefficient does around a point.
+    """Return the effect of each coefficient around a point.
 
     Parameters
     ----------
     objective, point, criterion
-        The problem, and where it stands.
+        The problem, and where it is examined.
     jacobian
-        There.
+        At that point.
     reference
         (K,) change of the scaled coordinate that counts as one hundred percent.
     flights
@@ -142,27 +142,27 @@ def local_sensitivity(
     space = objective.space
     vector = np.asarray(point.coefficients)
     slope = space.slope(vector)
-    sigmas = _Sigmas(objective, flights)
-    moved = SMALL * reference / slope
+    outputs = _Outputs(objective, flights)
+    moved = SMALL_STEP * reference / slope
     change = []
-    for channel, flight, axis in sigmas.outputs:
-        segments = sigmas.segments(flight)
+    for channel, flight, axis in outputs.places:
+        segments = outputs.segments(flight)
         columns = np.asarray(jacobian.columns[channel])[: len(space)][:, :, axis][..., segments]
-        mean = (columns**2).sum(axis=(1, 2)) / sigmas.count(channel, axis, segments)
-        change.append(np.sqrt(mean) * moved * sigmas.unit(channel, axis, segments))
+        mean = (columns**2).sum(axis=(1, 2)) / outputs.count(channel, axis, segments)
+        change.append(np.sqrt(mean) * moved * outputs.unit(channel, axis, segments))
     vectors, values = _steps(objective, vector, reference)
     batch = evaluate(objective, np.concatenate([vector[None], *vectors]), point, criterion)
-    rmse = sigmas.rmse({name: np.asarray(s) for name, s in batch.squares.items()})
+    rmse = outputs.rmse({name: np.asarray(s) for name, s in batch.squares.items()})
     crashes = np.isfinite(np.asarray(batch.crash_time))
     failed = np.array(
         [
-            [crashes[s, sigmas.segments(f)].any() for _, f, _ in sigmas.outputs]
+            [crashes[s, outputs.segments(f)].any() for _, f, _ in outputs.places]
             for s in range(len(rmse))
         ]
     )
     rmse = np.where(failed, np.nan, rmse)
     count = len(space)
-    time, acts = _when(objective, jacobian, criterion, moved, sigmas)
+    time, effect = _over_time(objective, jacobian, criterion, moved, outputs)
     return LocalSensitivity(
         names=space.names,
         outputs=tuple(
@@ -173,7 +173,7 @@ def local_sensitivity(
                 AXES[channel][1],
                 float(rmse[0, row]),
             )
-            for row, (channel, flight, axis) in enumerate(sigmas.outputs)
+            for row, (channel, flight, axis) in enumerate(outputs.places)
         ),
         step=values,
         change=np.stack(change, axis=-1),
@@ -183,40 +183,40 @@ def local_sensitivity(
         flights=tuple(flights),
         windowed=objective.segments.count > len(flights),
         time=time,
-        acts=acts,
+        effect=effect,
     )
 
 
 def _steps(
     objective: Objective, vector: Array, reference: Array
 ) -> tuple[tuple[Array, Array], Array]:
-    """Return the vectors (K, K) for +10 % and −10 %, and what one hundred percent is worth (K,)."""
+    """Return the vectors (K, K) for +10 % and −10 %, and the size (K,) of one hundred percent."""
     space = objective.space
     scaled = np.asarray(space.scaled(jnp.asarray(vector)))
     centre = [space.from_scaled(i, x) for i, x in enumerate(scaled)]
-    worth = np.array(
+    full = np.array(
         [
             abs(value) if parameter.scale == "log" else size
             for value, parameter, size in zip(centre, space.parameters, reference, strict=True)
         ]
     )
-    found = []
+    vectors = []
     for sign in (1.0, -1.0):
         rows = []
         for index, parameter in enumerate(space.parameters):
             value = np.clip(
-                centre[index] + sign * LARGE * worth[index], parameter.lower, parameter.upper
+                centre[index] + sign * LARGE_STEP * full[index], parameter.lower, parameter.upper
             )
             row = vector.copy()
-            at = dict(zip(space.names, centre, strict=True)) | {parameter.name: float(value)}
-            row[index] = space.vector_of(at)[index]
+            values = dict(zip(space.names, centre, strict=True)) | {parameter.name: float(value)}
+            row[index] = space.vector_of(values)[index]
             rows.append(row)
-        found.append(np.stack(rows))
-    return (found[0], found[1]), worth
+        vectors.append(np.stack(rows))
+    return (vectors[0], vectors[1]), full
 
 
-class _Sigmas:
-    """Which outputs hold data, and what a residual of one is worth in their units."""
+class _Outputs:
+    """The outputs that hold data, and the standard deviations of their noise in their units."""
 
     def __init__(self, objective: Objective, flights: Sequence[str]) -> None:
         self._flight = np.asarray(objective.segments.flight)
@@ -224,7 +224,7 @@ class _Sigmas:
             name: np.asarray(measured.weight)
             for name, measured in objective.segments.measured.items()
         }
-        self.outputs = [
+        self.places = [
             (channel, flight, axis)
             for flight in range(len(flights))
             for channel, weight in self._weight.items()
@@ -239,14 +239,14 @@ class _Sigmas:
         return int((self._weight[channel][:, axis][:, segments] > 0).sum())
 
     def unit(self, channel: str, axis: int, segments: NDArray[np.intp]) -> float:
-        """Return how much of the output's unit one standard deviation is."""
+        """Return one standard deviation of the measurement in the output's unit."""
         weight = self._weight[channel][:, axis][:, segments].max()
         return float(1.0 / weight / AXES[channel][2])
 
     def rmse(self, squares: dict[str, Array]) -> Array:
         """Return (S, R) RMSE in the outputs' units from sums of squares (S, k, F)."""
         columns = []
-        for channel, flight, axis in self.outputs:
+        for channel, flight, axis in self.places:
             segments = self.segments(flight)
             mean = squares[channel][:, axis][:, segments].sum(axis=-1)
             mean = mean / self.count(channel, axis, segments)
@@ -254,17 +254,17 @@ class _Sigmas:
         return np.stack(columns, axis=-1)
 
 
-def _when(
-    objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, sigmas: _Sigmas
+def _over_time(
+    objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, outputs: _Outputs
 ) -> tuple[Array, Array]:
-    """Return the middles (F, B) of stretches in s and what acts in them (K, F, B)."""
+    """Return the middles (F, B) of the stretches in s and the effects in them (K, F, B)."""
     flights = int(np.asarray(objective.segments.flight).max()) + 1
     squares = np.zeros((len(moved), flights, BINS))
     counts = np.zeros((flights, BINS))
     middles = np.zeros((flights, BINS))
     begins = objective.segments.begins
     for flight in range(flights):
-        segments = sigmas.segments(flight)
+        segments = outputs.segments(flight)
         end = max(
             float(np.max(np.asarray(m.time)[:, segments] + begins[segments], initial=0.0))
             for m in objective.segments.measured.values()
@@ -275,13 +275,13 @@ def _when(
             for segment in segments:
                 time = np.asarray(measured.time)[:, segment] + begins[segment]
                 weight = np.asarray(measured.weight)[..., segment]
-                which = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
+                stretch = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
                 rows = (
                     np.asarray(jacobian.columns[channel])[: len(moved), ..., segment]
                     / scale[flight]
                 )
                 power = (rows**2).sum(axis=2)
                 for index in range(len(moved)):
-                    squares[index, flight] += np.bincount(which, power[index], minlength=BINS)
-                counts[flight] += np.bincount(which, (weight > 0).sum(axis=1), minlength=BINS)
+                    squares[index, flight] += np.bincount(stretch, power[index], minlength=BINS)
+                counts[flight] += np.bincount(stretch, (weight > 0).sum(axis=1), minlength=BINS)
     return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None, None]

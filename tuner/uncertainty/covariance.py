@@ -12,21 +12,21 @@ from tuner.uncertainty.information import FisherInformation
 Array = NDArray[np.float64]
 
 WIDE = 100.0
-"""Priors this many times wider than given leave the flights alone to speak."""
-MOST_LEVERAGE = 0.95
-"""A stretch that determines more of a direction than this is not corrected any further."""
+"""Factor on the priors' widths that leaves practically the information of the flights alone."""
+MAX_LEVERAGE = 0.95
+"""Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
 
 
 @dataclass(frozen=True)
 class Covariance:
-    """Of the scaled coordinates.
+    """Covariance of the K estimates, in the scaled coordinates.
 
     Attributes
     ----------
     matrix
         (K, K), flights and priors together, inflated where residuals are correlated in time.
-    alone
-        (K, K), the same from the flights alone; huge where they say nothing.
+    data_only
+        (K, K), the same from the flights alone; huge where they carry no information.
     inflation
         (K,) standard error over that of independent residuals, at least 1.
     beyond_noise
@@ -34,7 +34,7 @@ class Covariance:
     """
 
     matrix: Array
-    alone: Array
+    data_only: Array
     inflation: Array
     beyond_noise: Array
 
@@ -46,7 +46,7 @@ class Covariance:
     @property
     def data_error(self) -> Array:
         """Standard errors (K,) from the flights alone."""
-        return np.asarray(np.sqrt(np.diag(self.alone)))
+        return np.asarray(np.sqrt(np.diag(self.data_only)))
 
     @property
     def correlation(self) -> Array:
@@ -54,7 +54,7 @@ class Covariance:
         return np.asarray(self.matrix / np.outer(self.error, self.error))
 
 
-def covariance(information: FisherInformation) -> Covariance:
+def covariance_of(information: FisherInformation) -> Covariance:
     """Return the covariance of a fit.
 
     With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
@@ -69,27 +69,27 @@ def covariance(information: FisherInformation) -> Covariance:
     unit = 1.0 / np.sqrt(np.diag(total))
     inverse = _inverse(total, unit)
     white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
-    quiet = information.prior + information.clock_prior
-    independent = inverse @ (white + quiet) @ inverse
-    clustered = inverse @ (_meat(information, unit) + quiet) @ inverse
+    priors = information.prior + information.nuisance_prior
+    independent = inverse @ (white + priors) @ inverse
+    clustered = inverse @ (_score_products(information, unit) + priors) @ inverse
     ratio = np.diag(clustered) / np.diag(independent) - np.sqrt(
-        2.0 / _stretches(information, inverse)
+        2.0 / _effective_stretches(information, inverse)
     )
     inflation = np.sqrt(np.maximum(ratio, 1.0))
-    alone = information.data + information.prior / WIDE**2
-    alone_inverse = _inverse(alone, 1.0 / np.sqrt(np.diag(alone)))
+    data = information.data + information.prior / WIDE**2
+    data_inverse = _inverse(data, 1.0 / np.sqrt(np.diag(data)))
     matrix = independent * np.outer(inflation, inflation)
     beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse))
     return Covariance(
         matrix=matrix,
-        alone=alone_inverse * np.outer(beyond_noise, beyond_noise),
+        data_only=data_inverse * np.outer(beyond_noise, beyond_noise),
         inflation=inflation,
         beyond_noise=beyond_noise,
     )
 
 
-def _stretches(information: FisherInformation, inverse: Array) -> Array:
-    """Return from how many stretches (K,) each parameter is known, as if they spoke equally."""
+def _effective_stretches(information: FisherInformation, inverse: Array) -> Array:
+    """Return the number (K,) of stretches with equal information that each parameter amounts to."""
     along = inverse / np.diag(inverse)
     by_stretch = np.einsum("pk,clbpq,qk->lbk", along, information.blocks, along, optimize=True)
     by_stretch = by_stretch.reshape(-1, len(inverse))
@@ -105,13 +105,13 @@ def _inverse(matrix: Array, unit: Array) -> Array:
     return np.asarray((vectors / values) @ vectors.T * np.outer(unit, unit))
 
 
-def _meat(information: FisherInformation, unit: Array) -> Array:
-    """Return the sum (K, K) over stretches of the corrected scores' outer products."""
+def _score_products(information: FisherInformation, unit: Array) -> Array:
+    """Return the sum (K, K) over stretches of the corrected scores' outer products, the "meat"."""
     total = information.total * np.outer(unit, unit)
     factor = np.linalg.cholesky(total + 1e-13 * np.eye(len(total)))
     blocks = information.blocks.sum(axis=0) * np.outer(unit, unit)
     score = information.score.sum(axis=0) * unit
-    meat = np.zeros_like(total)
+    products = np.zeros_like(total)
     for segment in range(score.shape[0]):
         for block in range(score.shape[1]):
             if not np.any(blocks[segment, block]):
@@ -119,8 +119,10 @@ def _meat(information: FisherInformation, unit: Array) -> Array:
             leverage = np.linalg.solve(factor, blocks[segment, block])
             leverage = np.linalg.solve(factor, leverage.T)
             values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.T))
-            left = np.sqrt(1.0 - np.clip(values, 0.0, MOST_LEVERAGE))
-            white = vectors @ ((vectors.T @ np.linalg.solve(factor, score[segment, block])) / left)
-            corrected = factor @ white
-            meat += np.outer(corrected, corrected)
-    return np.asarray(meat / np.outer(unit, unit))
+            remaining = np.sqrt(1.0 - np.clip(values, 0.0, MAX_LEVERAGE))
+            whitened = vectors @ (
+                (vectors.T @ np.linalg.solve(factor, score[segment, block])) / remaining
+            )
+            corrected = factor @ whitened
+            products += np.outer(corrected, corrected)
+    return np.asarray(products / np.outer(unit, unit))

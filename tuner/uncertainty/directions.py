@@ -13,9 +13,9 @@ from tuner.files import Part
 Array = NDArray[np.float64]
 
 NAMED = 0.3
-"""A coefficient takes part in a direction if it moves at least this much of the largest."""
+"""Move of a coefficient, relative to the largest, from which it takes part in a direction."""
 ALIKE = 0.1
-"""How closely the moves of a direction must agree with a common factor to be called one."""
+"""Deviation of a direction's moves from those of a common factor below which it is one."""
 UNDETERMINED = 1.0
 """Standard error along a direction above which the flights do not determine it at all."""
 

@@ -1,4 +1,4 @@
-"""How well every coefficient is known, and from what."""
+"""How well every coefficient is known, and which channels and flights determine it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tuner.coefficients import COEFFICIENTS
 from tuner.coefficients.space import Parameter, Space
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.covariance import Covariance, covariance
+from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.directions import Direction, weakest
 from tuner.uncertainty.information import FisherInformation, information_at
 from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judge
@@ -21,12 +21,12 @@ from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judg
 Array = NDArray[np.float64]
 
 AT_BOUND = 2e-3
-"""A fit within this share of its range from a bound has ended there."""
+"""Distance from a bound, as a share of the range, within which a fit has ended at it."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """One coefficient.
+    """Estimate of one coefficient.
 
     Attributes
     ----------
@@ -69,8 +69,8 @@ class Uncertainty:
     channels, flights
         Names in the order of the shares.
     shares
-        (C, F, K): how much of what is known of each parameter came from each channel of each
-        flight; with ``prior_share`` they add up to 1.
+        (C, F, K) of each channel of each flight in the information about each parameter; with
+        ``prior_share`` they add up to 1.
     prior_share
         (K,).
     directions
@@ -93,7 +93,7 @@ def uncertainty_of(
     fitted: Fitted,
     *,
     flights: Sequence[str] | None = None,
-    clocks: NDArray[np.bool_] | None = None,
+    offsets_fitted: NDArray[np.bool_] | None = None,
 ) -> Uncertainty:
     """Return how well a fit's coefficients are known.
 
@@ -102,11 +102,14 @@ def uncertainty_of(
     fitted
         A search's result.
     flights
-        Names of the fitted flights in the order of the objective; ``fitted.scales``' by default.
-    clocks
+        Names of the fitted flights in the order of the objective; those of ``fitted.scales`` by
+        default.
+    offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
-    information = information_at(fitted.objective, fitted.point, fitted.criterion, clocks=clocks)
+    information = information_at(
+        fitted.objective, fitted.point, fitted.criterion, offsets_fitted=offsets_fitted
+    )
     names = tuple(fitted.scales) if flights is None else tuple(flights)
     vector = np.asarray(fitted.point.coefficients)
     return uncertainty_at(fitted.objective.space, vector, information, names)
@@ -115,26 +118,26 @@ def uncertainty_of(
 def uncertainty_at(
     space: Space, vector: Array, information: FisherInformation, flights: Sequence[str]
 ) -> Uncertainty:
-    """Return what the evidence at a search vector (K,) says."""
+    """Return how well the coefficients are known, from the information at a search vector (K,)."""
     scaled = np.asarray(space.scaled(jnp.asarray(vector)))
     reference = references(space, vector)
-    found = covariance(information)
+    covariance = covariance_of(information)
     shares, prior_share = _shares(information, len(flights))
-    directions = weakest(found.alone, reference, space.names)
+    directions = weakest(covariance.data_only, reference, space.names)
     estimates = {}
     for index, parameter in enumerate(space.parameters):
-        partner, correlation = _partner(found.correlation[index], index, space.names)
+        partner, correlation = _partner(covariance.correlation[index], index, space.names)
         channel, flight = _source(shares[..., index], information.channels, flights)
-        half_width = float(QUANTILE * found.error[index])
+        half_width = float(QUANTILE * covariance.error[index])
         precision = Precision(
             name=parameter.name,
             half_width=half_width,
             unit=None if parameter.scale == "log" else COEFFICIENTS[parameter.name].unit,
             relative_half_width=half_width / reference[index],
-            data_error=float(found.data_error[index] / reference[index]),
+            data_error=float(covariance.data_error[index] / reference[index]),
             prior_share=float(prior_share[index]),
             prior_given=parameter.prior_given,
-            inflation=float(found.inflation[index]),
+            inflation=float(covariance.inflation[index]),
             partner=partner,
             correlation=correlation,
             channel=channel,
@@ -143,7 +146,7 @@ def uncertainty_at(
         )
         verdict, reason = judge(precision, directions)
         tied = reason.model_copy(update={"tied_to": parameter.name})
-        error = found.error[index]
+        error = covariance.error[index]
         low, high = (
             float(np.clip(scaled[index] + side * error, *_limits(parameter)))
             for side in (-QUANTILE, QUANTILE)
@@ -164,8 +167,8 @@ def uncertainty_at(
     return Uncertainty(
         estimates=estimates,
         names=space.names,
-        correlation=found.correlation,
-        covariance=found,
+        correlation=covariance.correlation,
+        covariance=covariance,
         reference=reference,
         channels=information.channels,
         flights=tuple(flights),
@@ -199,27 +202,25 @@ def _bound(parameter: Parameter, scaled: float) -> Literal["lower", "upper"] | N
 
 
 def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]:
-    """Split what is known of each parameter, others fitted beside it, over where it came from.
+    """Return the shares (C, F, K) of channels and flights in the information, and of priors (K,).
 
     The inverse of a parameter's variance is dᵀHd, d its change with all others following along;
-    H is a sum over channels, flights and priors, and so is what is known.
+    H is a sum over channels, flights and priors, and so is the inverse of the variance.
     """
     inverse = np.linalg.inv(information.total)
     along = inverse / np.diag(inverse)
-    whole = 1.0 / np.diag(inverse)
+    precision = 1.0 / np.diag(inverse)
     by_segment = information.blocks.sum(axis=2)
-    parts = np.einsum("pk,clpq,qk->clk", along, by_segment, along, optimize=True) / whole
+    parts = np.einsum("pk,clpq,qk->clk", along, by_segment, along, optimize=True) / precision
     shares = np.zeros((parts.shape[0], flights, parts.shape[2]))
     for segment, flight in enumerate(information.flight):
         shares[:, flight] += parts[:, segment]
-    prior = (
-        np.einsum("pk,pq,qk->k", along, information.prior + information.clock_prior, along) / whole
-    )
-    return shares, np.asarray(prior)
+    priors = information.prior + information.nuisance_prior
+    return shares, np.asarray(np.einsum("pk,pq,qk->k", along, priors, along) / precision)
 
 
 def _partner(row: Array, index: int, names: Sequence[str]) -> tuple[str | None, float]:
-    """Return the parameter that one is correlated with most, and how much."""
+    """Return the name that row ``index`` (K,) of the correlations is largest for, and how large."""
     if len(row) == 1:
         return None, 0.0
     others = np.where(np.arange(len(row)) == index, 0.0, row)

@@ -1,4 +1,4 @@
-"""A fit's problem with every coefficient free, so that one Jacobian answers for all of them."""
+"""A fit's problem with every coefficient free, so that one Jacobian serves all of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tuner.objective.normal import Objective
 
 @dataclass(frozen=True)
 class FullProblem:
-    """The same simulation at the same point, moved by every coefficient.
+    """The simulation and the point of a fit, in the space of all coefficients.
 
     Attributes
     ----------
@@ -25,51 +25,51 @@ class FullProblem:
         With K + L parameters: the fit's own K first, then the L fixed ones.
     fitted, fixed
         Their names.
-    own
-        The fit's own space.
+    fit_space
+        The K parameters of the fit.
     """
 
     objective: Objective
     point: Point
     fitted: tuple[str, ...]
     fixed: tuple[str, ...]
-    own: Space
+    fit_space: Space
 
     @property
     def columns(self) -> int:
-        """How many parameters to differentiate by at a time: as the search did, if it had many.
+        """Number of parameters to differentiate by at a time.
 
-        What was compiled for the search then serves again.
+        It is that of the search if two passes then suffice, for which its program is compiled.
         """
-        few, all_of_them = len(self.own), len(self.objective.space)
-        return few if 2 * few >= all_of_them else all_of_them
+        fitted, total = len(self.fit_space), len(self.objective.space)
+        return fitted if 2 * fitted >= total else total
 
-    def only(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
-        """Return the space of some parameters, and where they lie in the whole one."""
+    def subspace(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
+        """Return the space of some parameters, and their indices among all."""
         space = self.objective.space
-        places = np.array([space.names.index(name) for name in names])
+        indices = np.array([space.names.index(name) for name in names])
         if names == self.fitted:
-            return self.own, places  # so that what is compiled for it serves again
-        return Space([space.parameters[place] for place in places], {}), places
+            return self.fit_space, indices  # for which programs are compiled already
+        return Space([space.parameters[index] for index in indices], {}), indices
 
 
 def full_problem_of(objective: Objective, point: Point) -> FullProblem:
-    """Free the coefficients that a fit left alone, each around the value that it was given."""
+    """Return a fit's problem with its fixed coefficients free, too, around their values."""
     space = objective.space
     values = {
         name: float(value) for name, value in space.values(jnp.asarray(point.coefficients)).items()
     }
     fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
     parameters = [*space.parameters, *(_parameter(name, value) for name, value in fixed.items())]
-    whole = Space(parameters, {})
-    vector = whole.vector_of(values | fixed)
+    full_space = Space(parameters, {})
+    vector = full_space.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
     return FullProblem(
-        objective=with_space(objective, whole),
+        objective=with_space(objective, full_space),
         point=Point(jnp.asarray(vector), point.offsets),
         fitted=space.names,
         fixed=tuple(fixed),
-        own=space,
+        fit_space=space,
     )
 
 

@@ -1,8 +1,8 @@
-"""What the data say, cut into flights, channels and stretches of time.
+"""Fisher information of the data, by flights, channels and stretches of time.
 
 Everything here is in the scaled coordinates of the `Space` (logarithm or number). Each segment's
-start and each flight's offsets are nuisances: they are eliminated, so that what is left speaks of
-the coefficients alone and can be added up and split at will.
+start and each flight's offsets are nuisance parameters: they are eliminated, so that what remains
+concerns the coefficients alone and can be added up over any part of the data.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from tuner.search.normal_equations import OFFSET_SD
 Array = NDArray[np.float64]
 
 BLOCK = 2.0
-"""s; residuals further apart than this are taken to be independent."""
+"""Time beyond which residuals are taken to be independent, s."""
 
 
 @dataclass(frozen=True)
 class FisherInformation:
-    """Gradient and information of a fit, in C channels, F segments, B blocks, K coefficients.
+    """Score and information of C channels, F segments, B stretches of time, about K coefficients.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class FisherInformation:
         (C, F, B, K): JᵀWr, likewise.
     spread
         (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
-    clock_prior
+    nuisance_prior
         (K, K): what the priors of offsets and starts contribute.
     prior
         (K, K): what the priors of the coefficients contribute.
@@ -52,24 +52,24 @@ class FisherInformation:
     blocks: Array
     score: Array
     spread: Array
-    clock_prior: Array
+    nuisance_prior: Array
     prior: Array
     crashed: NDArray[np.bool_]
 
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
-        """Return what flights say of which each part holds the next ones."""
+        """Return the information of all flights from that of consecutive groups of them."""
         first = parts[0]
-        before = np.cumsum([0, *(int(part.flight.max()) + 1 for part in parts)])
+        first_flight = np.cumsum([0, *(int(part.flight.max()) + 1 for part in parts)])
         return FisherInformation(
             channels=first.channels,
             flight=np.concatenate(
-                [part.flight + begin for part, begin in zip(parts, before, strict=False)]
+                [part.flight + number for part, number in zip(parts, first_flight, strict=False)]
             ),
             blocks=np.concatenate([part.blocks for part in parts], axis=1),
             score=np.concatenate([part.score for part in parts], axis=1),
             spread=np.concatenate([part.spread for part in parts], axis=1),
-            clock_prior=np.sum([part.clock_prior for part in parts], axis=0),
+            nuisance_prior=np.sum([part.nuisance_prior for part in parts], axis=0),
             prior=first.prior,
             crashed=np.concatenate([part.crashed for part in parts]),
         )
@@ -77,7 +77,7 @@ class FisherInformation:
     @property
     def data(self) -> Array:
         """The information (K, K) of all flights."""
-        return np.asarray(self.blocks.sum(axis=(0, 1, 2)) + self.clock_prior)
+        return np.asarray(self.blocks.sum(axis=(0, 1, 2)) + self.nuisance_prior)
 
     @property
     def total(self) -> Array:
@@ -90,23 +90,23 @@ def information_at(
     point: Point,
     criterion: Criterion,
     *,
-    clocks: NDArray[np.bool_] | None = None,
+    offsets_fitted: NDArray[np.bool_] | None = None,
     block: float = BLOCK,
 ) -> FisherInformation:
-    """Evaluate the Jacobian at a point and sum it up.
+    """Return the information at a point, where the Jacobian is evaluated.
 
     Parameters
     ----------
     objective, point, criterion
-        A fit and where it stands.
-    clocks
+        The problem, and where it is examined.
+    offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     block
-        s of one flight that are summed up together.
+        Length of the stretches of time that are summed up, s.
     """
     jacobian = objective.jacobian(point, criterion)
     return information_from_jacobian(
-        objective, point, criterion, jacobian, clocks=clocks, block=block
+        objective, point, criterion, jacobian, offsets_fitted=offsets_fitted, block=block
     )
 
 
@@ -116,10 +116,10 @@ def information_from_jacobian(
     criterion: Criterion,
     jacobian: Jacobian,
     *,
-    clocks: NDArray[np.bool_] | None = None,
+    offsets_fitted: NDArray[np.bool_] | None = None,
     block: float = BLOCK,
 ) -> FisherInformation:
-    """Sum a Jacobian up; see `information_at`."""
+    """Return the information of a Jacobian; see `information_at`."""
     count, segments = len(objective.space), objective.segments.count
     channels = tuple(jacobian.residuals)
     blocks = _block_count(objective, criterion, block)
@@ -137,33 +137,32 @@ def information_from_jacobian(
         for segment in range(segments):
             rows = columns[..., segment] / scale[segment]
             error = residuals[..., segment] / scale[segment]
-            size_of = np.abs(error)
-            robust = np.minimum(1.0, float(criterion.huber) / np.maximum(size_of, 1e-300))
-            which = np.minimum((time[:, segment] / block).astype(int), blocks - 1)
-            for one in range(blocks):
-                here = which == one
-                part = rows[:, here].reshape(size, -1)
-                heavy = part * robust[here].ravel()
-                information[number, segment, one] = heavy @ part.T
-                score[number, segment, one] = heavy @ error[here].ravel()
+            robust = np.minimum(1.0, float(criterion.huber) / np.maximum(np.abs(error), 1e-300))
+            stretch = np.minimum((time[:, segment] / block).astype(int), blocks - 1)
+            for index in range(blocks):
+                inside = stretch == index
+                columns_inside = rows[:, inside].reshape(size, -1)
+                weighted = columns_inside * robust[inside].ravel()
+                information[number, segment, index] = weighted @ columns_inside.T
+                score[number, segment, index] = weighted @ error[inside].ravel()
             compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=0)
             if compared.any():
                 spread[number, segment] = np.mean((robust * error**2)[compared])
-    raw = _Raw(channels, information, score, spread)
-    fitted = np.asarray(point.offsets) != 0.0 if clocks is None else clocks
-    return _without_clocks(
+    sums = _Sums(channels, information, score, spread)
+    fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
+    return _without_nuisances(
         objective,
         point,
         criterion,
-        raw,
-        clocks=fitted,
+        sums,
+        offsets_fitted=fitted,
         crashed=np.isfinite(np.asarray(jacobian.crash_time)),
     )
 
 
 @dataclass(frozen=True)
-class _Raw:
-    """Sums with the nuisances still in them, in the search's coordinates."""
+class _Sums:
+    """Information and score, nuisance parameters included, in the search's coordinates."""
 
     channels: tuple[str, ...]
     blocks: Array
@@ -176,46 +175,46 @@ def _block_count(objective: Objective, criterion: Criterion, block: float) -> in
     return max(int(seconds / block), 1)
 
 
-def _without_clocks(
+def _without_nuisances(
     objective: Objective,
     point: Point,
     criterion: Criterion,
-    raw: _Raw,
+    sums: _Sums,
     *,
-    clocks: NDArray[np.bool_],
+    offsets_fitted: NDArray[np.bool_],
     crashed: NDArray[np.bool_],
 ) -> FisherInformation:
     """Change to scaled coordinates; eliminate the segments' starts, then the flights' offsets."""
     space, segments = objective.space, objective.segments.count
-    count, kinds = len(space), len(clocks)
+    count, kinds = len(space), len(offsets_fitted)
     slope = space.slope(np.asarray(point.coefficients))
-    stretch = np.concatenate([1.0 / slope, np.ones(raw.score.shape[-1] - count)])
-    blocks = raw.blocks * stretch[:, None] * stretch
-    score = raw.score * stretch
+    stretch = np.concatenate([1.0 / slope, np.ones(sums.score.shape[-1] - count)])
+    blocks = sums.blocks * stretch[:, None] * stretch
+    score = sums.score * stretch
     flight = np.asarray(objective.segments.flight)
     eliminate = np.zeros((segments, count, len(stretch)))
     nuisance_prior = np.zeros((count, count))
     for number in range(int(flight.max()) + 1):
-        own = np.flatnonzero(flight == number)
+        segments_of = np.flatnonzero(flight == number)
         first, whole = {}, np.zeros((count + kinds, count + kinds))
-        for segment in own:
+        for segment in segments_of:
             first[segment] = _without_start(blocks[:, segment].sum(axis=(0, 1)), count + kinds)
-            whole += _kept(blocks[:, segment].sum(axis=(0, 1)), first[segment])
-        projection = _projection(whole, clocks[:, number], count)
+            whole += _information_along(blocks[:, segment].sum(axis=(0, 1)), first[segment])
+        projection = _projection(whole, offsets_fitted[:, number], count)
         second = np.hstack([np.eye(count), projection])
         nuisance_prior += projection @ projection.T / OFFSET_SD**2
-        for segment in own:
+        for segment in segments_of:
             eliminate[segment] = second @ first[segment]
             follow = second @ first[segment][:, count + kinds :]
             nuisance_prior += follow @ follow.T
     reduced = np.einsum("lap,clbpq,ldq->clbad", eliminate, blocks, eliminate, optimize=True)
     return FisherInformation(
-        channels=raw.channels,
+        channels=sums.channels,
         flight=flight,
         blocks=reduced,
         score=np.einsum("lap,clbp->clba", eliminate, score),
-        spread=raw.spread,
-        clock_prior=nuisance_prior,
+        spread=sums.spread,
+        nuisance_prior=nuisance_prior,
         prior=np.diag(float(criterion.prior) ** 2 / space.prior_sd**2),
         crashed=crashed,
     )
@@ -224,13 +223,13 @@ def _without_clocks(
 def _without_start(whole: Array, kept: int) -> Array:
     """Return (kept, Q): how all parameters change when a segment's best start follows the others.
 
-    In its standard deviations the prior of a start is one.
+    Starts are in units of their prior's standard deviations.
     """
-    own = whole[kept:, kept:] + np.eye(len(whole) - kept)
-    return np.hstack([np.eye(kept), -np.linalg.solve(own, whole[kept:, :kept]).T])
+    of_start = whole[kept:, kept:] + np.eye(len(whole) - kept)
+    return np.hstack([np.eye(kept), -np.linalg.solve(of_start, whole[kept:, :kept]).T])
 
 
-def _kept(whole: Array, along: Array) -> Array:
+def _information_along(whole: Array, along: Array) -> Array:
     """Return the information along some directions, the prior of a start included."""
     kept = len(along)
     return np.asarray(along @ whole @ along.T + along[:, kept:] @ along[:, kept:].T)
@@ -240,6 +239,6 @@ def _projection(whole: Array, movable: NDArray[np.bool_], count: int) -> Array:
     """Return (K, offsets): how a flight's best offsets follow the coefficients."""
     projection = np.zeros((count, len(movable)))
     free = np.flatnonzero(movable)
-    own = whole[np.ix_(count + free, count + free)] + np.eye(len(free)) / OFFSET_SD**2
-    projection[:, free] = -np.linalg.solve(own, whole[count + free, :count]).T
+    of_offsets = whole[np.ix_(count + free, count + free)] + np.eye(len(free)) / OFFSET_SD**2
+    projection[:, free] = -np.linalg.solve(of_offsets, whole[count + free, :count]).T
     return projection

@@ -1,4 +1,4 @@
-"""Profile likelihood: one coefficient held at a value, all the others fitted again.
+"""Profile likelihood: one coefficient fixed at a value, all the others fitted again.
 
 Where the fit's quadratic picture of itself is wrong, the profile shows it: a valley that does not
 rise on one side has no interval there (Raue et al., "Structural and practical identifiability
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tuner.config import COEFFICIENTS
 from tuner.errors import InputError, did_you_mean
 from tuner.examination.examination import Examination
+from tuner.examination.sensitivity_json import numbers
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
@@ -24,15 +25,15 @@ from tuner.uncertainty.profiles_json import THRESHOLD, Profile
 Array = NDArray[np.float64]
 
 POINTS = 13
-"""Values of the coefficient, the middle one where it stands."""
+"""Number of the coefficient's values, the middle one where it stands."""
 REACH = 3.5
-"""Standard errors either side."""
-WIDEST = 1.2
-"""Scaled coordinate either side at most: a factor of three."""
-STEPS = 12
-"""Iterations at most."""
-STILL = 0.01
-"""Change of any point's χ² below which no more is to be gained."""
+"""Distance of the outermost values in standard errors."""
+MAX_REACH = 1.2
+"""Largest distance of the outermost values in the scaled coordinate, a factor of three."""
+MAX_ITERATIONS = 12
+"""Of refitting the others."""
+TOLERANCE = 0.01
+"""Decrease of every point's χ² below which refitting stops."""
 
 
 def profile_likelihood(examination: Examination, criterion: Criterion, name: str) -> Profile:
@@ -43,7 +44,8 @@ def profile_likelihood(examination: Examination, criterion: Criterion, name: str
     examination
         Of the point where the coefficient stands.
     criterion
-        In whose weights; priors are left out but for what keeps the others from running away.
+        Whose weights the residuals have; of the priors, only as much is kept as keeps the other
+        coefficients from diverging.
     name
         The coefficient.
 
@@ -57,39 +59,43 @@ def profile_likelihood(examination: Examination, criterion: Criterion, name: str
     if name not in names:
         raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
     chosen = full_problem.fitted if name in full_problem.fitted else (*full_problem.fitted, name)
-    space, places = full_problem.only(chosen)
+    space, indices = full_problem.subspace(chosen)
     objective = with_space(full_problem.objective, space)
-    found = examination.uncertainty if name in full_problem.fitted else examination.freed[name]
+    uncertainty = (
+        examination.uncertainty if name in full_problem.fitted else examination.freed[name]
+    )
     index = space.names.index(name)
-    vector = np.asarray(full_problem.point.coefficients)[places]
+    vector = np.asarray(full_problem.point.coefficients)[indices]
     centre = np.asarray(space.scaled(jnp.asarray(vector)))
-    error = float(found.covariance.data_error[index])
-    reach = min(REACH * error, WIDEST * found.reference[index])
+    error = float(uncertainty.covariance.data_error[index])
+    reach = min(REACH * error, MAX_REACH * uncertainty.reference[index])
     parameter = space.parameters[index]
     low, high = parameter.scaled(parameter.lower), parameter.scaled(parameter.upper)
     grid = np.linspace(max(centre[index] - reach, low), min(centre[index] + reach, high), POINTS)
-    along = found.covariance.alone[:, index] / found.covariance.alone[index, index]
-    starts = np.stack([_moved(objective, centre, along, index, x) for x in grid])
+    along = (
+        uncertainty.covariance.data_only[:, index] / uncertainty.covariance.data_only[index, index]
+    )
+    starts = np.stack([_start(objective, centre, along, index, x) for x in grid])
     chi = _refitted(objective, full_problem.point, criterion, starts, index)
     values = [space.from_scaled(index, float(x)) for x in grid]
     # as the standard errors do, the likelihood allows for residuals that are not white noise
-    rise = (chi - chi.min()) / found.covariance.beyond_noise[index] ** 2
+    rise = (chi - chi.min()) / uncertainty.covariance.beyond_noise[index] ** 2
     quadratic = ((grid - grid[int(np.argmin(chi))]) / error) ** 2
     return Profile(
         name=name,
         unit=COEFFICIENTS[name].unit,
         values=values,
-        rise=[float(one) if np.isfinite(one) else None for one in rise],
+        rise=numbers(rise),
         quadratic=quadratic.tolist(),
         interval=_crossings(np.array(values), rise),
     )
 
 
-def _moved(objective: Objective, centre: Array, along: Array, index: int, to: float) -> Array:
-    """Return the search vector (K,) where the others follow as the quadratic picture has it."""
+def _start(objective: Objective, centre: Array, along: Array, index: int, value: float) -> Array:
+    """Return the search vector (K,) where the others follow as the quadratic approximation says."""
     space = objective.space
-    scaled = centre + along * (to - centre[index])
-    scaled[index] = to
+    scaled = centre + along * (value - centre[index])
+    scaled[index] = value
     limits = [(p.scaled(p.lower), p.scaled(p.upper)) for p in space.parameters]
     inside = [float(np.clip(x, *limit)) for x, limit in zip(scaled, limits, strict=True)]
     pairs = enumerate(zip(space.names, inside, strict=True))
@@ -99,12 +105,12 @@ def _moved(objective: Objective, centre: Array, along: Array, index: int, to: fl
 def _refitted(
     objective: Objective, point: Point, criterion: Criterion, starts: Array, index: int
 ) -> Array:
-    """Return χ² (S,) with one coordinate held and all others at their best."""
+    """Return χ² (S,) with one coordinate fixed and all others at their minimum."""
     offsets = np.asarray(point.offsets)
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
     free[index] = 0.0
-    quiet = Criterion(
+    weak_priors = Criterion(
         horizon=criterion.horizon,
         scale=criterion.scale,
         reference_offset=criterion.reference_offset,
@@ -113,16 +119,16 @@ def _refitted(
         states=criterion.states,
     )
     points = Point(jnp.asarray(starts), jnp.asarray(np.repeat(offsets[None], len(starts), axis=0)))
-    step, before = begin(on_host(points)), np.full(len(starts), np.inf)
-    for _ in range(STEPS):
-        step = advance(objective, step, on_host(quiet), free)
+    step, previous = begin(on_host(points)), np.full(len(starts), np.inf)
+    for _ in range(MAX_ITERATIONS):
+        step = advance(objective, step, on_host(weak_priors), free)
         assert step.sums is not None
         compared = sum(np.asarray(n)[0].sum() for n in step.sums.counts.values())
-        now = 2.0 * np.asarray(step.loss) * compared
-        if np.all(before - now < STILL):
+        chi = 2.0 * np.asarray(step.loss) * compared
+        if np.all(previous - chi < TOLERANCE):
             break
-        before = now
-    return np.asarray(now)
+        previous = chi
+    return np.asarray(chi)
 
 
 def _crossings(values: Array, rise: Array) -> tuple[float | None, float | None]:

@@ -1,4 +1,4 @@
-"""Profiles of the likelihood, as ``profiles.json`` holds them."""
+"""The content of ``profiles.json``: profiles of the likelihood."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from tuner.files import Part, csv_text, read_optional
 PROFILES_FILE = "profiles.json"
 PROFILES_TABLE = "profiles.csv"
 THRESHOLD = 3.841459
-"""Rise of χ² that a true value stays below in 95 of 100 experiments, one degree of freedom."""
+"""Rise of χ² (one degree of freedom) at the true value that 95 % of experiments stay below."""
 
 
 class Profile(Part):
-    """One coefficient's.
+    """Profile of one coefficient.
 
     Attributes
     ----------
     name, unit
-        Which.
+        Of the coefficient.
     values
-        At which it was held.
+        At which it was fixed.
     rise
         χ² above its lowest, the others fitted again, over the square by which the standard error
         is widened for residuals that are no white noise; None where that failed.
     quadratic
-        What the standard error says it would be.
+        The rise that the standard error predicts.
     interval
         Where the rise passes `THRESHOLD`; None where it does not within the values.
     """
@@ -47,14 +47,14 @@ class Profiles(Part):
     profiles: list[Profile]
 
 
-def write_profiles(found: Sequence[Profile], folder: Path) -> None:
+def write_profiles(profiles: Sequence[Profile], folder: Path) -> None:
     """Write ``profiles.json`` and, for other programs, ``profiles.csv``."""
-    text = Profiles(profiles=list(found)).model_dump_json(indent=1) + "\n"
+    text = Profiles(profiles=list(profiles)).model_dump_json(indent=1) + "\n"
     write_text(folder / PROFILES_FILE, text)
     rows = [
-        [one.name, value, rise, quadratic]
-        for one in found
-        for value, rise, quadratic in zip(one.values, one.rise, one.quadratic, strict=True)
+        [profile.name, *row]
+        for profile in profiles
+        for row in zip(profile.values, profile.rise, profile.quadratic, strict=True)
     ]
     header = ("coefficient", "value", "chi_square_rise", "quadratic")
     write_text(folder / PROFILES_TABLE, csv_text(header, rows))

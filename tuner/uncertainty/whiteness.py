@@ -1,4 +1,4 @@
-"""Whether the residuals are white noise: if not, the model misses something."""
+"""Whether the residuals are white noise; where they are not, the model lacks something."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from tuner.objective.normal import Objective
 Array = NDArray[np.float64]
 
 LAGS = 50
-"""Samples over which a residual is compared with its own past."""
-FEWEST = 4 * LAGS
-"""Samples below which that is not told."""
+"""Number of lags of the autocorrelation, in samples."""
+MIN_SAMPLES = 4 * LAGS
+"""Samples below which the autocorrelation is not computed."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Residual:
     limit
         Half the band within which 95 % of the lags of white noise lie.
     memory
-        s after which the residual has forgotten itself: the integral of the autocorrelation's
-        square, on either side of 0; a sample's spacing for white noise.
+        Correlation time in s: the integral of the autocorrelation's square, on either side of 0; a
+        sample's spacing for white noise.
     outside
         Share of the lags beyond ``limit``.
     """
@@ -53,32 +53,32 @@ class Residual:
 
     @property
     def white(self) -> bool:
-        """Whether no more lags than twice chance's share lie outside the band."""
+        """Whether at most twice the share of lags expected by chance lies outside the band."""
         return self.outside <= 0.1
 
 
 def whiteness(
     objective: Objective, jacobian: Jacobian, criterion: Criterion, flights: Sequence[str]
 ) -> tuple[Residual, ...]:
-    """Return every flight's and channel's residuals, told by their own past."""
-    found = []
+    """Return the autocorrelation of the residuals of every channel of every flight."""
+    results = []
     seconds = float(criterion.horizon) / float(objective.schedule.log_rate)
     segment_flight = np.asarray(objective.segments.flight)
     for number, name in enumerate(flights):
         segments = np.flatnonzero(segment_flight == number)  # windows follow each other
         for channel, measured in objective.segments.measured.items():
             weight = np.concatenate(np.moveaxis(np.asarray(measured.weight)[..., segments], -1, 0))
-            own = np.asarray(measured.time)[:, segments]
-            time = (own + objective.segments.begins[segments]).T.ravel()
-            used = (weight > 0).any(axis=1) & (own.T.ravel() < seconds)
-            if used.sum() < FEWEST:
+            local = np.asarray(measured.time)[:, segments]
+            time = (local + objective.segments.begins[segments]).T.ravel()
+            used = (weight > 0).any(axis=1) & (local.T.ravel() < seconds)
+            if used.sum() < MIN_SAMPLES:
                 continue
             residuals = np.asarray(jacobian.residuals[channel])[..., segments]
             error = np.concatenate(np.moveaxis(residuals, -1, 0))[used]
             axes = (weight[used] > 0).all(axis=0)
             if axes.any():
-                found.append(_residual(name, channel, time[used], error[:, axes]))
-    return tuple(found)
+                results.append(_residual(name, channel, time[used], error[:, axes]))
+    return tuple(results)
 
 
 def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:

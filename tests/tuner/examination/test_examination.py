@@ -1,4 +1,4 @@
-"""What coefficients do, held against simulations with the coefficient changed by hand."""
+"""Sensitivities against simulations with the coefficient changed by hand."""
 
 from __future__ import annotations
 
@@ -30,36 +30,36 @@ def objective() -> Objective:
 
 
 @pytest.fixture(scope="module")
-def found(objective: Objective) -> Examination:
+def examination(objective: Objective) -> Examination:
     return examine(making.fitted_of(objective, making.truth(objective)))
 
 
 @pytest.fixture(scope="module")
-def knowledge(objective: Objective, found: Examination) -> Knowledge:
-    return knowledge_of(found, objective.space, making.truth(objective))
+def knowledge(objective: Objective, examination: Examination) -> Knowledge:
+    return knowledge_of(examination, objective.space, making.truth(objective))
 
 
 def test_flights_that_do_not_fit_the_memory_take_turns(
-    objective: Objective, found: Examination
+    objective: Objective, examination: Examination
 ) -> None:
     small = replace(objective, memory=1)
     fitted = making.fitted_of(small, making.truth(small))
     assert [list(p) for p in portions(small, fitted.point, fitted.criterion)] == [[0], [1]]
     turns = examine(fitted)
     assert turns.residuals[0].flight != turns.residuals[-1].flight
-    assert [r.flight for r in turns.residuals] == [r.flight for r in found.residuals]
-    for one, other in (
-        (turns.information, found.information),
-        (turns.sensitivity, found.sensitivity),
+    assert [r.flight for r in turns.residuals] == [r.flight for r in examination.residuals]
+    for in_turns, at_once in (
+        (turns.information, examination.information),
+        (turns.sensitivity, examination.sensitivity),
     ):
-        for name, value in vars(other).items():
+        for name, value in vars(at_once).items():
             if isinstance(value, np.ndarray):
                 size = np.abs(np.nan_to_num(value)).max()
-                np.testing.assert_allclose(getattr(one, name), value, atol=1e-9 * size)
+                np.testing.assert_allclose(getattr(in_turns, name), value, atol=1e-9 * size)
             elif name != "outputs":
-                assert getattr(one, name) == value
+                assert getattr(in_turns, name) == value
     assert [o.rmse for o in turns.sensitivity.outputs] == pytest.approx(
-        [o.rmse for o in found.sensitivity.outputs]
+        [o.rmse for o in examination.sensitivity.outputs]
     )
 
 
@@ -102,7 +102,7 @@ def test_rmse_for_ten_percent_is_the_simulations_own(
             assert output.rmse < expected or output.flight == "spin"
 
 
-def test_fixed_coefficients_are_told_of_as_if_they_were_free(knowledge: Knowledge) -> None:
+def test_fixed_coefficients_are_examined_as_if_they_were_free(knowledge: Knowledge) -> None:
     mass = knowledge.coefficients["mass"]
     assert not mass.fitted
     assert mass.bias["motor_constant"] > 0.2
@@ -110,39 +110,39 @@ def test_fixed_coefficients_are_told_of_as_if_they_were_free(knowledge: Knowledg
 
 
 def test_an_increase_of_the_fixed_one_moves_the_fitted_as_a_refit_would(
-    objective: Objective, found: Examination
+    objective: Objective, examination: Examination
 ) -> None:
-    rows = found.information
+    information = examination.information
     count = len(objective.space)
-    place = count + list(found.freed).index("mass")
-    step = -np.linalg.solve(rows.total[:count, :count], rows.data[:count, place])
+    place = count + list(examination.freed).index("mass")
+    step = -np.linalg.solve(information.total[:count, :count], information.data[:count, place])
     names = list(objective.space.names)
-    assert found.bias[list(found.freed).index("mass")][names.index("motor_constant")] == (
-        pytest.approx(step[names.index("motor_constant")])
-    )
+    row = examination.bias[list(examination.freed).index("mass")]
+    motor = names.index("motor_constant")
+    assert row[motor] == pytest.approx(step[motor])
 
 
-def test_white_residuals_are_called_white(found: Examination) -> None:
-    assert len(found.residuals) == 8
-    assert sum(one.white for one in found.residuals) >= 7
-    for one in found.residuals:
-        assert one.rms == pytest.approx(1.0, abs=0.15)
+def test_white_residuals_are_called_white(examination: Examination) -> None:
+    assert len(examination.residuals) == 8
+    assert sum(residual.white for residual in examination.residuals) >= 7
+    for residual in examination.residuals:
+        assert residual.rms == pytest.approx(1.0, abs=0.15)
 
 
 def test_residuals_of_a_wrong_model_are_not_white(objective: Objective) -> None:
     wrong = objective.start(objective.space.initial + 0.1)
     coloured = examine(making.fitted_of(objective, wrong)).residuals
-    assert not any(one.white for one in coloured if one.channel == "position")
+    assert not any(residual.white for residual in coloured if residual.channel == "position")
 
 
-def test_half_of_an_effect_is_found_where_it_is() -> None:
-    acts = np.zeros(40)
-    acts[20:24] = 1.0
-    assert shortest_half(np.arange(40) + 0.5, acts) == (20.0, 22.0)
+def test_half_of_an_effect_is_where_it_is() -> None:
+    effect = np.zeros(40)
+    effect[20:24] = 1.0
+    assert shortest_half(np.arange(40) + 0.5, effect) == (20.0, 22.0)
     assert shortest_half(np.arange(40) + 0.5, np.zeros(40)) == (0.0, 40.0)
 
 
-def test_files_hold_what_was_found(knowledge: Knowledge, tmp_path: Path) -> None:
+def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
     write_files(knowledge, tmp_path)
     assert read_knowledge(tmp_path) == knowledge
     rows = list(csv.DictReader(io.StringIO((tmp_path / "sensitivity.csv").read_text())))
@@ -156,5 +156,5 @@ def test_files_hold_what_was_found(knowledge: Knowledge, tmp_path: Path) -> None
     assert np.sqrt(np.diag(matrix)) == pytest.approx(errors)
     shares = list(csv.DictReader(io.StringIO((tmp_path / "information_shares.csv").read_text())))
     for name in knowledge.coefficients:
-        whole = sum(float(row["share"]) for row in shares if row["coefficient"] == name)
-        assert whole == pytest.approx(1.0)
+        total_share = sum(float(row["share"]) for row in shares if row["coefficient"] == name)
+        assert total_share == pytest.approx(1.0)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.uncertainty.covariance import covariance
+from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.information import FisherInformation
 
 COUNT, BLOCKS, LENGTH = 3, 40, 25
 
 
 def regression(noise: np.ndarray, design: np.ndarray) -> tuple[FisherInformation, np.ndarray]:
-    """Return the evidence of a least-squares fit, and the fit; truth is zero, σ is 1."""
+    """Return the information of a least-squares fit, and the fit; truth is zero, σ is 1."""
     fit, *_ = np.linalg.lstsq(design, noise, rcond=None)
     rows = design.reshape(BLOCKS, LENGTH, COUNT)
     residual = (design @ fit - noise).reshape(BLOCKS, LENGTH)
@@ -22,7 +22,7 @@ def regression(noise: np.ndarray, design: np.ndarray) -> tuple[FisherInformation
         blocks=np.einsum("bnp,bnq->bpq", rows, rows)[None, None],
         score=np.einsum("bnp,bn->bp", rows, residual)[None, None],
         spread=np.full((1, 1), np.mean(residual**2)),
-        clock_prior=np.zeros((COUNT, COUNT)),
+        nuisance_prior=np.zeros((COUNT, COUNT)),
         prior=1e-9 * np.eye(COUNT),
         crashed=np.zeros(1, bool),
     )
@@ -55,7 +55,7 @@ def test_the_standard_error_is_the_spread_of_repeated_fits(memory: float) -> Non
     for _ in range(300):
         information, fit = regression(autoregressive(generator, memory), design)
         fits.append(fit)
-        errors.append(covariance(information).error)
+        errors.append(covariance_of(information).error)
     spread = np.std(fits, axis=0)
     assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.2)
 
@@ -63,20 +63,21 @@ def test_the_standard_error_is_the_spread_of_repeated_fits(memory: float) -> Non
 def test_white_noise_widens_hardly_anything() -> None:
     generator = np.random.default_rng(5)
     design = smooth_design(2)
-    found = [
-        covariance(regression(generator.normal(size=BLOCKS * LENGTH), design)[0]) for _ in range(50)
+    covariances = [
+        covariance_of(regression(generator.normal(size=BLOCKS * LENGTH), design)[0])
+        for _ in range(50)
     ]
-    assert np.median([one.inflation for one in found]) < 1.05
-    assert min(one.inflation.min() for one in found) >= 1.0
+    assert np.median([covariance.inflation for covariance in covariances]) < 1.05
+    assert min(covariance.inflation.min() for covariance in covariances) >= 1.0
 
 
 def test_residuals_larger_than_assumed_widen_the_interval() -> None:
     generator = np.random.default_rng(7)
     design = smooth_design(3)
     noise = generator.normal(size=BLOCKS * LENGTH)
-    quiet, _ = regression(noise, design)
-    loud, _ = regression(4.0 * noise, design)
-    assert covariance(loud).error == pytest.approx(4.0 * covariance(quiet).error, rel=1e-6)
+    small, _ = regression(noise, design)
+    large, _ = regression(4.0 * noise, design)
+    assert covariance_of(large).error == pytest.approx(4.0 * covariance_of(small).error, rel=1e-6)
 
 
 def test_a_direction_without_data_is_known_from_the_prior_alone() -> None:
@@ -85,9 +86,9 @@ def test_a_direction_without_data_is_known_from_the_prior_alone() -> None:
     design[:, 2] = design[:, 0]
     information, _ = regression(generator.normal(size=BLOCKS * LENGTH), design)
     information = FisherInformation(**{**vars(information), "prior": np.eye(COUNT) / 0.5**2})
-    found = covariance(information)
+    covariance = covariance_of(information)
     # the sum of the two is known, their difference has the prior's 0.5·√2, half of it each
-    assert found.error[0] == pytest.approx(0.5 / np.sqrt(2), rel=0.02)
-    assert found.data_error[0] > 10.0
-    assert found.data_error[1] == pytest.approx(found.error[1], rel=0.1)
-    assert found.correlation[0, 2] < -0.9
+    assert covariance.error[0] == pytest.approx(0.5 / np.sqrt(2), rel=0.02)
+    assert covariance.data_error[0] > 10.0
+    assert covariance.data_error[1] == pytest.approx(covariance.error[1], rel=0.1)
+    assert covariance.correlation[0, 2] < -0.9

@@ -1,4 +1,4 @@
-"""Over repeats with different noise the 95 % intervals hold the truth as often as they say."""
+"""Over repeats with different noise the 95 % intervals cover the truth as often as they should."""
 
 import numpy as np
 import pytest
@@ -37,9 +37,9 @@ def test_intervals_cover_the_truth():
         progress = grow(
             noisy, stages, progress, free=free, clipped=False, on_progress=lambda _: None
         )
-        found = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
+        uncertainty = uncertainty_of(fitted_of(noisy, point_of(progress.points, 0)))
         for number, name in enumerate(FREE):
-            low, high = found.estimates[name].ci95
+            low, high = uncertainty.estimates[name].ci95
             covered[repeat, number] = low <= float(right[name]) <= high
     share = covered.mean()
     assert 0.85 <= share <= 1.0, covered.mean(axis=0)

@@ -26,7 +26,9 @@ FREE = (
     "rolling_moment_coefficient",
     "estimate_latency",
 )
-CLOCKS = np.array([[True, False], [True, True], [True, True], [False, False], [True, False]])
+OFFSETS_FITTED = np.array(
+    [[True, False], [True, True], [True, True], [False, False], [True, False]]
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +38,15 @@ def objective() -> Objective:
 
 
 @pytest.fixture(scope="module")
-def found(objective: Objective) -> Uncertainty:
+def uncertainty(objective: Objective) -> Uncertainty:
     fitted = making.fitted_of(objective, making.truth(objective))
-    return uncertainty_of(fitted, clocks=CLOCKS)
+    return uncertainty_of(fitted, offsets_fitted=OFFSETS_FITTED)
 
 
-def test_information_is_the_searchs_own_with_clock_offsets_eliminated(
+def test_information_is_the_searchs_with_clock_offsets_eliminated(
     objective: Objective,
 ) -> None:
-    offsets = np.random.default_rng(1).normal(0.0, 0.1, CLOCKS.shape)
+    offsets = np.random.default_rng(1).normal(0.0, 0.1, OFFSETS_FITTED.shape)
     point = Point(making.truth(objective).coefficients + 0.01, jnp.asarray(offsets))
     criterion = making.criterion_of(objective)
     sums = objective.sums(point, criterion, derivatives=True)
@@ -53,12 +55,12 @@ def test_information_is_the_searchs_own_with_clock_offsets_eliminated(
     )
     compared = sum(float(n.sum()) for n in sums.counts.values())
     count = len(objective.space)
-    kept = np.concatenate([np.arange(count), count + np.flatnonzero(CLOCKS)])
+    kept = np.concatenate([np.arange(count), count + np.flatnonzero(OFFSETS_FITTED)])
     covariance = np.linalg.inv(np.asarray(hessian)[np.ix_(kept, kept)] * compared)[:count, :count]
     slope = objective.space.slope(np.asarray(point.coefficients))
-    information = information_at(objective, point, criterion, clocks=CLOCKS)
-    ours = np.linalg.inv(information.total)
-    assert ours == pytest.approx(covariance * np.outer(slope, slope), rel=1e-5)
+    information = information_at(objective, point, criterion, offsets_fitted=OFFSETS_FITTED)
+    inverse = np.linalg.inv(information.total)
+    assert inverse == pytest.approx(covariance * np.outer(slope, slope), rel=1e-5)
 
 
 def test_residuals_at_the_truth_are_as_large_as_the_noise(objective: Objective) -> None:
@@ -67,8 +69,10 @@ def test_residuals_at_the_truth_are_as_large_as_the_noise(objective: Objective) 
     assert not information.crashed.any()
 
 
-def test_a_freed_mass_is_not_identifiable_and_the_direction_is_named(found: Uncertainty) -> None:
-    worst = found.directions[0]
+def test_a_freed_mass_is_not_identifiable_and_the_direction_is_named(
+    uncertainty: Uncertainty,
+) -> None:
+    worst = uncertainty.directions[0]
     assert worst.null
     assert worst.common_scale
     assert set(worst.moves) == {
@@ -80,45 +84,45 @@ def test_a_freed_mass_is_not_identifiable_and_the_direction_is_named(found: Unce
         "rotor_drag_coefficient",
         "rolling_moment_coefficient",
     }
-    assert found.estimates["mass"].verdict is Verdict.NOT_IDENTIFIABLE
-    assert found.estimates["mass"].reason.direction == worst
-    assert not found.estimates["motor_constant"].identifiable
+    assert uncertainty.estimates["mass"].verdict is Verdict.NOT_IDENTIFIABLE
+    assert uncertainty.estimates["mass"].reason.direction == worst
+    assert not uncertainty.estimates["motor_constant"].identifiable
 
 
-def test_ratios_stay_known_beside_a_freed_mass(found: Uncertainty) -> None:
-    assert found.estimates["moment_constant"].verdict is Verdict.WELL_KNOWN
-    assert found.estimates["input_scaling"].verdict is Verdict.WELL_KNOWN
+def test_ratios_stay_known_beside_a_freed_mass(uncertainty: Uncertainty) -> None:
+    assert uncertainty.estimates["moment_constant"].verdict is Verdict.WELL_KNOWN
+    assert uncertainty.estimates["input_scaling"].verdict is Verdict.WELL_KNOWN
 
 
-def test_shares_add_up_and_are_nobodys_debt(found: Uncertainty) -> None:
-    assert found.shares.min() > -1e-6
-    whole = found.shares.sum(axis=(0, 1)) + found.prior_share
-    assert whole == pytest.approx(1.0)
-    mass = found.names.index("mass")
-    assert found.prior_share[mass] > 0.99
-    scaling = found.names.index("input_scaling")
-    speed = found.channels.index("rotor_speed")
-    assert found.shares[speed, :, scaling].sum() > 0.5
+def test_shares_are_not_negative_and_add_up(uncertainty: Uncertainty) -> None:
+    assert uncertainty.shares.min() > -1e-6
+    total_share = uncertainty.shares.sum(axis=(0, 1)) + uncertainty.prior_share
+    assert total_share == pytest.approx(1.0)
+    mass = uncertainty.names.index("mass")
+    assert uncertainty.prior_share[mass] > 0.99
+    scaling = uncertainty.names.index("input_scaling")
+    speed = uncertainty.channels.index("rotor_speed")
+    assert uncertainty.shares[speed, :, scaling].sum() > 0.5
 
 
-def test_the_yaw_spin_tells_the_moment_constant(found: Uncertainty) -> None:
-    by_flight = found.shares.sum(axis=0)[found.flights.index("spin")]
-    moment = by_flight[found.names.index("moment_constant")]
+def test_the_yaw_spin_identifies_the_moment_constant(uncertainty: Uncertainty) -> None:
+    by_flight = uncertainty.shares.sum(axis=0)[uncertainty.flights.index("spin")]
+    moment = by_flight[uncertainty.names.index("moment_constant")]
     assert moment > 0.3
-    assert moment > 5 * by_flight[found.names.index("estimate_latency")]
+    assert moment > 5 * by_flight[uncertainty.names.index("estimate_latency")]
 
 
 def test_intervals_are_in_units_and_inside_the_bounds(
-    found: Uncertainty, objective: Objective
+    uncertainty: Uncertainty, objective: Objective
 ) -> None:
     for parameter in objective.space.parameters:
-        estimate = found.estimates[parameter.name]
+        estimate = uncertainty.estimates[parameter.name]
         low, high = estimate.ci95
         assert parameter.lower <= low < estimate.value < high <= parameter.upper
-    latency = found.estimates["estimate_latency"]
+    latency = uncertainty.estimates["estimate_latency"]
     low, high = latency.ci95
     assert high - low == pytest.approx(2 * 1.96 * latency.std_error, rel=1e-3)
-    scaling = found.estimates["input_scaling"]
+    scaling = uncertainty.estimates["input_scaling"]
     low, high = scaling.ci95
     assert high / scaling.value == pytest.approx(scaling.value / low)
 

@@ -14,7 +14,7 @@ from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
 REFITS = 50
-JUDGED = 5
+EXAMINED = 5
 ITERATIONS = 3
 
 
@@ -33,16 +33,16 @@ def refit(objective: Objective, start: Point) -> Point:
 def test_standard_errors_are_the_spread_of_refits() -> None:
     exact = making.problem(FREE)
     truth, noise = making.truth(exact), np.random.default_rng(5)
-    found, errors = [], []
+    fits, errors = [], []
     for number in range(REFITS):
         noisy = making.with_data(exact, truth, noise=noise)
         point = refit(noisy, truth)
-        found.append(np.asarray(noisy.space.scaled(point.coefficients)))
-        if number < JUDGED:
+        fits.append(np.asarray(noisy.space.scaled(point.coefficients)))
+        if number < EXAMINED:
             estimated = uncertainty_of(making.fitted_of(noisy, point))
             errors.append(estimated.covariance.error)
-    spread = np.std(found, axis=0, ddof=1)
+    spread = np.std(fits, axis=0, ddof=1)
     assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.3)
     # and they scatter about the truth
     true = np.asarray(exact.space.scaled(truth.coefficients))
-    assert np.all(np.abs(np.mean(found, axis=0) - true) < 3.5 * spread / np.sqrt(REFITS))
+    assert np.all(np.abs(np.mean(fits, axis=0) - true) < 3.5 * spread / np.sqrt(REFITS))
