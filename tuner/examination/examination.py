@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tuner.objective.flight_batches import portion, portions
 from tuner.search.fitted import Fitted
-from tuner.sensitivity.local import LocalSensitivity, local_sensitivity
+from tuner.sensitivity_analysis.local import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.estimates import Uncertainty, references, uncertainty_at
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 from tuner.uncertainty.information import FisherInformation, information_from_jacobian

@@ -33,7 +33,7 @@ class CoefficientKnowledge(Part):
     verdict, reason
         How well it is known, and why.
     step
-        Change that counts as one hundred percent, see `tuner.sensitivity.local`.
+        Change that counts as one hundred percent, see `tuner.sensitivity_analysis.local`.
     shares
         Channel -> flight -> share in the information about it.
     prior_share

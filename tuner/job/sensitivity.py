@@ -23,8 +23,8 @@ from tuner.report import render
 from tuner.report.record import About, Recording, write_about
 from tuner.report.traces import write_simulated
 from tuner.search.fitted import Fitted
-from tuner.sensitivity.global_indices import global_sensitivity
-from tuner.sensitivity.global_sensitivity_json import Method, write_global
+from tuner.sensitivity_analysis.global_indices import global_sensitivity
+from tuner.sensitivity_analysis.global_sensitivity_json import Method, write_global
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import write_profiles
 

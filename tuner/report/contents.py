@@ -22,7 +22,7 @@ from tuner.report.record import (
 )
 from tuner.report.traces import read_traces
 from tuner.result import RESULT_FILE, Run, read_run
-from tuner.sensitivity.global_sensitivity_json import GlobalSensitivity, read_global
+from tuner.sensitivity_analysis.global_sensitivity_json import GlobalSensitivity, read_global
 from tuner.uncertainty.profiles_json import Profiles, read_profiles
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.sensitivity.global_sensitivity_json import MEANING, GlobalSensitivity
+from tuner.sensitivity_analysis.global_sensitivity_json import MEANING, GlobalSensitivity
 
 
 def whole_range(contents: Contents) -> Section | None:

@@ -13,8 +13,8 @@ from tuner.errors import InputError
 from tuner.examination.examination import Examination, examine
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
-from tuner.sensitivity.global_indices import _outputs, global_sensitivity
-from tuner.sensitivity.global_sensitivity_json import (
+from tuner.sensitivity_analysis.global_indices import _outputs, global_sensitivity
+from tuner.sensitivity_analysis.global_sensitivity_json import (
     GlobalSensitivity,
     Method,
     read_global,

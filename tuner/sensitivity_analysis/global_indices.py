@@ -19,7 +19,11 @@ from tuner.coefficients.space import Space
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.sensitivity.global_sensitivity_json import GlobalSensitivity, Method, SensitivityIndex
+from tuner.sensitivity_analysis.global_sensitivity_json import (
+    GlobalSensitivity,
+    Method,
+    SensitivityIndex,
+)
 
 Array = NDArray[np.float64]
 
