@@ -68,8 +68,8 @@ def read_recordings(
     for name in job.holdout:
         if name not in names:
             raise InputError(
-                "holdout",
-                f"there is no flight '{name}' in the recordings",
+                "--holdout",
+                f"there is no flight '{name}'",
                 did_you_mean(name, names),
             )
     return recordings_of(

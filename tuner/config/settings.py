@@ -27,7 +27,7 @@ DEFAULT_NAME = "hovergames"
 
 @dataclass(frozen=True)
 class Options:
-    """What was said on the command line; None is nothing said.
+    """The options of the command line; None stands for an option that was not given.
 
     Attributes
     ----------
@@ -97,9 +97,9 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     Parameters
     ----------
     options
-        What was said.
+        Of the command line.
     fits
-        Whether something is to be fitted, so that some flight must not be held out.
+        Whether a fit follows, for which some flight must not be held out.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     _names_are_distinct(flights)
     _check_flight_names(job, job_path, flights)
     if fits and all(flight.stem in holdout for flight in flights):
-        raise InputError("--holdout", "holds out every flight", "leave one to fit")
+        raise InputError("--holdout", "holds out all flights", "leave one to fit")
     try:
         job = _override(job, options, holdout)
     except ValidationError as error:
@@ -152,12 +152,12 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
         The flights lie in several folders with a job file each.
     """
     folders = {flight.resolve().parent: flight.parent for flight in flights}
-    found = [shown / JOB_FILE for shown in folders.values() if (shown / JOB_FILE).is_file()]
-    if len(found) > 1:
+    files = [shown / JOB_FILE for shown in folders.values() if (shown / JOB_FILE).is_file()]
+    if len(files) > 1:
         raise ConfigError(
-            found[1], f"is a second job file beside {found[0]}", "name one of them with --config"
+            files[1], f"is a second job file beside {files[0]}", "name one of them with --config"
         )
-    return found[0] if found else None
+    return files[0] if files else None
 
 
 def _job_path(options: Options, flights: tuple[Path, ...]) -> Path | None:
@@ -181,14 +181,14 @@ CONTROLLERS = _Choice[ControllerFile]("controllers", "--controller", read_contro
 
 
 def _choose(
-    choice: _Choice[M], said: str | M | None, in_job: Path | None, job_path: Path | None
+    choice: _Choice[M], option: str | M | None, in_job: Path | None, job_path: Path | None
 ) -> tuple[M, str]:
     """Return what is named first, and where it comes from."""
-    if isinstance(said, str):
-        path = find_config(choice.kind, said, Path())
+    if isinstance(option, str):
+        path = find_config(choice.kind, option, Path())
         return choice.read(path), f"{choice.option} {path}"
-    if said is not None:
-        return said, f"{choice.option} '{said.name}'"
+    if option is not None:
+        return option, f"{choice.option} '{option.name}'"
     if in_job is not None:
         return choice.read(in_job), f"{in_job} ({job_path})"
     path = find_config(choice.kind, DEFAULT_NAME, Path("/nonexistent"))
@@ -206,19 +206,19 @@ def _holdout(
     names = {flight.stem for flight in flights}
     if options.holdout is None:
         return tuple(name for name in job.holdout if _is_among(name, names)), ()
-    held: list[str] = []
+    holdout: list[str] = []
     extra: list[Path] = []
     for word in options.holdout:
         if _is_among(word, names):
-            held.append(word)
+            holdout.append(word)
         elif exists(Path(word)) or glob.has_magic(word):
             for path in find_flights([word]):
-                held.append(path.stem)
+                holdout.append(path.stem)
                 if path.resolve() not in {flight.resolve() for flight in (*flights, *extra)}:
                     extra.append(path)
         else:
-            raise InputError("--holdout", f"no flight '{word}'", did_you_mean(word, names))
-    return tuple(dict.fromkeys(held)), tuple(extra)
+            raise InputError("--holdout", f"there is no flight '{word}'", did_you_mean(word, names))
+    return tuple(dict.fromkeys(holdout)), tuple(extra)
 
 
 def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFile:
@@ -264,11 +264,11 @@ def _check_flight_names(job: JobFile, job_path: Path | None, flights: tuple[Path
     """Refuse settings for a flight that exists neither here nor beside the job file."""
     given = [flight.stem for flight in flights]
     folders = {flight.parent for flight in flights} | ({job_path.parent} if job_path else set())
-    known = {file.stem for folder in folders for file in folder.iterdir()} | set(given)
+    known = {file.stem for folder in folders for file in folder.glob("*")} | set(given)
     for name in (*job.holdout, *job.flights):
         if not _is_among(name, known):
             raise ConfigError(
                 job_path or "flights",
-                f"names a flight '{name}' that is not there",
+                f"names a flight '{name}' that does not exist",
                 did_you_mean(name, given),
             )

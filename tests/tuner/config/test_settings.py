@@ -111,7 +111,7 @@ def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypa
         ({"flights": ["{lab}"]}, "is a folder"),
         ({"flights": []}, "names no recording"),
         ({"holdout": ["d"]}, "no flight 'd'"),
-        ({"holdout": ["a", "b", "c"]}, "holds out every flight"),
+        ({"holdout": ["a", "b", "c"]}, "holds out all flights"),
         ({"mass": -1.0}, "mass is -1.0; it should be greater than 0"),
         ({"mass": float("nan")}, "mass is nan"),
         ({"seed": -1}, "seed is -1"),
@@ -137,10 +137,10 @@ def test_what_cannot_be_used_is_refused_in_one_line(lab, change, expected):
 
 def test_a_misspelt_flight_in_the_job_file_is_named(lab):
     (lab / "tune.yaml").write_text("flights: {aa: {weight: 2}}\n")
-    with pytest.raises(ConfigError, match="'aa' that is not there; did you mean 'a'"):
+    with pytest.raises(ConfigError, match="'aa' that does not exist; did you mean 'a'"):
         settle(Options([f"{lab}/*.bag"]))
     (lab / "tune.yaml").write_text("holdout: [cc]\n")
-    with pytest.raises(ConfigError, match="'cc' that is not there"):
+    with pytest.raises(ConfigError, match="'cc' that does not exist"):
         settle(Options([f"{lab}/*.bag"]))
 
 
