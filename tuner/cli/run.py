@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import shlex
 import sys
@@ -18,6 +19,7 @@ DONE = 0
 OUR_FAULT = 1
 WRONG_INPUT = 2
 INTERRUPTED = 130
+FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,6 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         _know_the_command(given)
         app(given)
+        sys.stdout.flush()
     except InputError as error:
         return _say(str(error), WRONG_INPUT)
     except CycloptsError as error:
@@ -45,9 +48,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()  # whoever read our output has gone; nothing is left to say
         return DONE
     except Exception as error:
-        traceback.print_exc()
-        return _say(f"this is a fault of ours: {type(error).__name__}: {error}", OUR_FAULT)
+        return _unforeseen(error)
     return DONE
+
+
+def _unforeseen(error: Exception) -> int:
+    """Report what no part of the program answers for, the full disk of a redirected output too."""
+    if isinstance(error, OSError) and error.errno in FULL:
+        return _say("the disk is full; free some space and try again", WRONG_INPUT)
+    traceback.print_exception(error)
+    return _say(f"this is a fault of ours: {type(error).__name__}: {error}", OUR_FAULT)
 
 
 def _know_the_command(arguments: Sequence[str]) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -106,3 +107,15 @@ def test_a_place_that_cannot_be_written_to(command, place, expected, lab, capsys
 @pytest.mark.parametrize(("command", "expected"), IN)
 def test_a_place_that_cannot_be_read(command, expected, lab, capsys):
     refused(command, expected, lab, capsys)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+@pytest.mark.parametrize("arguments", [("inspect", "{bag}"), ("inspect", "{bag}", "--json")])
+def test_output_into_a_file_on_a_full_disk(arguments, lab, capsys, monkeypatch):
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr("sys.stdout", full)
+        assert main([word.format(bag=lab / "spin.bag") for word in arguments]) == 2
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
+    assert capsys.readouterr().err == "tune: the disk is full; free some space and try again\n"
