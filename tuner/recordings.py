@@ -1,6 +1,6 @@
 """Which flights a job uses, where each enters the simulated loop, and how late its clocks are.
 
-Every command takes its flights from here: the fit, the comparison, the examination, the export's
+All commands take their flights from here: the fit, the comparison, the sensitivity, the export's
 check and the cross-validation.
 """
 
@@ -56,7 +56,7 @@ def read_recordings(
     ------
     InputError
         A file cannot be read, a flight does not hold what its inlet needs, its side-car names an
-        impossible trajectory, or a held-out flight is not there.
+        impossible trajectory, or a held-out flight does not exist.
     """
     job = settings.job
     flights = [

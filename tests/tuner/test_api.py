@@ -65,7 +65,7 @@ def test_simulate_flies_what_it_is_given(updated):
     np.testing.assert_array_equal(flight.signals["position"], same.signals["position"])
     grid = {"motor_constant": [1.3e-5, 1.5e-5], "inertia_xx": [0.028, 0.028]}
     both = tuner.simulate("circle", vehicle=updated, duration=4.0, grid=grid)
-    assert [one.coefficients["motor_constant"] for one in both] == [1.3e-5, 1.5e-5]
+    assert [flight.coefficients["motor_constant"] for flight in both] == [1.3e-5, 1.5e-5]
     with pytest.raises(InputError, match="did you mean 'mass'"):
         tuner.simulate("circle", grid={"mas": [1.0]})
 

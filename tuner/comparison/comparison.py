@@ -53,7 +53,7 @@ from tuner.simulation.table import roll_pitch_yaw
 
 POSE = ("position", "attitude")
 LAG = 0.03
-"""s over which recent commands tell the speed of a rotor without tachometer."""
+"""s over which recent commands give the speed of a rotor without tachometer."""
 BEYOND = 0.02
 """s simulated beyond a window, for stamps that are late."""
 LOOSE = 10.0

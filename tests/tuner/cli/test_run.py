@@ -26,7 +26,7 @@ def test_every_command_has_help_with_an_example(name, capsys):
     assert f"Example: tune {name}" in words
 
 
-def test_the_version_is_said(capsys):
+def test_the_version_is_printed(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out.strip()
 
@@ -85,7 +85,7 @@ def test_help_loads_nothing_heavy():
         "heavy = {'jax', 'numpy', 'pandas', 'scipy', 'rosbags', 'matplotlib', 'equinox', 'lxml'}\n"
         "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or None)"
     )
-    found = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", script],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
@@ -93,7 +93,7 @@ def test_help_loads_nothing_heavy():
         text=True,
         check=False,
     )
-    assert found.returncode == 0, found.stderr
+    assert done.returncode == 0, done.stderr
 
 
 def test_inspect_needs_no_jax(tmp_path):
@@ -102,7 +102,7 @@ def test_inspect_needs_no_jax(tmp_path):
         "sys.exit('jax' in sys.modules or code)"
     )
     bag = ROOT / "reference_flights" / "circle_3mps.bag"
-    found = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", script, "inspect", str(bag)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)},
@@ -110,11 +110,11 @@ def test_inspect_needs_no_jax(tmp_path):
         text=True,
         check=False,
     )
-    assert found.returncode == 0, found.stderr
-    assert "circle" in found.stdout
+    assert done.returncode == 0, done.stderr
+    assert "circle" in done.stdout
 
 
-def test_simulate_writes_what_it_is_told(tmp_path, capsys):
+def test_simulate_writes_the_flight(tmp_path, capsys):
     out = tmp_path / "c.csv"
     arguments = ["simulate", "--trajectory", "circle", "--duration", "4", "--out", str(out)]
     assert main(arguments) == 0
@@ -140,7 +140,7 @@ def test_inspect_prints_tables_or_json(capsys):
     assert json.loads(capsys.readouterr().out)["schema_version"] == 1
 
 
-def test_inspect_says_which_recording_cannot_be_read(tmp_path, capsys):
+def test_inspect_reports_which_recording_cannot_be_read(tmp_path, capsys):
     broken = tmp_path / "broken.bag"
     broken.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
     assert main(["inspect", str(broken), str(ROOT / "reference_flights/yaw_spin_3rps.bag")]) == 2

@@ -30,15 +30,15 @@ def errors(position, attitude, **options):
 
 
 def test_the_root_mean_square_of_known_errors():
-    found = errors([[3, 0, 1], [-4, 0, 1]], [[1, 2, 0], [1, -2, 0]]).rmse
-    assert found.x == pytest.approx(np.sqrt(12.5))
-    assert (found.y, found.z, found.roll, found.pitch, found.yaw) == (0, 1, 1, 2, 0)
+    rmse = errors([[3, 0, 1], [-4, 0, 1]], [[1, 2, 0], [1, -2, 0]]).rmse
+    assert rmse.x == pytest.approx(np.sqrt(12.5))
+    assert (rmse.y, rmse.z, rmse.roll, rmse.pitch, rmse.yaw) == (0, 1, 1, 2, 0)
 
 
 def test_flights_are_pooled_by_their_samples():
-    one = errors([[1, 0, 0]], [[1, 0, 0]])
+    single = errors([[1, 0, 0]], [[1, 0, 0]])
     three = errors([[3, 0, 0]] * 3, [[3, 0, 0]] * 3)
-    assert rmse_of([one, three]).x == pytest.approx(np.sqrt((1 + 3 * 9) / 4))
+    assert rmse_of([single, three]).x == pytest.approx(np.sqrt((1 + 3 * 9) / 4))
 
 
 def test_a_crash_or_nothing_measured_has_no_rmse():
@@ -55,14 +55,14 @@ def test_a_stretch_is_cut_by_each_clock():
 
 def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
     comparison = Comparison([Recording(flight)], ControllerFile())
-    own = comparison.fly(updated)["small_circle"]
-    assert own.crash_time is None
+    flown = comparison.fly(updated)["small_circle"]
+    assert flown.crash_time is None
     for axis in ("x", "y", "z"):
-        assert getattr(own.rmse, axis) < 2e-4, axis
+        assert getattr(flown.rmse, axis) < 2e-4, axis
     for axis in ("roll", "pitch", "yaw"):
-        assert getattr(own.rmse, axis) < 0.02, axis
-    other = comparison.fly(with_values(updated, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
-    assert other.rmse.x > 100 * own.rmse.x
+        assert getattr(flown.rmse, axis) < 0.02, axis
+    draggy = comparison.fly(with_values(updated, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
+    assert draggy.rmse.x > 100 * flown.rmse.x
 
 
 def test_angles_are_compared_the_short_way_round():
@@ -89,9 +89,9 @@ def test_a_late_clock_is_taken_back(flight, updated):
 
 def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
     heavy = with_values(updated, {"mass": 9.0})
-    found = Comparison([Recording(flight)], ControllerFile()).fly(heavy)["small_circle"]
-    assert 0 < found.crash_time < 12
-    assert found.rmse.x is None
+    crash = Comparison([Recording(flight)], ControllerFile()).fly(heavy)["small_circle"]
+    assert 0 < crash.crash_time < 12
+    assert crash.rmse.x is None
 
 
 def test_flights_of_different_length_fly_side_by_side(flight, updated):

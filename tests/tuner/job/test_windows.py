@@ -8,6 +8,7 @@ import pytest
 from tuner.comparison.comparison import Comparison
 from tuner.config import JobFile, Options, settle, values_of, with_values
 from tuner.config.job import FlightSettings, Search
+from tuner.findings import Code
 from tuner.job.check import check
 from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
@@ -37,14 +38,14 @@ def fitted_through(job, folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
-def test_the_truth_is_found_through_every_inlet(inlet, full_flight, full_bag, updated, tmp_path):
+def test_the_truth_comes_back_through_every_inlet(inlet, full_flight, full_bag, updated, tmp_path):
     job = job_through(inlet, full_flight, full_bag, updated)
     fitted = fitted_through(job, tmp_path)
     assert fitted.objective.segments.count > 15
-    found = job.space.values(fitted.point.coefficients)
+    values = job.space.values(fitted.point.coefficients)
     truth = values_of(updated)
     for name in ("inertia_xx", "inertia_yy", "motor_constant"):
-        assert float(found[name]) == pytest.approx(truth[name], rel=0.03), name
+        assert float(values[name]) == pytest.approx(truth[name], rel=0.03), name
 
 
 @pytest.mark.slow
@@ -65,10 +66,10 @@ def test_flights_may_enter_through_different_inlets(full_flight, full_bag, updat
     np.testing.assert_allclose(both.loss[:count], alone.loss, rtol=1e-8)
     np.testing.assert_allclose(both.gradient[..., :count], alone.gradient, rtol=1e-6, atol=1e-6)
     fitted = fitted_through(mixed, tmp_path)
-    found = mixed.space.values(fitted.point.coefficients)
+    values = mixed.space.values(fitted.point.coefficients)
     truth = values_of(updated)
     for name in ("inertia_xx", "motor_constant"):
-        assert float(found[name]) == pytest.approx(truth[name], rel=0.03), name
+        assert float(values[name]) == pytest.approx(truth[name], rel=0.03), name
 
 
 def stage_for(job):
@@ -95,13 +96,13 @@ def test_windows_are_compared_from_their_likeliest_starts(full_flight, full_bag,
     assert np.all(np.diff(right.position.time) > 0)
 
 
-def test_commands_recorded_too_seldom_are_said(flight, bag, updated, full_flight, full_bag):
+def test_commands_recorded_too_seldom_are_reported(flight, bag, updated, full_flight, full_bag):
     seldom = check(job_through("actuator", flight, bag, updated))
-    said = [finding.text for finding in seldom if "recorded at 100 Hz" in finding.text]
-    assert len(said) == 1
-    assert "made at 400 Hz" in said[0]
+    (sparse,) = (finding for finding in seldom if finding.code == Code.SPARSE_INPUT)
+    assert sparse.numbers["recorded"] == pytest.approx(100, abs=1)
+    assert sparse.numbers["needed"] == 400
     full = check(job_through("actuator", full_flight, full_bag, updated))
-    assert not any("recorded at" in finding.text for finding in full)
+    assert not any(finding.code == Code.SPARSE_INPUT for finding in full)
 
 
 @pytest.mark.slow
@@ -110,14 +111,14 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
 ):
     free = (*FREE, "mass", "inertia_zz")
     job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
-    said = []
+    messages = []
     fitted, examination = with_undetermined_held(
-        job, fitted_through(job, tmp_path), lambda *_: None, said.append
+        job, fitted_through(job, tmp_path), lambda *_: None, messages.append
     )
     assert fitted.held["motor_constant"] == "mass"
-    assert "mass" in said[0]
-    found = job.space.values(fitted.point.coefficients)
-    assert float(found["mass"]) == pytest.approx(updated.mass, rel=1e-9)
+    assert "mass" in messages[0]
+    values = job.space.values(fitted.point.coefficients)
+    assert float(values["mass"]) == pytest.approx(updated.mass, rel=1e-9)
     truth = values_of(updated)["motor_constant"]
-    assert float(found["motor_constant"]) == pytest.approx(truth, rel=0.02)
+    assert float(values["motor_constant"]) == pytest.approx(truth, rel=0.02)
     assert not examination.uncertainty.estimates["motor_constant"].identifiable
