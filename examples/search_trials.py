@@ -2,7 +2,7 @@
 
     python examples/search_trials.py reference   # from the original coefficients
     python examples/search_trials.py starts      # from random starts in a box of a factor 3
-    python examples/search_trials.py mass        # mass freed, which no flight can tell
+    python examples/search_trials.py mass        # mass freed, which no flight identifies
     python examples/search_trials.py clock       # one recording's poses stamped 20 ms late
     python examples/search_trials.py noise       # one recording replaced by noise
 
@@ -50,10 +50,10 @@ LATE = 0.020
 SPOILT = "diagonal_3mps"
 
 
-def settings_of(**said: object) -> Settings:
+def settings_of(**options: object) -> Settings:
     """Return the settings of the shipped job, some of them changed."""
-    options = Options([str(path) for path in sorted(FOLDER.glob("*.bag"))], **said)  # type: ignore[arg-type]
-    return settle(options)
+    changed = Options([str(path) for path in sorted(FOLDER.glob("*.bag"))], **options)  # type: ignore[arg-type]
+    return settle(changed)
 
 
 def truth() -> dict[str, float]:
@@ -75,11 +75,11 @@ def solved(
 
 def worst(job: Job, fitted: Fitted) -> str:
     """Return how far the coefficients are from the truth."""
-    true, found = truth(), job.space.values(fitted.point.coefficients)
-    off = {name: abs(float(value) / true[name] - 1.0) for name, value in found.items()}
+    true, values = truth(), job.space.values(fitted.point.coefficients)
+    off = {name: abs(float(value) / true[name] - 1.0) for name, value in values.items()}
     mechanical = max((name for name in off if name not in TIMES), key=lambda name: off[name])
     lag = max(TIMES[:2], key=lambda name: off[name])
-    latency = abs(float(found["estimate_latency"]) - true["estimate_latency"])
+    latency = abs(float(values["estimate_latency"]) - true["estimate_latency"])
     return (
         f"{mechanical} {100 * off[mechanical]:.2f} % off, {lag} {100 * off[lag]:.1f} % off, "
         f"estimate latency {1e3 * latency:.3f} ms off"
@@ -122,9 +122,9 @@ def mass() -> str:
     start = settings.vehicle.replace(mass=1.1 * settings.vehicle.mass)
     settings = replace(settings, vehicle=start, job=settings.job.model_copy(update={"free": free}))
     _, fitted, _ = solved(settings)
-    found = uncertainty_of(fitted)
-    verdict = verdict_in_words(found.estimates["mass"].verdict)
-    return f"{verdict}: {direction_in_words(found.directions[0])}"
+    uncertainty = uncertainty_of(fitted)
+    verdict = verdict_in_words(uncertainty.estimates["mass"].verdict)
+    return f"{verdict}: {direction_in_words(uncertainty.directions[0])}"
 
 
 def clock() -> str:
@@ -140,10 +140,10 @@ def clock() -> str:
 
     job, fitted, _ = solved(settings_of(), late)
     number = [flight.name for flight in job.fitted].index(SPOILT)
-    found = float(fitted.point.offsets[0, number]) * OFFSET_UNIT
+    late_by = float(fitted.point.offsets[0, number]) * OFFSET_UNIT
     others = np.delete(np.asarray(fitted.point.offsets[0]) * OFFSET_UNIT, number)
     return (
-        f"{SPOILT} found {1e3 * found:.2f} ms late, the others at most "
+        f"{SPOILT} found {1e3 * late_by:.2f} ms late, the others at most "
         f"{1e3 * np.abs(others).max():.2f} ms: {worst(job, fitted)}"
     )
 
@@ -157,10 +157,11 @@ def noise() -> str:
             return flight
         series = dict(flight.series)
         for name in ("position", "body_rate", "rotor_speed", "command"):
-            one = series[name]
-            told = np.where(np.isfinite(one.values), one.values, 0.0)
-            drawn = told.mean(axis=0) + told.std(axis=0) * generator.standard_normal(told.shape)
-            series[name] = Series(one.time, np.where(np.isfinite(one.values), drawn, np.nan))
+            signal = series[name]
+            recorded = np.where(np.isfinite(signal.values), signal.values, 0.0)
+            white = generator.standard_normal(recorded.shape)
+            drawn = recorded.mean(axis=0) + recorded.std(axis=0) * white
+            series[name] = Series(signal.time, np.where(np.isfinite(signal.values), drawn, np.nan))
         turns = generator.standard_normal(series["attitude"].values.shape)
         turns /= np.linalg.norm(turns, axis=1, keepdims=True)
         series["attitude"] = Series(series["attitude"].time, turns)

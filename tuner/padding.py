@@ -1,4 +1,4 @@
-"""How much room arrays get: sizes are rounded up, so that most recordings share compiled code."""
+"""Sizes of arrays, rounded up so that most recordings share compiled code."""
 
 from __future__ import annotations
 

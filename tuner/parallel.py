@@ -94,13 +94,13 @@ def shared_among(
         return function
 
     def over_all(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
-        own = jax.tree.map(
+        share = jax.tree.map(
             lambda leaf: jax.ShapeDtypeStruct(
                 (*leaf.shape[:-1], leaf.shape[-1] // count), leaf.dtype
             ),
             batch,
         )
-        traced, shapes = _traced(function, own, *whole)
+        traced, shapes = _traced(function, share, *whole)
         return jax.shard_map(
             traced,
             mesh=Mesh(np.array(jax.devices()[:count]), (_AXIS,)),
@@ -162,7 +162,7 @@ def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..
 
         part, shapes = _traced(part_from, begin(0))
 
-        def one(number: Array, joined: PyTree[Array]) -> PyTree[Array]:
+        def joined_with(number: Array, joined: PyTree[Array]) -> PyTree[Array]:
             first = begin(number)
             return jax.tree.map(
                 lambda into, leaf: lax.dynamic_update_slice_in_dim(into, leaf, first, axis=-1),
@@ -171,7 +171,7 @@ def in_pieces(function: Callable[..., PyTree[Array]], piece: int) -> Callable[..
             )
 
         empty = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape[:-1], size), leaf.dtype), shapes)
-        return lax.fori_loop(0, -(-size // piece), one, empty)
+        return lax.fori_loop(0, -(-size // piece), joined_with, empty)
 
     return piecewise
 

@@ -129,9 +129,9 @@ def test_a_rollout_in_pieces_from_sample_to_sample_is_the_same_and_needs_no_memo
     together, factor = partial(fly, samples=200), factors(30)
     arranged = partial(together, arranged=partial(in_pieces, piece=4))
     in_turns = jax.jit(arranged).lower(factor).compile()
-    for one, other in zip(
+    for in_turn, at_once in zip(
         jax.tree.leaves(in_turns(factor)), jax.tree.leaves(jax.jit(together)(factor)), strict=True
     ):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(in_turn, at_once, rtol=1e-12, atol=1e-12)
     memory = in_turns.memory_analysis()
     assert memory.temp_size_in_bytes < 0.1 * memory.output_size_in_bytes

@@ -39,35 +39,35 @@ def in_fresh_python(tmp_path: Path, before: str = "", **environment: str) -> dic
 
 
 def test_one_device_a_core_double_precision_and_a_kept_cache(tmp_path: Path) -> None:
-    found = in_fresh_python(tmp_path)
-    assert found["devices"] == runtime.cores()
-    assert found["dtype"] == "float64"
-    assert found["nproc"] == "1"
-    assert found["answer"] == 6.0
+    report = in_fresh_python(tmp_path)
+    assert report["devices"] == runtime.cores()
+    assert report["dtype"] == "float64"
+    assert report["nproc"] == "1"
+    assert report["answer"] == 6.0
     assert any((tmp_path / "multirotor-tune" / "compiled").iterdir())
-    assert "NPROC=1" in str(found["line"])
+    assert "NPROC=1" in str(report["line"])
 
 
 def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
-    found = in_fresh_python(
+    report = in_fresh_python(
         tmp_path,
         NPROC="2",
         XLA_FLAGS="--xla_force_host_platform_device_count=3",
         JAX_ENABLE_X64="0",
         JAX_COMPILATION_CACHE_DIR=str(tmp_path / "elsewhere"),
     )
-    assert found["devices"] == 3
-    assert found["dtype"] == "float32"
-    assert found["nproc"] == "2"
-    assert str(found["flags"]).count("device_count") == 1
-    assert found["cache"] == str(tmp_path / "elsewhere")
+    assert report["devices"] == 3
+    assert report["dtype"] == "float32"
+    assert report["nproc"] == "2"
+    assert str(report["flags"]).count("device_count") == 1
+    assert report["cache"] == str(tmp_path / "elsewhere")
 
 
 def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
-    found = in_fresh_python(tmp_path, before="import jax.numpy as jnp; jnp.ones(3).sum()")
-    assert found["devices"] == 1
-    assert found["dtype"] == "float64"
-    assert found["answer"] == 6.0
+    report = in_fresh_python(tmp_path, before="import jax.numpy as jnp; jnp.ones(3).sum()")
+    assert report["devices"] == 1
+    assert report["dtype"] == "float64"
+    assert report["answer"] == 6.0
 
 
 def test_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -56,19 +56,19 @@ def evaluate(
     point
         Its clock offsets hold for all.
     """
-    flown = _shared(objective.flier)
+    evaluate_chunk = _shared(objective.flier)
     parts = []
     for first in range(0, len(vectors), CHUNK):
         chunk = vectors[first : first + CHUNK]
         padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
-        found = flown(
+        result = evaluate_chunk(
             objective.data(point.offsets, criterion),
             objective.tunable,
             padded,
             np.asarray(criterion.horizon),
             np.asarray(criterion.huber),
         )
-        parts.append(_first(found, len(chunk)))
+        parts.append(_first(result, len(chunk)))
     joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return joined
 
@@ -83,13 +83,13 @@ def _shared(flier: Flier) -> Callable[..., Batch]:
     def segmentwise(
         data: SegmentData, model: Tunable, vectors: Array, horizon: Array, huber: Array
     ) -> Batch:
-        def one(vector: Array) -> Batch:
+        def at(vector: Array) -> Batch:
             trace, errors = flier.compared(data, model, vector, horizon)
             scaled = {name: error / data.scale[name] for name, error in errors.items()}
             squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
             return Batch(robust_loss(scaled, huber), squares, trace.crash_time)
 
-        found: Batch = jax.vmap(one)(vectors)
-        return found
+        batch: Batch = jax.vmap(at)(vectors)
+        return batch
 
     return over_devices(in_pieces(segmentwise, max(1, piece_that_fits(8) // CHUNK)))

@@ -50,9 +50,9 @@ class Flier:
         )
         logged = self.capacity * sum(m.values.shape[1] for m in data.segments.measured.values())
         # the flown derivatives twice, those of the residuals as such and weighted
-        one = 8 * (columns + 1) * (2 * logged + 2 * recorded)
+        bytes_of_segment = 8 * (columns + 1) * (2 * logged + 2 * recorded)
         share = self.memory // len(jax.devices())
-        return max(1, min(piece_that_fits(8, columns), share // one))
+        return max(1, min(piece_that_fits(8, columns), share // bytes_of_segment))
 
     def fly(
         self,

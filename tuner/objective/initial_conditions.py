@@ -147,8 +147,8 @@ def eliminated(
         gradient = gradient[:-1] - follow * pull
         hessian = hessian[:-1, :-1] - follow[:, None] * row[None, :-1]
     step: list[Array] = []
-    for row, pull, own in reversed(rows):
+    for row, pull, curvature in reversed(rows):
         across = sum((h * s for h, s in zip(row, step, strict=True)), jnp.zeros_like(pull))
-        step.append(-(pull + across) / own)
+        step.append(-(pull + across) / curvature)
     best = states + jnp.stack(step)
     return jnp.maximum(loss, 0.0), gradient, hessian, best

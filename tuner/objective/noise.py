@@ -73,18 +73,18 @@ def channel_noise(flights: Sequence[Flight], channel: str) -> float:
     Commands come in steps and are smooth between them, so that only rounding counts: their noise
     is the step's share.
     """
-    found = []
+    per_flight = []
     for flight in flights:
         series = flight.series.get(channel)
         if series is None or not np.isfinite(series.values).any():
             continue
         if channel == "command":
-            found.append(_step(series) / np.sqrt(12.0))
+            per_flight.append(_step(series) / np.sqrt(12.0))
         elif channel == "attitude":
-            found.append(2.0 * float(np.nanmedian(white_noise(series)[1:])))
+            per_flight.append(2.0 * float(np.nanmedian(white_noise(series)[1:])))
         else:
-            found.append(float(np.nanmedian(white_noise(series))))
-    known = [value for value in found if np.isfinite(value)]
+            per_flight.append(float(np.nanmedian(white_noise(series))))
+    known = [value for value in per_flight if np.isfinite(value)]
     return max(float(np.median(known)) if known else 0.0, FLOOR[channel])
 
 

@@ -76,23 +76,23 @@ class Objective(eqx.Module):
     def sums(self, point: Point, criterion: Criterion, *, derivatives: bool = True) -> SegmentSums:
         """Return every segment's contribution at a point, computed on all devices."""
         alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], point)
-        found: SegmentSums = jax.tree.map(
+        sums: SegmentSums = jax.tree.map(
             lambda leaf: leaf[0], self.sums_of(alone, criterion, derivatives=derivatives)
         )
-        return found
+        return sums
 
     def sums_of(
         self, points: Point, criterion: Criterion, *, derivatives: bool = True
     ) -> SegmentSums:
         """Return every segment's contribution at S points; all leaves have S first."""
-        found: SegmentSums = _shared_sums(self.flier, derivatives)(
+        sums: SegmentSums = _shared_sums(self.flier, derivatives)(
             self.data(points.offsets, criterion),
             self.tunable,
             np.asarray(points.coefficients),
             np.asarray(criterion.horizon),
             np.asarray(criterion.huber),
         )
-        return found
+        return sums
 
     def jacobian(
         self, point: Point, criterion: Criterion, *, columns: int | None = None
@@ -108,16 +108,16 @@ class Objective(eqx.Module):
         for first in range(0, len(vector), count):
             some = Space(self.space.parameters[first : first + count], {})
             moved = np.pad(vector[first : first + count], (0, count - len(some)))
-            found = _shared_jacobian(self.flier)(
+            jacobian = _shared_jacobian(self.flier)(
                 data, tunable_of(model, some, count=count), moved, np.asarray(criterion.horizon)
             )
-            parts.append((len(some), found))
+            parts.append((len(some), jacobian))
         return _beside(count, parts)
 
     def data(self, offsets: Array, criterion: Criterion) -> SegmentData:
         """Return what each device needs of its segments; offsets are (\\*starts, offsets, N)."""
         flight = np.asarray(self.segments.flight)
-        own: SegmentData = jax.tree.map(
+        by_segment: SegmentData = jax.tree.map(
             np.asarray,
             SegmentData(
                 segments=self.segments,
@@ -127,16 +127,18 @@ class Objective(eqx.Module):
                 states=criterion.states,
             ),
         )
-        return own
+        return by_segment
 
 
 def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
-    """Return as one the Jacobians by some parameters each, all followed by what flights own."""
-    own, first = parts[0]
-    if own == count and len(parts) == 1:
+    """Return as one the Jacobians by some parameters each, all followed by the flights' offsets."""
+    moved, first = parts[0]
+    if moved == count and len(parts) == 1:
         return first
     columns: dict[str, Any] = {
-        name: np.concatenate([part.columns[name][:own] for own, part in parts] + [column[count:]])
+        name: np.concatenate(
+            [part.columns[name][:moved] for moved, part in parts] + [column[count:]]
+        )
         for name, column in first.columns.items()
     }
     return Jacobian(first.residuals, columns, first.crash_time)
@@ -146,8 +148,8 @@ def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
 def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
     def segmentwise(data: SegmentData, *rest: Any) -> Jacobian:
         pieces = in_pieces(flier.jacobian, flier.segments_at_once(data, len(rest[0].coordinates)))
-        found: Jacobian = pieces(data, *rest)
-        return found
+        jacobian: Jacobian = pieces(data, *rest)
+        return jacobian
 
     return over_devices(segmentwise)
 
@@ -159,17 +161,17 @@ def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., SegmentSums]:
     def some(data: SegmentData, model: Tunable, coefficients: Array, *rest: Any) -> SegmentSums:
         def at(point: tuple[Array, Array]) -> SegmentSums:
             vector, offsets = point
-            own = eqx.tree_at(lambda d: d.offsets, data, offsets)
-            return flier.sums(own, model, vector, *rest, derivatives=derivatives)
+            at_offsets = eqx.tree_at(lambda d: d.offsets, data, offsets)
+            return flier.sums(at_offsets, model, vector, *rest, derivatives=derivatives)
 
         # one start after the other: segments and columns fill the processor already
-        found: SegmentSums = lax.map(at, (coefficients, data.offsets))
-        return found
+        sums: SegmentSums = lax.map(at, (coefficients, data.offsets))
+        return sums
 
     def segmentwise(data: SegmentData, *rest: Any) -> SegmentSums:
         moving = len(rest[0].coordinates) if derivatives or data.states is not None else 0
         pieces = in_pieces(some, flier.segments_at_once(data, moving))
-        found: SegmentSums = pieces(data, *rest)
-        return found
+        sums: SegmentSums = pieces(data, *rest)
+        return sums
 
     return over_devices(segmentwise)

@@ -41,10 +41,10 @@ class Tunable(eqx.Module):
 
     def at(self, vector: Float[Array, " K"]) -> Model:
         """Return the model with the coefficients of a search vector."""
-        told = jnp.sum(self.ratios * self.coordinates.numbers(vector), axis=-1)
-        own = coefficients_in(self.model)
+        moved = jnp.sum(self.ratios * self.coordinates.numbers(vector), axis=-1)
+        given = coefficients_in(self.model)
         values = {
-            name: jnp.where(self.moves[i], told[i], own.get(name, 0.0))
+            name: jnp.where(self.moves[i], moved[i], given.get(name, 0.0))
             for i, name in enumerate(self.names)
         }
         return with_coefficients(self.model, values)
@@ -54,8 +54,8 @@ def tunable_of(model: Model, space: Space, *, count: int | None = None) -> Tunab
     """Return the model moved by a space, with parameters that move nothing up to a count."""
     spare = 0 if count is None else count - len(space)
     free = {name for parameter in space.parameters for name in parameter.ratios}
-    own = coefficients_in(model)
-    names = (*own, *sorted(free - set(own)))
+    given = coefficients_in(model)
+    names = (*given, *sorted(free - set(given)))
     ratios = np.zeros((len(names), len(space) + spare))
     for column, parameter in enumerate(space.parameters):
         for name, ratio in parameter.ratios.items():

@@ -16,7 +16,7 @@ from tuner.flights.flight import Flight, Series
 from tuner.flights.initial import initial_state
 
 BEFORE = 1.2
-"""s of a recording before a window that may help to tell its start."""
+"""s of a recording before a window that may help to estimate its start."""
 BEHIND = 0.1
 """s behind it."""
 FEWEST = 8
@@ -50,17 +50,17 @@ def windows_of(flight: Flight, seconds: float) -> tuple[Window, ...]:
         No stretch of the flight holds enough poses.
     """
     count = max(1, round(seconds * flight.rate))
-    found = []
+    windows = []
     for first in range(0, len(flight.time) - count // 2, count):
         last = min(first + count, len(flight.time) - 1)
         window = _window(flight, first, last)
         if window is not None:
-            found.append(window)
-    if not found:
+            windows.append(window)
+    if not windows:
         raise RecordingError(
             flight.path, f"holds no {seconds:g} s with poses throughout", "record motion capture"
         )
-    return tuple(found)
+    return tuple(windows)
 
 
 def _window(flight: Flight, first: int, last: int) -> Window | None:
@@ -84,9 +84,9 @@ def _window(flight: Flight, first: int, last: int) -> Window | None:
 
 
 def _around(series: Mapping[str, Series], begin: float, end: float) -> dict[str, Series]:
-    found = {}
-    for name, one in series.items():
-        near = (one.time >= begin - BEFORE) & (one.time <= end + BEHIND)
+    cut = {}
+    for name, signal in series.items():
+        near = (signal.time >= begin - BEFORE) & (signal.time <= end + BEHIND)
         if near.any():
-            found[name] = Series(one.time[near] - begin, one.values[near])
-    return found
+            cut[name] = Series(signal.time[near] - begin, signal.values[near])
+    return cut

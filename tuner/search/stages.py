@@ -16,7 +16,7 @@ GENTLE = 1.0
 ENOUGH = 0.01
 """Loss at which such a stage has done its part: the next sees further."""
 OFFSETS_FROM = 5.0
-"""s of horizon from which the clocks' offsets are free: before, nothing tells them from lag."""
+"""s of horizon from which the clocks' offsets are free: before, they look like lag."""
 EVOLVED = (0.8, 3.0)
 """s of horizon at which CMA-ES looks for where to begin."""
 GENERATIONS = 60

@@ -42,14 +42,14 @@ def test_random_starts_lie_in_the_box_and_the_first_is_the_vehicles(updated):
     assert vectors.shape == (50, 3)
     np.testing.assert_allclose(vectors[0], job.space.initial)
     values = [job.space.values(vector) for vector in vectors]
-    drawn = np.array([float(one["motor_constant"]) for one in values])
+    drawn = np.array([float(drawn_values["motor_constant"]) for drawn_values in values])
     initial = job.space.parameters[job.space.names.index("motor_constant")].initial
     ratio = drawn / initial
     assert 1 / 3.01 < ratio.min() < 0.5
     assert 2.0 < ratio.max() < 3.01
     np.testing.assert_array_equal(vectors, starting_vectors(job))
-    other = job_with(updated, starts=50, spread=3.0, seed=1)
-    assert not np.array_equal(vectors[1:], starting_vectors(other)[1:])
+    reseeded = job_with(updated, starts=50, spread=3.0, seed=1)
+    assert not np.array_equal(vectors[1:], starting_vectors(reseeded)[1:])
 
 
 def test_starts_that_agree_are_believed(fitted, updated):
@@ -81,12 +81,12 @@ def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
             controller=SimpleNamespace(mixer=SimpleNamespace(saturation_feedback=True))
         )
     )
-    one = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
-    assert set(unmatched(one)) == {"c"}
-    (finding,) = end_findings(job, 1.0, one)
+    one_stray = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
+    assert set(unmatched(one_stray)) == {"c"}
+    (finding,) = end_findings(job, 1.0, one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
-    every = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
-    (finding,) = end_findings(job, 1.0, every)
+    all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
+    (finding,) = end_findings(job, 1.0, all_far)
     assert finding.code is Code.MODEL_UNMATCHED
     assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
 
@@ -109,7 +109,7 @@ def test_a_lag_known_more_finely_than_physics_steps_is_warned_of():
 
 def test_time_left_falls_to_nothing():
     stages = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
-    told = [left(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
-    assert told == sorted(told, reverse=True)
-    assert told[-1] == 0.0
+    remaining = [left(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
+    assert remaining == sorted(remaining, reverse=True)
+    assert remaining[-1] == 0.0
     assert np.isnan(left(stages, 0, 0, 0.0))

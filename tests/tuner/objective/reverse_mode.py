@@ -60,14 +60,14 @@ def gradients(
     point
         Its clock offsets hold for all.
     """
-    found: Gradients = _shared(objective.flier)(
+    result: Gradients = _shared(objective.flier)(
         np.asarray(vectors).T,
         objective.data(point.offsets, criterion),
         objective.tunable,
         np.asarray(criterion.horizon),
         np.asarray(criterion.huber),
     )
-    return found
+    return result
 
 
 @lru_cache(maxsize=16)
@@ -85,14 +85,14 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
         return Gradients(values, slopes)
 
     def share(vectors: Array, data: SegmentData, *rest: Any) -> Gradients:
-        found: Gradients = in_pieces(some, _vectors_at_once(flier, data))(vectors, data, *rest)
-        return found
+        result: Gradients = in_pieces(some, _vectors_at_once(flier, data))(vectors, data, *rest)
+        return result
 
     return over_devices(share)
 
 
 def _vectors_at_once(flier: Flier, data: SegmentData) -> int:
     segments = data.segments.count
-    one = 8 * _REMEMBERED * flier.capacity * flier.schedule.blocks_per_sample * segments
+    bytes_of_vector = 8 * _REMEMBERED * flier.capacity * flier.schedule.blocks_per_sample * segments
     memory = flier.memory // len(jax.devices())
-    return max(1, min(piece_that_fits(8) // segments, memory // one))
+    return max(1, min(piece_that_fits(8) // segments, memory // bytes_of_vector))

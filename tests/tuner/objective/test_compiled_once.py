@@ -34,8 +34,8 @@ def shortened(flight, seconds):
         time=flight.time[kept],
         signals={name: rows[kept] for name, rows in flight.signals.items()},
         series={
-            name: Series(one.time[one.time <= end], one.values[one.time <= end])
-            for name, one in flight.series.items()
+            name: Series(signal.time[signal.time <= end], signal.values[signal.time <= end])
+            for name, signal in flight.series.items()
         },
     )
 
@@ -64,15 +64,18 @@ def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypat
     traced = []
     forward = flier._jacobian_forward
     monkeypatch.setattr(flier, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
-    found = fit.jacobian(fit.start(fit.space.initial), criterion, columns=3)
+    together = fit.jacobian(fit.start(fit.space.initial), criterion, columns=3)
     for group in groups:
-        one = problem(group)
-        alone = one.jacobian(one.start(one.space.initial), criterion, columns=3)
+        part = problem(group)
+        alone = part.jacobian(part.start(part.space.initial), criterion, columns=3)
         for channel, columns in alone.columns.items():
-            for number, name in enumerate(one.space.names):
+            for number, name in enumerate(part.space.names):
                 np.testing.assert_allclose(
-                    found.columns[channel][names.index(name)], columns[number], rtol=1e-9, atol=1e-9
+                    together.columns[channel][names.index(name)],
+                    columns[number],
+                    rtol=1e-9,
+                    atol=1e-9,
                 )
-            offsets = found.columns[channel][len(names) :]
+            offsets = together.columns[channel][len(names) :]
             np.testing.assert_allclose(offsets, columns[len(group) :], rtol=1e-9, atol=1e-9)
     assert len(traced) <= 1  # by none, if another test was here before

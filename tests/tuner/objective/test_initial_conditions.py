@@ -23,9 +23,9 @@ def test_elimination_is_the_minimum_over_the_start():
         jnp.asarray(loss), jnp.asarray(gradient), jnp.asarray(hessian), jnp.asarray(centre)
     )
     for segment in range(segments):
-        own = hessian[kept:, kept:, segment] + np.eye(states)
+        curvature = hessian[kept:, kept:, segment] + np.eye(states)
         pull = gradient[kept:, segment] + centre[:, segment]
-        step = -np.linalg.solve(own, pull)
+        step = -np.linalg.solve(curvature, pull)
         np.testing.assert_allclose(best[:, segment], centre[:, segment] + step, rtol=1e-9)
         want = loss[segment] + 0.5 * centre[:, segment] @ centre[:, segment] + 0.5 * pull @ step
         assert float(least[segment]) == pytest.approx(want)
@@ -33,7 +33,7 @@ def test_elimination_is_the_minimum_over_the_start():
         np.testing.assert_allclose(left[:, segment], gradient[:kept, segment] + across @ step)
         np.testing.assert_allclose(
             information[..., segment],
-            hessian[:kept, :kept, segment] - across @ np.linalg.solve(own, across.T),
+            hessian[:kept, :kept, segment] - across @ np.linalg.solve(curvature, across.T),
             rtol=1e-9,
         )
 

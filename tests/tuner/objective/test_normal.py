@@ -41,12 +41,12 @@ def test_offset_gradient_equals_finite_differences(fit):
     at = np.asarray(fit.space.initial)
     late = np.full((5, 2), 0.03)
     _, gradient, _ = loss_at(fit, at, late, criterion)
-    own = gradient[len(at) :].reshape(5, 2)
+    by_offset = gradient[len(at) :].reshape(5, 2)
     step = np.zeros((5, 2))
     step[0, 0] = 1e-4
     up, _, _ = loss_at(fit, at, late + step, criterion)
     down, _, _ = loss_at(fit, at, late - step, criterion)
-    assert float(own[0, 0]) == pytest.approx(float(up - down) / 2e-4, rel=1e-2)
+    assert float(by_offset[0, 0]) == pytest.approx(float(up - down) / 2e-4, rel=1e-2)
 
 
 def test_the_truth_has_no_residual_and_no_gradient(fit):

@@ -22,14 +22,14 @@ def test_reverse_mode_gives_forward_modes_gradient(fit):
     late = jnp.full((5, 2), 0.1)
     steps = np.random.default_rng(1).normal(0.0, 0.2, (3, len(FREE)))
     vectors = np.asarray(fit.space.initial) + steps
-    found = gradients(fit, vectors, Point(jnp.asarray(vectors[0]), late), criterion)
-    assert found.gradient.shape == (len(FREE), 3)
+    backwards = gradients(fit, vectors, Point(jnp.asarray(vectors[0]), late), criterion)
+    assert backwards.gradient.shape == (len(FREE), 3)
     for number, vector in enumerate(vectors):
         sums = fit.sums(Point(jnp.asarray(vector), late), criterion)
-        np.testing.assert_allclose(found.loss[number], np.sum(sums.loss), rtol=1e-9)
+        np.testing.assert_allclose(backwards.loss[number], np.sum(sums.loss), rtol=1e-9)
         forward = np.sum(sums.gradient, axis=-1)[: len(FREE)]
         np.testing.assert_allclose(
-            found.gradient[:, number], forward, rtol=1e-6, atol=1e-8 * np.abs(forward).max()
+            backwards.gradient[:, number], forward, rtol=1e-6, atol=1e-8 * np.abs(forward).max()
         )
 
 

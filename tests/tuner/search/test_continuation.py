@@ -38,9 +38,9 @@ def test_truth_is_recovered_from_every_start(fit):
     ]
     progress, reports = searched(fit, starts)
     for start in range(2):
-        found = fit.space.values(progress.points.coefficients[start])
+        fitted = fit.space.values(progress.points.coefficients[start])
         for name, value in values.items():
-            assert float(found[name]) == pytest.approx(float(value), rel=0.02), (start, name)
+            assert float(fitted[name]) == pytest.approx(float(value), rel=0.02), (start, name)
     assert progress.converged
     assert len(reports) == progress.evaluations
     assert reports[-1].iterations[-1].stage == "polish again"
@@ -58,10 +58,10 @@ def test_a_flight_of_noise_is_weighed_down_and_the_others_are_fitted(fit):
     poisoned = eqx.tree_at(lambda o: o.segments.measured, fit, spoilt)
     progress, _ = searched(poisoned, [np.asarray(fit.space.initial) + 0.1])
     assert min(float(scale[1]) for scale in progress.scales.values()) > 10
-    found = fit.space.values(progress.points.coefficients[0])
+    fitted = fit.space.values(progress.points.coefficients[0])
     true = fit.space.values(jnp.asarray(fit.space.initial))
-    assert float(found["inertia_xx"]) == pytest.approx(float(true["inertia_xx"]), rel=0.05)
-    assert float(found["motor_constant"]) == pytest.approx(float(true["motor_constant"]), rel=0.01)
+    assert float(fitted["inertia_xx"]) == pytest.approx(float(true["inertia_xx"]), rel=0.05)
+    assert float(fitted["motor_constant"]) == pytest.approx(float(true["motor_constant"]), rel=0.01)
 
 
 def test_the_same_search_twice_gives_the_same_numbers(fit):

@@ -57,17 +57,17 @@ def test_generations_come_closer_to_the_truth(fit):
 def test_a_seed_decides_the_numbers(fit):
     _, first, _ = evolved(fit, seed=3)
     _, again, _ = evolved(fit, seed=3)
-    _, other, _ = evolved(fit, seed=4)
+    _, reseeded, _ = evolved(fit, seed=4)
     np.testing.assert_array_equal(first.points.coefficients, again.points.coefficients)
-    assert not np.array_equal(first.points.coefficients, other.points.coefficients)
+    assert not np.array_equal(first.points.coefficients, reseeded.points.coefficients)
 
 
 def test_what_is_fixed_stays(fit):
     free = np.array([True, False, True])
     start, end, _ = evolved(fit, seed=0, free=free)
-    found = np.asarray(end.points.coefficients[0])
-    assert found[1] == pytest.approx(start[1], rel=1e-9)
-    assert found[0] != start[0]
+    vector = np.asarray(end.points.coefficients[0])
+    assert vector[1] == pytest.approx(start[1], rel=1e-9)
+    assert vector[0] != start[0]
 
 
 @pytest.mark.parametrize("windows", [True, False])
