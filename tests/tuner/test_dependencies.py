@@ -37,8 +37,12 @@ def declared(extra: str | None) -> set[str]:
     return {normalised(re.match(r"[\w.-]+", line)[0]) for line in requirements}
 
 
-def modules(tree: ast.AST) -> Iterator[str]:
-    """Yield the modules that a file imports, those named to `importlib` and `importorskip` too."""
+def modules(tree: ast.AST, *, by_name: bool = True) -> Iterator[str]:
+    """Yield the modules that a file imports, those named to `importlib` and `importorskip` too.
+
+    Tests name to `importlib` what they have written themselves, so that there it does not count.
+    """
+    functions = {"importorskip", "import_module"} if by_name else {"importorskip"}
     for node in ast.walk(tree):
         match node:
             case ast.Import(names=names):
@@ -46,9 +50,8 @@ def modules(tree: ast.AST) -> Iterator[str]:
             case ast.ImportFrom(module=str(module), level=0):
                 yield module
             case ast.Call(
-                func=ast.Attribute(attr="import_module" | "importorskip"),
-                args=[ast.Constant(value=str(module)), *_],
-            ):
+                func=ast.Attribute(attr=function), args=[ast.Constant(value=str(module)), *_]
+            ) if function in functions:
                 yield module
 
 
@@ -57,7 +60,9 @@ def imported(*folders: str) -> set[str]:
         module.split(".")[0]
         for folder in folders
         for path in (ROOT / folder).rglob("*.py")
-        for module in modules(ast.parse(path.read_text(encoding="utf-8")))
+        for module in modules(
+            ast.parse(path.read_text(encoding="utf-8")), by_name=folder != "tests"
+        )
     }
     outside = packages - sys.stdlib_module_names - OURS - {"compression"}  # of Python 3.14
     return {normalised(DISTRIBUTIONS.get(package, package)) for package in outside}
