@@ -10,7 +10,7 @@ from tuner.config import Options, Settings, check_names, settle
 from tuner.design.candidates import Arena
 from tuner.design.next_flight_json import Proposals
 from tuner.disk import make_folder
-from tuner.errors import InputError
+from tuner.errors import InputError, did_you_mean
 from tuner.examination.examination import Examination, examine
 from tuner.examination.sensitivity_json import Knowledge
 from tuner.findings import Finding
@@ -25,6 +25,7 @@ from tuner.report.traces import write_simulated
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.global_indices import global_sensitivity
 from tuner.sensitivity_analysis.global_sensitivity_json import Method, write_global
+from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import write_profiles
 
@@ -147,9 +148,28 @@ def _write_requested(
     profiles = []
     for name in request.profiles:
         on_message(f"fitting the others again for each value of {name}")
-        profiles.append(profile_likelihood(examination, fitted.criterion, name))
+        uncertainty = _uncertainty_with(examination, name)
+        profiles.append(
+            profile_likelihood(examination.full_problem, uncertainty, fitted.criterion, name)
+        )
     if profiles:
         write_profiles(profiles, folder)
+
+
+def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:
+    """Return the uncertainty of the fitted coefficients and a named one.
+
+    Raises
+    ------
+    InputError
+        There is no such coefficient in this simulation.
+    """
+    if name in examination.uncertainty.names:
+        return examination.uncertainty
+    if name in examination.freed:
+        return examination.freed[name]
+    names = examination.sensitivity.names
+    raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
 
 
 def _ranges(job: Job, examination: Examination, span: float) -> dict[str, tuple[float, float]]:

@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.config import COEFFICIENTS
-from tuner.errors import InputError, did_you_mean
-from tuner.examination.examination import Examination
-from tuner.examination.sensitivity_json import numbers
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
 from tuner.uncertainty.covariance import WIDE
-from tuner.uncertainty.full_problem import with_space
+from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.full_problem import FullProblem, with_space
 from tuner.uncertainty.profiles_json import THRESHOLD, Profile
 
 Array = NDArray[np.float64]
@@ -36,34 +34,25 @@ TOLERANCE = 0.01
 """Decrease of every point's χ² below which refitting stops."""
 
 
-def profile_likelihood(examination: Examination, criterion: Criterion, name: str) -> Profile:
+def profile_likelihood(
+    full_problem: FullProblem, uncertainty: Uncertainty, criterion: Criterion, name: str
+) -> Profile:
     """Return the profile of one coefficient, fitted or fixed.
 
     Parameters
     ----------
-    examination
-        Of the point where the coefficient stands.
+    full_problem
+        The problem in all coefficients, at the fit's point.
+    uncertainty
+        At this point, of the coefficient and of those that are fitted again for each of its values.
     criterion
         Whose weights the residuals have; of the priors, only as much is kept as keeps the other
         coefficients from diverging.
     name
         The coefficient.
-
-    Raises
-    ------
-    InputError
-        There is no such coefficient in this simulation.
     """
-    full_problem = examination.full_problem
-    names = full_problem.objective.space.names
-    if name not in names:
-        raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
-    chosen = full_problem.fitted if name in full_problem.fitted else (*full_problem.fitted, name)
-    space, indices = full_problem.subspace(chosen)
+    space, indices = full_problem.subspace(uncertainty.names)
     objective = with_space(full_problem.objective, space)
-    uncertainty = (
-        examination.uncertainty if name in full_problem.fitted else examination.freed[name]
-    )
     index = space.names.index(name)
     vector = np.asarray(full_problem.point.coefficients)[indices]
     centre = np.asarray(space.scaled(jnp.asarray(vector)))
@@ -85,7 +74,7 @@ def profile_likelihood(examination: Examination, criterion: Criterion, name: str
         name=name,
         unit=COEFFICIENTS[name].unit,
         values=values,
-        rise=numbers(rise),
+        rise=[float(value) if np.isfinite(value) else None for value in rise],
         quadratic=quadratic.tolist(),
         interval=_crossings(np.array(values), rise),
     )

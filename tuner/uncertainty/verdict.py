@@ -87,7 +87,7 @@ class Reason(Part):
     direction
         The combination of coefficients that the flights do not determine.
     tied_to
-        The coefficient that it is a constant multiple of; all else is said of that one.
+        The coefficient that it is a constant multiple of; all else refers to that coefficient.
     given_held
         The coefficient held at its initial value, given which alone this one was fitted.
     fitted_value

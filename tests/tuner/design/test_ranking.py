@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.design import ranking
+from tuner.design import candidate_problem
 from tuner.design.candidates import CLEARANCE, Arena, candidates
 from tuner.design.next_flight_json import (
     Proposals,
@@ -42,8 +42,8 @@ def fitted() -> Fitted:
     """A fit to the swing alone, which hardly turns about up, met 200 times worse than noise."""
     exact = making.problem(FREE)
     noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
-    alone = only(noisy, 0)
-    exact_fit = making.fitted_of(alone, making.truth(alone))
+    swing = only(noisy, 0)
+    exact_fit = making.fitted_of(swing, making.truth(swing))
     rough = {name: 200.0 * scale[:1] for name, scale in exact_fit.criterion.scale.items()}
     criterion = eqx.tree_at(
         lambda s: (s.scale, s.reference_offset), exact_fit.criterion, (rough, np.zeros((2, 1)))
@@ -91,7 +91,7 @@ def test_fewer_samples_of_larger_weight_carry_nearly_the_same_information(
     proposals: Proposals,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(ranking, "SAMPLE_RATE", 50.0)
+    monkeypatch.setattr(candidate_problem, "SAMPLE_RATE", 50.0)
     coarser = ranked(examination, fitted)
     by_name = {row.name: row for row in coarser.flights}
     for row in proposals.flights:

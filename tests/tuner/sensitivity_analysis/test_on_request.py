@@ -11,6 +11,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.errors import InputError
 from tuner.examination.examination import Examination, examine
+from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.global_indices import _outputs, global_sensitivity
@@ -61,19 +62,19 @@ def indices(objective: Objective, method: Method, samples: int) -> GlobalSensiti
 def test_indices_put_first_what_matters_most(
     objective: Objective, method: Method, samples: int, simulations: int, tmp_path: Path
 ) -> None:
-    found = indices(objective, method, samples)
-    assert found.simulations == simulations
-    total = {one.coefficient: one.total for one in found.indices if not one.flight}
+    result = indices(objective, method, samples)
+    assert result.simulations == simulations
+    total = {index.coefficient: index.total for index in result.indices if not index.flight}
     assert total["motor_constant"] > 10 * total["rolling_moment_coefficient"]
     spin = {
-        one.coefficient: one.total
-        for one in found.indices
-        if (one.flight, one.channel) == ("spin", "body_rate")
+        index.coefficient: index.total
+        for index in result.indices
+        if (index.flight, index.channel) == ("spin", "body_rate")
     }
     assert spin["moment_constant"] > spin["rolling_moment_coefficient"]
-    assert indices(objective, method, samples) == found
-    write_global(found, tmp_path)
-    assert read_global(tmp_path) == found
+    assert indices(objective, method, samples) == result
+    write_global(result, tmp_path)
+    assert read_global(tmp_path) == result
     lines = (tmp_path / "global_sensitivity.csv").read_text().splitlines()
     assert len(lines) == 1 + len(FREE) * (1 + 8)
 
@@ -81,9 +82,9 @@ def test_indices_put_first_what_matters_most(
 def test_a_crash_counts_as_no_better_than_the_worst_that_flew(objective: Objective) -> None:
     channels = objective.segments.measured
     squares = {name: np.ones((3, m.weight.shape[1], 2)) for name, m in channels.items()}
-    for one in squares.values():
-        one[1] = 100.0
-        one[2] = np.nan
+    for sums in squares.values():
+        sums[1] = 100.0
+        sums[2] = np.nan
     crashed = np.array([[True, False], [False, False], [False, False]])
     names, values = _outputs(objective, squares, crashed, making.FLIGHTS)
     swing = names.index(("swing", "position"))
@@ -96,7 +97,9 @@ def test_a_crash_counts_as_no_better_than_the_worst_that_flew(objective: Objecti
 
 @pytest.fixture(scope="module")
 def known(examination: Examination, fitted: Fitted) -> Profile:
-    return profile_likelihood(examination, fitted.criterion, "moment_constant")
+    return profile_likelihood(
+        examination.full_problem, examination.uncertainty, fitted.criterion, "moment_constant"
+    )
 
 
 @pytest.mark.slow
@@ -107,16 +110,18 @@ def test_a_well_known_coefficients_profile_is_its_interval(
     assert known.interval[0] is not None
     assert known.interval[1] is not None
     assert known.interval[1] - known.interval[0] == pytest.approx(high - low, rel=0.1)
-    assert min(one for one in known.rise if one is not None) == 0.0
+    assert min(value for value in known.rise if value is not None) == 0.0
 
 
 @pytest.mark.slow
-def test_what_cannot_be_told_has_an_open_profile(
+def test_what_is_not_identifiable_has_an_open_profile(
     examination: Examination, fitted: Fitted, known: Profile, tmp_path: Path
 ) -> None:
     rough = {name: 30.0 * scale for name, scale in fitted.criterion.scale.items()}
     criterion = eqx.tree_at(lambda s: s.scale, fitted.criterion, rough)
-    rolling = profile_likelihood(examination, criterion, "rolling_moment_coefficient")
+    rolling = profile_likelihood(
+        examination.full_problem, examination.uncertainty, criterion, "rolling_moment_coefficient"
+    )
     assert rolling.interval == (None, None)
     write_profiles([known, rolling], tmp_path)
     read = read_profiles(tmp_path)
@@ -125,6 +130,6 @@ def test_what_cannot_be_told_has_an_open_profile(
 
 
 @pytest.mark.slow
-def test_an_unknown_coefficient_is_named(examination: Examination, fitted: Fitted) -> None:
+def test_an_unknown_coefficient_is_named(examination: Examination) -> None:
     with pytest.raises(InputError, match="did you mean 'moment_constant'"):
-        profile_likelihood(examination, fitted.criterion, "moment_constand")
+        _uncertainty_with(examination, "moment_constand")

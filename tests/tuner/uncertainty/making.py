@@ -75,18 +75,18 @@ def problem(free: Sequence[str], *, job: Mapping[str, object] | None = None) -> 
 def _sensors() -> dict[str, Measured]:
     time = np.arange(SAMPLE_EVERY, round(SECONDS * PHYSICS) - 1, SAMPLE_EVERY) / PHYSICS
     count = len(time)
-    found = {}
+    measured = {}
     for channel, sigma in NOISE.items():
         read = 4 if channel in ("attitude", "rotor_speed") else 3
         compared = 3 if channel == "attitude" else read
         values = np.zeros((count, read, 2))
         values[:, 0] = 1.0 if channel == "attitude" else 0.0
-        found[channel] = Measured(
+        measured[channel] = Measured(
             time=jnp.asarray(np.stack([time, time], axis=-1)),
             values=jnp.asarray(values),
             weight=jnp.full((count, compared, 2), 1.0 / sigma),
         )
-    return found
+    return measured
 
 
 def truth(objective: Objective) -> Point:

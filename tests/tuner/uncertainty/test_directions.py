@@ -1,4 +1,4 @@
-"""The worst-determined combinations are found and named."""
+"""The combinations of coefficients that are determined worst."""
 
 from __future__ import annotations
 
