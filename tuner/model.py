@@ -78,15 +78,15 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
     """Return the simulator's vehicle, float64 where that is switched on."""
-    first, second, third, fourth = (
-        Rotor(_vector(rotor.position), 1 if rotor.spin == "ccw" else -1) for rotor in file.rotors
-    )
     aerodynamics = file.aerodynamics
     return Vehicle(
         body=Body(
             *map(jnp.asarray, (file.mass, file.inertia.xx, file.inertia.yy, file.inertia.zz))
         ),
-        rotors=(first, second, third, fourth),
+        rotors=tuple(
+            Rotor(_vector(rotor.position), 1 if rotor.spin == "ccw" else -1)
+            for rotor in file.rotors
+        ),
         motor=Motor(**{key: jnp.asarray(value) for key, value in file.motor}),
         aerodynamics=Aerodynamics(
             **{k: jnp.asarray(v) for k, v in aerodynamics if k != "reaction_torque"},

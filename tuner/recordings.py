@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from tuner.config import Settings, TrajectorySettings
+from tuner.config import Settings, TrajectorySettings, check_mixer
 from tuner.errors import InputError, did_you_mean
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
-from tuner.objective.inlets import InletName, inlet_for
+from tuner.objective.inlets import INLETS, InletName, inlet_for
 from tuner.simulation.trajectory import with_named_reference
 from tuner.yaml_files.section import build
 
@@ -93,6 +93,8 @@ def recordings_of(
     ------
     RecordingError
         A flight does not hold what its inlet needs.
+    ConfigError
+        The vehicle has rotors that the mixer above an inlet cannot fly.
     """
     held_out = settings.job.holdout if holdout is None else holdout
     return tuple(_assigned(settings, flight, flight.name in held_out) for flight in flights)
@@ -111,9 +113,12 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if flight_settings is not None:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
+    chosen = inlet_for(flight, inlet)
+    if INLETS[chosen].has_mixer:
+        check_mixer(settings.vehicle)
     return Recording(
         flight,
-        inlet_for(flight, inlet),
+        chosen,
         None if offset == "free" else float(offset),
         holdout,
     )

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from tuner.coefficients import COEFFICIENTS, REGISTRY
 from tuner.coefficients.space import space_of
+from tuner.coefficients.table import markdown_table
 from tuner.config import ControllerFile, JobFile, initial_values, read_vehicle, with_values
 from tuner.config.controller import Filters
 from tuner.config.job import CoefficientSettings
@@ -16,6 +17,8 @@ from tuner.errors import ConfigError
 from tuner.model import coefficients_in, model_of, with_coefficients
 from tuner.objective.tunable import tunable_of
 from tuner.yaml_files.shipped import find_config
+
+README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.fixture(scope="module")
@@ -167,3 +170,7 @@ def test_every_row_is_complete():
             assert row.neutral is not None
             low, high = row.limits(row.neutral)
             assert low < row.neutral < high
+
+
+def test_the_table_of_the_readme_is_the_registrys():
+    assert markdown_table() in README.read_text(encoding="utf-8")

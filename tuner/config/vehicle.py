@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.errors import did_you_mean
+from tuner.errors import ConfigError, did_you_mean
 from tuner.yaml_files.section import (
     NonNegative,
     Number,
@@ -21,6 +21,9 @@ from tuner.yaml_files.section import (
 
 #: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
 QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))
+
+
+ROTOR_COUNTS = (4, 6, 8)
 
 
 class Inertia(Section):
@@ -150,7 +153,8 @@ class VehicleFile(Section):
     inertia
         Principal moments of inertia.
     rotors
-        Four, in PX4's motor order (front right, rear left, front left, rear right).
+        Four in PX4's motor order (front right, rear left, front left, rear right), or six or eight
+        in any order.
     motor, aerodynamics, setup
         See there.
     effects
@@ -163,7 +167,7 @@ class VehicleFile(Section):
     name: str
     mass: Positive
     inertia: Inertia
-    rotors: tuple[Rotor, Rotor, Rotor, Rotor]
+    rotors: tuple[Rotor, ...]
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup = Setup()
@@ -173,7 +177,14 @@ class VehicleFile(Section):
     source: dict[str, JsonValue] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _is_a_quad_x(self) -> Self:
+    def _has_rotors_in_order(self) -> Self:
+        if len(self.rotors) not in ROTOR_COUNTS:
+            counts = ", ".join(map(str, ROTOR_COUNTS[:-1]))
+            raise refuse(
+                f"rotors are {len(self.rotors)}", f"list {counts} or {ROTOR_COUNTS[-1]} rotors"
+            )
+        if not self.is_quad:
+            return self
         for index, (rotor, expected) in enumerate(zip(self.rotors, QUAD_X, strict=True)):
             sign_x, sign_y, spin = expected
             if rotor.position[0] * sign_x <= 0 or rotor.position[1] * sign_y <= 0:
@@ -188,6 +199,27 @@ class VehicleFile(Section):
                     "the quad-X mixer needs the first two rotors ccw and the last two cw",
                 )
         return self
+
+    @property
+    def is_quad(self) -> bool:
+        """Whether it has four rotors, as the simulated mixer needs."""
+        return len(self.rotors) == len(QUAD_X)
+
+
+def check_mixer(vehicle: VehicleFile) -> None:
+    """Refuse a vehicle that the simulated mixer, which is the quad X's, cannot fly.
+
+    Raises
+    ------
+    ConfigError
+        It has more than four rotors.
+    """
+    if not vehicle.is_quad:
+        raise ConfigError(
+            vehicle.name,
+            f"has {len(vehicle.rotors)} rotors, and the simulated mixer flies four only",
+            "fit it through the inlet actuator or rotor_speed, which need no mixer",
+        )
 
 
 def read_vehicle(path: str | Path) -> VehicleFile:

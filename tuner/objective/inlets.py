@@ -53,6 +53,8 @@ class RecordedInlet(ABC):
     closed_loop: ClassVar[bool] = False
     """Whether the position controller is simulated: it keeps a whole flight to its path, and the
     recording's clock is the reference's rather than the flight controller's."""
+    has_mixer: ClassVar[bool] = False
+    """Whether the mixer, which is that of a quad X, is simulated."""
     remedy: ClassVar[str] = "use inlet: auto"
     """What to do where a signal is missing."""
 
@@ -114,6 +116,7 @@ class RecordedReference(RecordedInlet):
     needs = ("reference_position",)
     ignores = ("trim",)
     closed_loop = True
+    has_mixer = True
     remedy = "name its trajectory in the job file"
 
     def is_preferred(self, flight: Flight) -> bool:
@@ -147,6 +150,7 @@ class RecordedBodyRate(RecordedInlet):
     feeds = BodyRateInlet
     needs = ("rate_setpoint", "thrust_setpoint")
     ignores = ("trim",)
+    has_mixer = True
 
     def update_rate(self, schedule: Schedule) -> float:
         """Return the rate of the position controller."""

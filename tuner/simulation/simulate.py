@@ -16,7 +16,7 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
-from tuner.config import ControllerFile, TrajectorySettings, VehicleFile
+from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, check_mixer
 from tuner.flights.flight import Array, Series
 from tuner.flights.resample import resample
 from tuner.model import Model, model_of, schedule_of, with_coefficients
@@ -90,6 +90,7 @@ def simulate(
     sent = _sent(reference, clock, control_rate)
     samples = math.ceil(duration * schedule.log_rate) + 1
     log_time = np.arange(samples) / schedule.log_rate
+    check_mixer(vehicle)
     model = model_of(vehicle, controller)
     fly = _flier(schedule, samples, precision)
     for columns, wanted in _chunks(grid or {}):

@@ -76,7 +76,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("search: {starts: 0}", "search.starts is 0"),
         ("search: {seed: 1.5}", "search.seed is 1.5"),
         ("flights: {a: {trajectory: {name: square}}}", "flights.a.trajectory.name is 'square'"),
-        ("export: {formats: [urdf]}", "export.formats[0] is 'urdf'"),
+        ("export: {formats: [urdf]}", "unknown export format 'urdf'; did you mean 'sdf'?"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_in_one_line(tmp_path, text, expected):

@@ -2,7 +2,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tuner.config import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
+from tuner.config import (
+    COEFFICIENTS,
+    check_mixer,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
 from tuner.config.vehicle import Aerodynamics, Inertia, Motor, Setup
 from tuner.errors import ConfigError
 from tuner.yaml_files.shipped import configs_folder
@@ -189,4 +196,22 @@ def test_effects_are_optional_numbers_under_names_of_the_registry(vehicle_text, 
     with pytest.raises(
         ConfigError, match=r"'effects\.fuselage_darg'; did you mean 'fuselage_drag'"
     ):
+        read_vehicle(path)
+
+
+def test_six_and_eight_rotors_are_read_and_only_the_mixer_refuses_them(vehicle_text, tmp_path):
+    path = tmp_path / "v.yaml"
+    extra = [
+        "  - {position: [0.0, 0.3, 0.0], spin: ccw}\n",
+        "  - {position: [0.0, -0.3, 0.0], spin: cw}\n",
+    ]
+    path.write_text(vehicle_text.replace("motor:\n", "".join(extra) + "motor:\n", 1))
+    hexacopter = read_vehicle(path)
+    assert len(hexacopter.rotors) == 6
+    check_mixer(read_vehicle(ORIGINAL))
+    with pytest.raises(ConfigError, match="has 6 rotors") as error:
+        check_mixer(hexacopter)
+    assert "inlet actuator or rotor_speed" in str(error.value)
+    path.write_text(vehicle_text.replace("motor:\n", extra[0] + "motor:\n", 1))
+    with pytest.raises(ConfigError, match="rotors are 5; list 4, 6 or 8 rotors"):
         read_vehicle(path)

@@ -1,0 +1,144 @@
+"""What is added in one place is seen all the way through.
+
+A coefficient is its row in the registry, a force is its function in the tuple of terms, an export
+target is a module: nothing else knows of them beforehand.
+"""
+
+import sys
+from types import ModuleType
+
+import pytest
+
+import tuner
+from sim_jax.numeric import safe_sqrt
+from sim_jax.rigid_body import Wrench
+from sim_jax.terms import total
+from sim_jax.vector import Vec3
+from tuner.coefficients import EFFECTS, REGISTRY, Coefficient, NotCarried, Written
+from tuner.config import (
+    ControllerFile,
+    JobFile,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
+from tuner.errors import ExportError
+from tuner.exporters import targets
+from tuner.exporters.draft import Draft, differences
+from tuner.exporters.target import Target, registered
+from tuner.flights.inspection import inspect_recordings
+from tuner.simulation.write import write_flights
+
+NAME = "sail_drag"
+TRUTH = 0.06
+
+ROW = Coefficient(
+    name=NAME,
+    unit="N s²/m²",
+    meaning="drag of a sail that turns its face to the air",
+    source="F = -d‖v‖v",
+    place=(EFFECTS, NAME),
+    scale="linear",
+    bounds=(-0.5, 0.5),
+    prior_sd=0.1,
+    step=0.05,
+    mass_exponent=1,
+    neutral=0.0,
+    exported_as={
+        "sdf": NotCarried("the motor plugins know no sail", 0.0),
+        "ini": Written("sail"),
+    },
+    informed_by="speed",
+)
+
+
+def sail_drag(vehicle, motion, rotor_speed, air):  # noqa: ARG001 (all terms take the same)
+    """Return -d‖v‖v of the body through the air."""
+    still = Vec3.zeros(air.velocity.x)
+    if NAME not in vehicle.effects:
+        return Wrench(still, still)
+    v = air.velocity
+    speed = safe_sqrt(v.x * v.x + v.y * v.y + v.z * v.z)
+    return Wrench(v * (-vehicle.effects[NAME] * speed), still)
+
+
+@pytest.fixture
+def added(monkeypatch):
+    """The row and the term, and nothing else."""
+    monkeypatch.setitem(REGISTRY, NAME, ROW)
+    monkeypatch.setattr(total, "TERMS", (*total.TERMS, sail_drag))
+
+
+@pytest.fixture
+def ini_target(monkeypatch):
+    """A module that exports all that a row gives it a key for."""
+
+    def draft(vehicle, _provenance, _choices):
+        rows = {name: REGISTRY[name] for name in values_of(vehicle)}
+        keys = {
+            n: row.exported_as["ini"].tag for n, row in rows.items() if "ini" in row.exported_as
+        }
+        values = {name: values_of(vehicle)[name] for name in keys}
+        text = "".join(f"{keys[name]}={value!r}\n" for name, value in values.items())
+
+        def faults(path):
+            lines = dict(line.split("=") for line in path.read_text().splitlines())
+            held = {name: float(lines[key]) for name, key in keys.items() if key in lines}
+            return differences(values, held)
+
+        return Draft(text, vehicle, (), faults)
+
+    def entry(row):
+        return registered("ini")(row) or NotCarried("an ini file holds sails alone")
+
+    module = ModuleType("tuner.exporters.targets.ini")
+    module.TARGET = Target("ini", ".ini", draft, entry)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(targets, "NAMES", [*targets.NAMES, "ini"])
+
+
+@pytest.mark.usefixtures("added")
+def test_a_row_is_a_key_of_the_vehicle_file_and_of_the_job_file(updated, tmp_path):
+    path = tmp_path / "v.yaml"
+    write_vehicle(with_values(updated, {NAME: TRUTH}), path)
+    assert values_of(read_vehicle(path))[NAME] == TRUTH
+    assert any(NAME in line and ROW.unit in line for line in path.read_text().splitlines())
+    assert JobFile(free=(NAME,)).free == (NAME,)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("added", "ini_target")
+def test_a_coefficient_and_its_term_are_fitted_judged_reported_and_exported(updated, tmp_path):
+    flown = with_values(updated, {NAME: TRUTH})
+    bag = tmp_path / "circle.bag"
+    flights = tuner.simulate("circle", vehicle=flown, radius=1.0, speed=3.0, duration=12.0)
+    write_flights(flights, bag)
+    (inspection,), _ = inspect_recordings([bag])
+    assert any(informed.coefficient == NAME for informed in inspection.coefficients)
+
+    run = tuner.fit(
+        [bag],
+        vehicle=updated,
+        controller=ControllerFile(),
+        free=[NAME, "rotor_drag_coefficient"],
+        out=tmp_path / "run",
+    )
+    result = run.result.coefficients[NAME]
+    assert result.initial == 0.0
+    assert result.best == pytest.approx(TRUTH, rel=0.02)
+    assert result.unit == ROW.unit
+    assert result.verdict == "well_known"
+    low, high = result.ci95
+    assert low < result.best < high
+    assert values_of(read_vehicle(run.folder / "best_fit.yaml"))[NAME] == result.best
+    assert NAME in (run.folder / "report.html").read_text(encoding="utf-8")
+    assert NAME in (run.folder / "sensitivity.csv").read_text(encoding="utf-8")
+
+    again = tuner.export(run, "yaml").path
+    assert values_of(read_vehicle(again))[NAME] == result.best
+    assert f"sail={result.best!r}" in tuner.export(run, "ini").path.read_text()
+    sdf = tuner.export(run, "sdf", accept="to read what is lost")
+    assert any("is not exported: the motor plugins know no sail" in note for note in sdf.notes)
+    with pytest.raises(ExportError, match=f"{NAME} is .* which --format px4 can neither write"):
+        tuner.export(run, "px4")
