@@ -18,7 +18,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     InputError
         A path does not exist, a glob matches nothing, or nothing is named at all.
     """
-    found: dict[Path, Path] = {}
+    recordings: dict[Path, Path] = {}
     for pattern in patterns:
         path = Path(pattern).expanduser()
         if exists(path):
@@ -34,7 +34,7 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
                 raise InputError(
                     match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
                 )
-            found.setdefault(match.resolve(), match)
-    if not found:
+            recordings.setdefault(match.resolve(), match)
+    if not recordings:
         raise InputError("--flights", "names no recording", "give the recordings to use")
-    return tuple(found.values())
+    return tuple(recordings.values())

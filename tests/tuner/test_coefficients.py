@@ -41,9 +41,9 @@ def test_values_come_back_from_the_search_vector(vehicle):
         JobFile(free=("inertia_xx", "motor_constant", "estimate_latency")),
     )
     values = {"inertia_xx": 0.03, "motor_constant": 1.2e-5, "estimate_latency": 0.02}
-    found = space.values(jnp.asarray(space.vector_of(values)))
+    returned = space.values(jnp.asarray(space.vector_of(values)))
     for name, value in values.items():
-        assert float(found[name]) == pytest.approx(value, rel=1e-9)
+        assert float(returned[name]) == pytest.approx(value, rel=1e-9)
 
 
 @given(st.lists(st.floats(-50, 50), min_size=12, max_size=12))
@@ -51,9 +51,9 @@ def test_no_step_leaves_the_bounds(steps):
     space = space_of(
         read_vehicle(find_config("vehicles", "hovergames", Path())), ControllerFile(), JobFile()
     )
-    found = space.values(jnp.asarray(steps))
+    values = space.values(jnp.asarray(steps))
     for parameter in space.parameters:
-        value = float(found[parameter.name])
+        value = float(values[parameter.name])
         assert parameter.lower * (1 - 1e-9) <= value <= parameter.upper * (1 + 1e-9)
 
 
@@ -75,9 +75,9 @@ def test_tied_coefficients_keep_their_ratio(vehicle):
     job = JobFile(free=("inertia_xx", "inertia_zz"), ties=(("inertia_xx", "inertia_zz"),))
     space = space_of(vehicle, ControllerFile(), job)
     assert space.names == ("inertia_xx",)
-    found = space.values(jnp.asarray(space.initial + 1.0))
+    values = space.values(jnp.asarray(space.initial + 1.0))
     ratio = vehicle.inertia.zz / vehicle.inertia.xx
-    assert float(found["inertia_zz"] / found["inertia_xx"]) == pytest.approx(ratio)
+    assert float(values["inertia_zz"] / values["inertia_xx"]) == pytest.approx(ratio)
 
 
 def test_a_tie_to_a_fixed_coefficient_is_refused(vehicle):

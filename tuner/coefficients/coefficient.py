@@ -1,4 +1,4 @@
-"""What the registry says of a coefficient: the columns of its table."""
+"""The columns of the registry of coefficients."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Coefficient:
     step
         The change of the scaled coordinate that is one in the search's coordinate, mid-range.
     free
-        Whether it is fitted unless the job says otherwise.
+        Whether it is fitted unless the job fixes it.
     mass_exponent
         The power of a common factor on all masses with which it must go so that every motion stays
         the same: 1 for masses, inertias and what forces are proportional to.
@@ -91,7 +91,7 @@ class Coefficient:
     exported_as
         Export target -> where the coefficient stands in it, or why it does not.
     informed_by
-        The rule of `tuner.flights.informs` that says whether a recording can show it.
+        The rule of `tuner.flights.informs` that decides whether a recording can show it.
     plausible
         Values outside this range are reported as improbable.
     fallback

@@ -151,7 +151,7 @@ class Physics(Section):
 
 
 class Sensing(Section):
-    """What the controllers get to see: poses at ``pose_rate`` Hz, held between; None for all."""
+    """What the controllers see: poses at ``pose_rate`` Hz with a zero-order hold; None for all."""
 
     pose_rate: Positive | None = None
 

@@ -1,4 +1,4 @@
-"""The job file, ``tune.yaml``: everything a fit can be told, with nothing required."""
+"""The job file, ``tune.yaml``: all settings of a fit, none of them required."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class CoefficientSettings(Section):
     prior: Prior | None = None
 
     @model_validator(mode="after")
-    def _leave_room(self) -> Self:
+    def _bounds_are_in_order(self) -> Self:
         if self.lower is not None and self.upper is not None and self.lower >= self.upper:
             raise refuse(f"lower {self.lower:g} is not below upper {self.upper:g}", "swap them")
         if self.scale == "log":
@@ -234,18 +234,18 @@ def read_job(path: str | Path) -> JobFile:
         "controller": "controllers",
         "topics": "topics",
     }
-    found: dict[str, Path] = {}
+    paths: dict[str, Path] = {}
     for key, kind in kinds.items():
         reference = getattr(job, key)
         if reference is not None:
             try:
-                found[key] = find_config(kind, str(reference), path.parent)
+                paths[key] = find_config(kind, str(reference), path.parent)
             except ConfigError as error:
                 raise ConfigError(path, f"{key} '{reference}' {error.what}", error.remedy) from None
     if job.export.into is not None:
         into = path.parent / job.export.into.expanduser()
-        return job.model_copy(update=found | {"export": job.export.replace(into=into)})
-    return job.model_copy(update=found)
+        return job.model_copy(update=paths | {"export": job.export.replace(into=into)})
+    return job.model_copy(update=paths)
 
 
 def _once(key: str, names: tuple[str, ...]) -> None:

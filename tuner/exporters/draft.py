@@ -39,12 +39,12 @@ class Draft:
     faults: Callable[[Path], Sequence[str]]
 
 
-def differences(wanted: Mapping[str, float], held: Mapping[str, float]) -> list[str]:
+def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[str]:
     """Return which of the wanted numbers, by name, a file does not hold, a sentence each."""
     return [
-        f"{name} is {held[name]!r}, not {value!r}" if name in held else f"{name} is missing"
+        f"{name} is {read[name]!r}, not {value!r}" if name in read else f"{name} is missing"
         for name, value in wanted.items()
-        if name not in held or not math.isclose(held[name], value, rel_tol=TOLERANCE, abs_tol=1e-15)
+        if name not in read or not math.isclose(read[name], value, rel_tol=TOLERANCE, abs_tol=1e-15)
     ]
 
 

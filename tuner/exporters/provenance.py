@@ -1,4 +1,4 @@
-"""Which numbers of a run are exported, and what is said of where they come from."""
+"""Which numbers of a run are exported, and where they come from."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...
     the value that goes with it.
     """
     notes = tuple(
-        f"{name} = {found.best:g} is {judgement_in_words(found.verdict, found.reason)}"
-        for name, found in run.result.coefficients.items()
-        if found.fitted and found.identifiable is False
+        f"{name} = {row.best:g} is {judgement_in_words(row.verdict, row.reason)}"
+        for name, row in run.result.coefficients.items()
+        if row.fitted and row.identifiable is False
     )
     return run.vehicle.replace(source=_source(run, today)), notes
 

@@ -1,4 +1,4 @@
-"""A run's flights flown again with another vehicle, from what its result folder says."""
+"""A run's flights flown again with another vehicle, with the settings of its result folder."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     Raises
     ------
     InputError
-        A recording is gone or has changed, or the run does not say what flew.
+        A recording is gone or has changed, or the result folder does not hold what flew.
     """
     settings = _settings(run, vehicle)
     wanted = {flight.name: flight for flight in run.result.flights}
@@ -42,13 +42,13 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
 
 
 def _settings(run: Run, vehicle: VehicleFile) -> Settings:
-    said = run.result.settings
+    settings = run.result.settings
     try:
-        controller = ControllerFile.model_validate(said["controller"])
-        job = JobFile.model_validate(said["job"])
+        controller = ControllerFile.model_validate(settings["controller"])
+        job = JobFile.model_validate(settings["job"])
     except (KeyError, ValidationError):
         raise InputError(
-            run.folder / RESULT_FILE, "does not say with which controller", "fit again"
+            run.folder / RESULT_FILE, "does not hold the controller that flew", "fit again"
         ) from None
     paths = tuple(dict.fromkeys(Path(flight.path) for flight in run.result.flights))
     for path in paths:

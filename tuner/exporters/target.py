@@ -49,7 +49,7 @@ class Target:
         how it is read back.
     entry
         Where the target holds a coefficient, or why it has no place for it; None for a coefficient
-        of which nobody has said either.
+        about which nothing is registered.
     patches
         Whether it can go into a model that exists.
     """

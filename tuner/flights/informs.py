@@ -42,7 +42,7 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
     trajectory
         Whether the trajectory is named, which stands for a recorded reference.
     """
-    found = []
+    available = []
     for name, needs in _NEEDS.items():
         missing = [need for need in needs if need not in measured]
         if trajectory and "reference_position" in missing:
@@ -52,8 +52,8 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
             if need in needs and columns is not None and len(columns) < 4:
                 lacking = [str(i) for i in range(4) if i not in columns]
                 missing.append(f"{need} of rotors {', '.join(lacking)}")
-        found.append(Inlet(name, tuple(missing)))
-    return tuple(found)
+        available.append(Inlet(name, tuple(missing)))
+    return tuple(available)
 
 
 def informed(

@@ -33,7 +33,7 @@ def find_config(kind: Kind, reference: str, base: Path) -> Path:
     Raises
     ------
     ConfigError
-        A bare name is no shipped file's. Whether a path can be read is for its reader to say.
+        A bare name is no shipped file's. Whether a path can be read is checked by its reader.
     """
     path = base / Path(reference).expanduser()
     if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or exists(path):

@@ -124,13 +124,13 @@ def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypa
 )
 def test_what_cannot_be_used_is_refused_in_one_line(lab, change, expected):
     fill = lambda value: value.format(lab=lab) if isinstance(value, str) else value  # noqa: E731
-    said = {"flights": ["{lab}/*.bag"]} | change
-    said = {
+    given = {"flights": ["{lab}/*.bag"]} | change
+    given = {
         key: [fill(word) for word in value] if isinstance(value, list) else fill(value)
-        for key, value in said.items()
+        for key, value in given.items()
     }
     with pytest.raises(InputError) as error:
-        settle(Options(**said))
+        settle(Options(**given))
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
 

@@ -40,10 +40,10 @@ def make_run(tmp_path):
         start = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
         best = read_vehicle(configs_folder() / "vehicles" / f"{vehicle}.yaml")
         best = with_values(best, values or {})
-        found = {}
+        rows = {}
         for name, initial in values_of(start).items():
             value = values_of(best)[name]
-            found[name] = {
+            rows[name] = {
                 "unit": COEFFICIENTS[name].unit,
                 "initial": initial,
                 "best": value,
@@ -84,7 +84,7 @@ def make_run(tmp_path):
             seed=0,
             versions={"tune": "0.1.0"},
             settings={},
-            coefficients={name: CoefficientResult(**data) for name, data in found.items()},
+            coefficients={name: CoefficientResult(**data) for name, data in rows.items()},
             flights=tuple(shown),
             findings=(),
             search=SearchResult(

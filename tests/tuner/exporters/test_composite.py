@@ -47,8 +47,8 @@ def test_poses_chain():
 def test_base_and_others_together_are_the_wanted_whole(others, base):
     bodies = [solid_box(mass, pose_of(pose), [0.02, 0.1, 0.03]) for mass, *pose in others]
     wanted = np.diag([0.05, 0.06, 0.08])
-    found = base_for(2.0, wanted, pose_of(base), bodies)
-    whole = together([found, *bodies])
+    base_body = base_for(2.0, wanted, pose_of(base), bodies)
+    whole = together([base_body, *bodies])
     assert whole.mass == pytest.approx(2.0, rel=1e-12)
     np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
 

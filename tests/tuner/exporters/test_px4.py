@@ -13,40 +13,40 @@ def value(vehicle):
 
 
 def test_rotors_are_in_px4s_frame_forward_right_down(vehicle):
-    found = value(vehicle)
-    places = [[found[f"CA_ROTOR{i}_{axis}"] for axis in ("PX", "PY", "PZ")] for i in range(4)]
+    values = value(vehicle)
+    places = [[values[f"CA_ROTOR{i}_{axis}"] for axis in ("PX", "PY", "PZ")] for i in range(4)]
     assert places == [
         [0.17678, 0.17678, -0.06],
         [-0.17678, -0.17678, -0.06],
         [0.17678, -0.17678, -0.06],
         [-0.17678, 0.17678, -0.06],
     ]
-    assert [found[f"CA_ROTOR{i}_KM"] for i in range(4)] == [0.033, 0.033, -0.033, -0.033]
-    assert found["CA_ROTOR_COUNT"] == 4
+    assert [values[f"CA_ROTOR{i}_KM"] for i in range(4)] == [0.033, 0.033, -0.033, -0.033]
+    assert values["CA_ROTOR_COUNT"] == 4
 
 
 def test_full_thrust_and_torque(vehicle):
-    found = value(vehicle)
+    values = value(vehicle)
     thrust = 1.45e-5 * 1050**2
-    assert found["CA_ROTOR0_CT"] == pytest.approx(thrust, rel=1e-6)
-    assert found["SIH_T_MAX"] == pytest.approx(thrust, rel=1e-6)
-    assert found["SIH_Q_MAX"] == pytest.approx(thrust * 0.033, rel=1e-6)
+    assert values["CA_ROTOR0_CT"] == pytest.approx(thrust, rel=1e-6)
+    assert values["SIH_T_MAX"] == pytest.approx(thrust, rel=1e-6)
+    assert values["SIH_Q_MAX"] == pytest.approx(thrust * 0.033, rel=1e-6)
     limited = vehicle.replace(motor=vehicle.motor.replace(max_rotor_velocity=1000.0))
     assert value(limited)["SIH_T_MAX"] == pytest.approx(14.5, rel=1e-6)
 
 
 def test_the_simulation_in_hardware_gets_the_body(vehicle):
-    found = value(vehicle)
-    assert (found["SIH_MASS"], found["SIH_IXX"], found["SIH_IYY"], found["SIH_IZZ"]) == (
+    values = value(vehicle)
+    assert (values["SIH_MASS"], values["SIH_IXX"], values["SIH_IYY"], values["SIH_IZZ"]) == (
         2.243,
         0.028,
         0.033,
         0.038,
     )
-    assert (found["SIH_L_ROLL"], found["SIH_L_PITCH"]) == (0.17678, 0.17678)
+    assert (values["SIH_L_ROLL"], values["SIH_L_PITCH"]) == (0.17678, 0.17678)
     hover = math.sqrt(2.243 * 9.81 / 4 / 1.45e-5)
-    assert found["SIH_KDV"] == pytest.approx(4 * hover * 1.45e-4, rel=1e-6)
-    assert found["SIH_T_TAU"] == pytest.approx(0.01875)
+    assert values["SIH_KDV"] == pytest.approx(4 * hover * 1.45e-4, rel=1e-6)
+    assert values["SIH_T_TAU"] == pytest.approx(0.01875)
 
 
 def test_hover_command_carries_the_weight(vehicle):
@@ -59,10 +59,10 @@ def test_hover_command_carries_the_weight(vehicle):
 
 
 def test_the_gz_bridge_gets_whole_speeds(vehicle):
-    found = value(vehicle)
-    assert [found[f"SIM_GZ_EC_MIN{i}"] for i in range(1, 5)] == [100] * 4
-    assert [found[f"SIM_GZ_EC_MAX{i}"] for i in range(1, 5)] == [1050] * 4
-    assert isinstance(found["SIM_GZ_EC_MAX1"], int)
+    values = value(vehicle)
+    assert [values[f"SIM_GZ_EC_MIN{i}"] for i in range(1, 5)] == [100] * 4
+    assert [values[f"SIM_GZ_EC_MAX{i}"] for i in range(1, 5)] == [1050] * 4
+    assert isinstance(values["SIM_GZ_EC_MAX1"], int)
 
 
 def test_a_vehicle_too_heavy_to_hover_is_refused(vehicle):

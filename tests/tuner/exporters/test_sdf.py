@@ -219,8 +219,8 @@ def test_what_has_no_tag_is_said(vehicle):
 
 
 def test_the_commands_of_gz_sim_are_px4_parameters(vehicle):
-    said = " / ".join(sdf_draft(GZ, vehicle, "by a test").notes)
-    assert "SIM_GZ_EC_MIN1..4 to 100 and SIM_GZ_EC_MAX1..4 to 1050" in said
+    notes = " / ".join(sdf_draft(GZ, vehicle, "by a test").notes)
+    assert "SIM_GZ_EC_MIN1..4 to 100 and SIM_GZ_EC_MAX1..4 to 1050" in notes
     assert "SIM_GZ" not in " / ".join(sdf_draft(CLASSIC, vehicle, "by a test").notes)
 
 

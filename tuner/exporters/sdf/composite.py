@@ -1,6 +1,6 @@
 """Mass and inertia of links taken together, and of the base that makes them a wanted whole.
 
-Poses and tensors are in the model's frame unless said otherwise; SI units.
+Poses and tensors are in the model's frame unless stated otherwise; SI units.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def base_for(
     moments = np.linalg.eigvalsh(in_model)
     if moments[0] <= 0 or moments[2] > moments[0] + moments[1]:
         raise ValueError(
-            "the links beside the base carry more inertia than the vehicle's leaves room for: "
+            "the links beside the base carry more inertia than the vehicle's allows: "
             f"the base would have the principal moments {moments.round(9).tolist()} kg m²"
         )
     return Inertial(mass, base, base.rotation.T @ in_model @ base.rotation)

@@ -56,19 +56,19 @@ class Model:
 
         Those of a template without a number of their own, as in a macro, count as well.
         """
-        found = []
+        plugins = []
         for plugin in self.root.all("plugin"):
             names = plugin.attributes.get("filename", "") + plugin.attributes.get("name", "")
             names = names.replace("MulticopterMotorModel", _GZ_MOTOR)
             if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
                 index = self._number_in(plugin, "motorNumber")
                 if index is None or 0 <= index < self.rotors:
-                    found.append(plugin)
-        return found
+                    plugins.append(plugin)
+        return plugins
 
     def channels(self) -> list[Element]:
         """Return the control channels of the vehicle's rotors (Gazebo classic only)."""
-        found = []
+        channels = []
         for parent in self.root.all(_CLASSIC_CHANNELS):
             for channel in parent.children:
                 index = self._number_in(channel, "input_index")
@@ -79,8 +79,8 @@ class Model:
                     and drives
                     and (index is None or 0 <= index < self.rotors)
                 ):
-                    found.append(channel)
-        return found
+                    channels.append(channel)
+        return channels
 
     def pose_of_link(self, link: Element) -> Pose:
         """Return where a link lies in the model's frame.
@@ -174,13 +174,13 @@ def read_model(text: str, path: Path, rotors: int) -> Model:
         It holds no model, no link, or no motor plugin.
     """
     root = parse(text, path)
-    found = root if root.tag == "model" else next(root.all("model"), None)
-    if found is None:
+    element = root if root.tag == "model" else next(root.all("model"), None)
+    if element is None:
         raise ExportError(path, "holds no <model>", "give the SDF of a multirotor")
-    links = [child for child in found.children if child.tag == "link"]
+    links = [child for child in element.children if child.tag == "link"]
     if not links:
         raise ExportError(path, "has no <link>", "give the SDF of a multirotor")
-    model = Model(path, text, found, _base(found, links), rotors)
+    model = Model(path, text, element, _base(element, links), rotors)
     if not model.motors():
         raise ExportError(
             path, "has no motor model plugin", "give a model for PX4's motor model plugins"

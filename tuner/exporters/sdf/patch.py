@@ -54,13 +54,13 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     edits.append(_provenance_edit(text, model, provenance))
     patched = apply(text, dict.fromkeys(edits))
     wanted = carried_values(vehicle, channels=bool(whole.channels()))
-    held = values_in(rendered(patched, path), path, rotors)
-    wrong = differences(wanted, held)
+    written_values = values_in(rendered(patched, path), path, rotors)
+    wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
     return Draft(
         patched,
-        as_flown(vehicle, held),
+        as_flown(vehicle, written_values),
         tuple(_notes(whole, vehicle, base)),
         lambda written: differences(
             wanted, values_in(rendered(read_file(written), written), written, rotors)
@@ -136,14 +136,14 @@ def _through_variable(text: str, blank: str, edit: Edit, path: Path) -> Edit:
         if name
         else iter(())
     )
-    found = list(settings)
-    if len(found) != 1:
+    assignments = list(settings)
+    if len(assignments) != 1:
         raise ExportError(
             path,
             f"has the expression {old.strip()} where a number of ours belongs",
             "write a number there, or set its variable to a number once",
         )
-    return Edit(found[0].start(1), found[0].end(1), edit.text)
+    return Edit(assignments[0].start(1), assignments[0].end(1), edit.text)
 
 
 def _provenance_edit(text: str, model: Model, provenance: str) -> Edit:

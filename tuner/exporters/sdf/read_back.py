@@ -42,12 +42,12 @@ def values_in(text: str, path: Path, rotors: int) -> dict[str, float]:
         if _text(e, "input_index") in ours
         and (_text(e, "joint_control_type") or "velocity").startswith("velocity")
     ]
-    held = _agreed(plugins, tags_in("motor"), path) | _agreed(channels, tags_in("channel"), path)
+    read = _agreed(plugins, tags_in("motor"), path) | _agreed(channels, tags_in("channel"), path)
     whole = composite(read_model(text, path, rotors))
     body = {"mass": whole.mass}
     body |= {f"i{axis}{axis}": float(whole.inertia[i, i]) for i, axis in enumerate("xyz")}
     tags = tags_in("inertial") | tags_in("inertia")
-    return held | {name: body[tag] for tag, name in tags.items() if tag in body}
+    return read | {name: body[tag] for tag, name in tags.items() if tag in body}
 
 
 def _text(element: etree._Element, tag: str) -> str:
@@ -58,7 +58,7 @@ def _agreed(
     elements: Iterable[etree._Element], tags: dict[str, str], path: Path
 ) -> dict[str, float]:
     """Return the values that elements share."""
-    held: dict[str, float] = {}
+    read: dict[str, float] = {}
     for tag, name in tags.items():
         texts = {_text(element, tag) for element in elements}
         try:
@@ -71,8 +71,8 @@ def _agreed(
             raise ExportError(path, f"has rotors of different {tag}", "give them one value")
         for value in values:
             if value is not None:
-                held[name] = value
-    return held
+                read[name] = value
+    return read
 
 
 def composite(model: Model) -> Inertial:

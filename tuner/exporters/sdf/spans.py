@@ -112,7 +112,7 @@ def parse(text: str, path: Path) -> Element:
 
 def without_comments(text: str) -> str:
     """Return a text of the same length with comments as space: simulators take ``--`` in them."""
-    return _COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found.group()), text)
+    return _COMMENT.sub(lambda match: re.sub(r"[^\n]", " ", match.group()), text)
 
 
 def _after_tag(text: str, start: int) -> int:
@@ -145,13 +145,13 @@ def number(element: Element, text: str) -> float | None:
 def set_value(element: Element, text: str, value: str) -> Edit:
     """Return the edit that gives a childless element another value, its comments kept."""
     if element.content == element.end:
-        opening = text[element.start : element.end].rstrip("/>").rstrip()
-        return Edit(element.start, element.end, f"{opening}>{value}</{element.tag}>")
+        start_tag = text[element.start : element.end].rstrip("/>").rstrip()
+        return Edit(element.start, element.end, f"{start_tag}>{value}</{element.tag}>")
     inside = text[element.content : element.content_end]
     masked = without_comments(inside)
-    found = _NUMBER.search(masked)
-    if found and found.group() == masked.strip():
-        return Edit(element.content + found.start(), element.content + found.end(), value)
+    match = _NUMBER.search(masked)
+    if match and match.group() == masked.strip():
+        return Edit(element.content + match.start(), element.content + match.end(), value)
     return Edit(element.content, element.content_end, value)
 
 

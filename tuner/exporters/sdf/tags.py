@@ -63,15 +63,15 @@ def as_text(value: float) -> str:
     return format(value, ".12g")
 
 
-def as_flown(vehicle: VehicleFile, held: dict[str, float]) -> VehicleFile:
+def as_flown(vehicle: VehicleFile, read: dict[str, float]) -> VehicleFile:
     """Return the vehicle that the plugins fly: what a model holds, and what they have built in."""
     built_in = {}
     for name in values_of(vehicle):
         entry = COEFFICIENTS[name].exported_as.get("sdf")
         if isinstance(entry, NotCarried) and entry.built_in is not None:
             built_in[name] = entry.built_in
-    limit = held[SPEED_LIMIT_KEY]
-    coefficients = {name: value for name, value in held.items() if name != SPEED_LIMIT_KEY}
+    limit = read[SPEED_LIMIT_KEY]
+    coefficients = {name: value for name, value in read.items() if name != SPEED_LIMIT_KEY}
     flown = with_values(vehicle, built_in | coefficients)
     return flown.replace(
         motor=flown.motor.replace(max_rotor_velocity=limit),
@@ -80,7 +80,7 @@ def as_flown(vehicle: VehicleFile, held: dict[str, float]) -> VehicleFile:
 
 
 def lost_in(vehicle: VehicleFile) -> tuple[str, ...]:
-    """Return what of a vehicle, beside coefficients, the plugins fly otherwise."""
+    """Return what of a vehicle, beside coefficients, the plugins fly differently."""
     if vehicle.aerodynamics.reaction_torque == "body":
         return ()
     return ("the plugins' reaction torque acts about the body's z axis, not the world's",)

@@ -13,7 +13,7 @@ _FILLER = "J"
 
 
 def is_template(text: str) -> bool:
-    """Tell whether a text holds Jinja expressions, statements or comments."""
+    """Return whether a text holds Jinja expressions, statements or comments."""
     return bool(_EXPRESSION.search(text) or _STATEMENT.search(text))
 
 
@@ -22,8 +22,8 @@ def blanked(text: str) -> str:
 
     Expressions become letters, so that they are no numbers; statements and comments become space.
     """
-    text = _STATEMENT.sub(lambda found: re.sub(r"[^\n]", " ", found.group()), text)
-    return _EXPRESSION.sub(lambda found: re.sub(r"[^\n]", _FILLER, found.group()), text)
+    text = _STATEMENT.sub(lambda match: re.sub(r"[^\n]", " ", match.group()), text)
+    return _EXPRESSION.sub(lambda match: re.sub(r"[^\n]", _FILLER, match.group()), text)
 
 
 def rendered(text: str, path: Path) -> str:

@@ -81,7 +81,7 @@ def parameters(vehicle: VehicleFile) -> tuple[Parameter, ...]:
 
 def _allocation(vehicle: VehicleFile) -> list[Parameter]:
     """Return where the rotors are and what they give: thrust = CT·u², torque = KM·thrust."""
-    parameters: list[Parameter] = [Parameter("CA_ROTOR_COUNT", len(vehicle.rotors))]
+    allocation: list[Parameter] = [Parameter("CA_ROTOR_COUNT", len(vehicle.rotors))]
     for index, rotor in enumerate(vehicle.rotors):
         x, y, z = rotor.position
         sign = 1.0 if rotor.spin == "ccw" else -1.0
@@ -92,8 +92,8 @@ def _allocation(vehicle: VehicleFile) -> list[Parameter]:
             "PY": -y,
             "PZ": -z,
         }
-        parameters += [Parameter(f"CA_ROTOR{index}_{key}", value) for key, value in values.items()]
-    return parameters
+        allocation += [Parameter(f"CA_ROTOR{index}_{key}", value) for key, value in values.items()]
+    return allocation
 
 
 def _sih(vehicle: VehicleFile) -> list[Parameter]:
@@ -146,39 +146,39 @@ def px4_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
     ExportError
         The vehicle cannot hover.
     """
-    found = parameters(vehicle)
-    said = _notes(vehicle)
+    wanted = parameters(vehicle)
+    notes = _notes(vehicle)
 
     def faults(path: Path) -> list[str]:
         there = {parameter.name: parameter.value for parameter in read_parameters(path)}
         return [
-            f"{wanted.name} is {there.get(wanted.name)}, not {wanted.value}"
-            for wanted in found
-            if not math.isclose(there.get(wanted.name, math.nan), wanted.value, rel_tol=DIGITS)
+            f"{parameter.name} is {there.get(parameter.name)}, not {parameter.value}"
+            for parameter in wanted
+            if not math.isclose(
+                there.get(parameter.name, math.nan), parameter.value, rel_tol=DIGITS
+            )
         ]
 
-    return Draft(_text(found, "\n".join((provenance, *said))), vehicle, said, faults)
+    return Draft(_text(wanted, "\n".join((provenance, *notes))), vehicle, notes, faults)
 
 
 def _notes(vehicle: VehicleFile) -> tuple[str, ...]:
     """Return what a reader of the parameters should know."""
     idle = rotor_speed(vehicle, 0.0)
-    said = [
+    notes = [
         f"CA_ROTOR*_CT is thrust in N at full command (idle {idle:.0f} rad/s: not CT·u² below)",
         "MPC_THR_HOVER holds for THR_MDL_FAC 0",
         "the SIH model has one drag and one lag for all directions",
     ]
     hover = hover_command(vehicle)
     if hover is not None and not HOVER_RANGE[0] <= hover <= HOVER_RANGE[1]:
-        said.append(f"hover command {hover:.3f} lies outside what PX4 accepts {HOVER_RANGE}")
-    return tuple(said)
+        notes.append(f"hover command {hover:.3f} lies outside what PX4 accepts {HOVER_RANGE}")
+    return tuple(notes)
 
 
-def _text(found: tuple[Parameter, ...], header: str) -> str:
+def _text(parameters: tuple[Parameter, ...], header: str) -> str:
     """Return a ``.params`` file as ground stations load it, floats with nine digits."""
-    lines = [
-        f"1\t1\t{parameter.name}\t{_value(parameter)}\t{_kind(parameter)}\n" for parameter in found
-    ]
+    lines = [f"1\t1\t{p.name}\t{_value(p)}\t{_kind(p)}\n" for p in parameters]
     columns = commented("Vehicle-Id Component-Id Name Value Type")
     return commented(header) + columns + "".join(lines)
 
@@ -191,15 +191,17 @@ def read_parameters(path: Path) -> tuple[Parameter, ...]:
     ExportError
         A line is no parameter.
     """
-    found = []
+    parameters = []
     for line in read_file(path).splitlines():
         if line.strip() and not line.startswith("#"):
             try:
                 _, _, name, value, kind = line.split()
-                found.append(Parameter(name, int(value) if int(kind) == INT32 else float(value)))
+                parameters.append(
+                    Parameter(name, int(value) if int(kind) == INT32 else float(value))
+                )
             except ValueError:
                 raise ExportError(path, f"has the line '{line}'", "was it edited?") from None
-    return tuple(found)
+    return tuple(parameters)
 
 
 def _value(parameter: Parameter) -> str:
