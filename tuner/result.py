@@ -8,7 +8,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
-from tuner.config import COEFFICIENTS, VehicleFile, read_vehicle
+from tuner.coefficients import COEFFICIENTS
+from tuner.config import VehicleFile, read_vehicle
 from tuner.disk import exists, write_text
 from tuner.errors import InputError
 from tuner.files import Part, read_json

@@ -1,6 +1,5 @@
 """Vehicle, controller and job files: validated in one line, plain numbers, no simulator."""
 
-from tuner.coefficients import COEFFICIENTS
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import CHANNELS, JobFile, read_job
 from tuner.config.settings import Options, Settings, find_job_file, settle
@@ -12,7 +11,6 @@ from tuner.yaml_files.shipped import configs_folder, find_config
 
 __all__ = [
     "CHANNELS",
-    "COEFFICIENTS",
     "ControllerFile",
     "JobFile",
     "Options",

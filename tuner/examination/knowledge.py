@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.coefficients.space import Space
-from tuner.config import COEFFICIENTS
 from tuner.examination.examination import Examination
 from tuner.examination.sensitivity_json import (
     CoefficientKnowledge,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
 from tuner.objective.segments import CLOCKS, OFFSETS

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.errors import InputError, did_you_mean
 from tuner.flights.flight import Array
 

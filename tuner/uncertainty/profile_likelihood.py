@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host

@@ -2,14 +2,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tuner.config import (
-    COEFFICIENTS,
-    check_mixer,
-    read_vehicle,
-    values_of,
-    with_values,
-    write_vehicle,
-)
+from tuner.coefficients import COEFFICIENTS
+from tuner.config import check_mixer, read_vehicle, values_of, with_values, write_vehicle
 from tuner.config.vehicle import Aerodynamics, Inertia, Motor, Setup
 from tuner.errors import ConfigError
 from tuner.yaml_files.shipped import configs_folder

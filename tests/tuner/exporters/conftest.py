@@ -2,14 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import (
-    COEFFICIENTS,
-    configs_folder,
-    read_vehicle,
-    values_of,
-    with_values,
-    write_vehicle,
-)
+from tuner.coefficients import COEFFICIENTS
+from tuner.config import configs_folder, read_vehicle, values_of, with_values, write_vehicle
 from tuner.result import (
     AxesRmse,
     CoefficientResult,

@@ -4,9 +4,9 @@ import pytest
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
+from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.comparison import Comparison
 from tuner.config import (
-    COEFFICIENTS,
     ControllerFile,
     JobFile,
     read_vehicle,

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from tests.tuner.flights import making
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.flights import Inspection, inspect_recordings
 from tuner.flights.inspection import as_json
 from tuner.flights.inspection_table import render

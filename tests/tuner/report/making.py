@@ -9,8 +9,9 @@ import equinox as eqx
 import numpy as np
 
 from tests.tuner.uncertainty import making
+from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, SignalErrors
-from tuner.config import COEFFICIENTS, values_of, write_vehicle
+from tuner.config import values_of, write_vehicle
 from tuner.examination.examination import Examination, examine
 from tuner.examination.knowledge import knowledge_of
 from tuner.examination.tables import write_files

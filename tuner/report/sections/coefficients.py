@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuner.config import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS
 from tuner.examination.sensitivity_json import CoefficientKnowledge
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
