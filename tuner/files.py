@@ -1,4 +1,4 @@
-"""JSON and CSV of a result folder: JSON is read with a limit and a schema version."""
+"""JSON, CSV and arrays of a result folder: JSON is read with a limit and a schema version."""
 
 from __future__ import annotations
 
@@ -6,13 +6,17 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from zipfile import BadZipFile
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
 from tuner.errors import ConfigError, InputError
 from tuner.validation import config_error
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MAX_BYTES = 50_000_000
 """Of a JSON file of a result folder."""
@@ -46,6 +50,23 @@ def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
     if len(raw) > most:
         raise ConfigError(path, f"is larger than {most // 1_000_000} MB", remedy)
     return raw
+
+
+def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an ``.npz`` file by their names.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is damaged; ``remedy`` says what to do.
+    """
+    import numpy as np  # noqa: PLC0415 (`tune --help` answers without it)
+
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except (OSError, EOFError, BadZipFile, ValueError, TypeError, AttributeError) as error:
+        raise InputError(path, f"is damaged ({error})", remedy) from None
 
 
 class Part(BaseModel):

@@ -12,6 +12,7 @@ import numpy as np
 
 from tuner.disk import whole_file
 from tuner.errors import InputError
+from tuner.files import read_arrays
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Iteration
@@ -64,24 +65,22 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
     """
     if not path.exists():
         raise InputError(path, "there is no checkpoint to resume from", "leave --resume out")
+    data = read_arrays(path, remedy="leave --resume out")
     try:
-        with np.load(path, allow_pickle=False) as data:
-            head = json.loads(data["head"].tobytes())
-            if head["key"] != key:
-                raise InputError(path, "belongs to other flights or settings", "leave --resume out")
-            progress = replace(
-                fresh,
-                stage=head["stage"],
-                points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
-                scales=dict(zip(head["channels"], data["scales"], strict=True)),
-                losses=data["losses"],
-                states=data["states"] if data["states"].size else None,
-                iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
-                evaluations=head["evaluations"],
-                feedback=head["feedback"],
-            )
-            return progress, float(head["seconds"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            path, f"cannot be read ({type(error).__name__})", "leave --resume out"
-        ) from None
+        head = json.loads(data["head"].tobytes())
+        if head["key"] != key:
+            raise InputError(path, "belongs to other flights or settings", "leave --resume out")
+        progress = replace(
+            fresh,
+            stage=head["stage"],
+            points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
+            scales=dict(zip(head["channels"], data["scales"], strict=True)),
+            losses=data["losses"],
+            states=data["states"] if data["states"].size else None,
+            iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
+            evaluations=head["evaluations"],
+            feedback=head["feedback"],
+        )
+        return progress, float(head["seconds"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(path, f"is no checkpoint ({error!r})", "leave --resume out") from None

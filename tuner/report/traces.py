@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from tuner.comparison.errors import FlightErrors
 from tuner.disk import whole_file
+from tuner.files import read_arrays
 
 Array = NDArray[np.float64]
 
@@ -60,12 +61,11 @@ def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
     path = folder / TRACES_FILE
     if not path.exists():
         return {}
-    found: dict[str, dict[str, Array]] = {}
-    with np.load(path, allow_pickle=False) as data:
-        for key in data.files:
-            flight, _, name = key.rpartition("/")
-            found.setdefault(flight, {})[name] = data[key]
-    return found
+    traces: dict[str, dict[str, Array]] = {}
+    for key, values in read_arrays(path, remedy="run tune again").items():
+        flight, _, name = key.rpartition("/")
+        traces.setdefault(flight, {})[name] = values
+    return traces
 
 
 def _thinned(values: Array) -> Array:
