@@ -36,7 +36,7 @@ def polished(
     free
         What may move.
     title
-        For people, before the stages' names.
+        What stands before the stages' names in messages.
     on_progress
         Called after every iteration.
     """

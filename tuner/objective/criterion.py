@@ -13,7 +13,7 @@ OFFSET_UNIT = 0.01
 
 
 class Point(eqx.Module):
-    """Where the search is: what all flights share, and each flight's own.
+    """A point of the search: coefficients that all flights share, and the offsets of each flight.
 
     Attributes
     ----------

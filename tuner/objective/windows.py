@@ -18,9 +18,9 @@ from tuner.flights.initial import initial_state
 BEFORE = 1.2
 """s of a recording before a window that may help to estimate its start."""
 BEHIND = 0.1
-"""s behind it."""
+"""s of a recording after a window that may help as well."""
 FEWEST = 8
-"""Poses without which a stretch is no window."""
+"""Poses that a stretch must hold to be a window."""
 
 
 @dataclass(frozen=True)

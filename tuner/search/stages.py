@@ -1,16 +1,17 @@
-"""What a search does one after the other: how far it looks, how loosely, and by which method."""
+"""The stages of a search: how far each looks, how it inflates the noise, by which optimiser."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 HORIZONS = (0.2, 0.4, 0.8, 1.5, 3.0, 5.0, 8.0, 12.0, 18.0, 26.0)
-"""s; the whole flights follow. The first are so short that even a vehicle with a third of the
-thrust is still near where it began, so that a bad start has a slope to go down."""
+"""s that the stages of the continuation look ahead; the whole flights follow. The first are so
+short that even a vehicle with a third of the thrust is still near where it began, so that a bad
+start has a slope to go down."""
 NOISE_INFLATION = (20.0, 20.0, 20.0, 20.0, 10.0, 5.0, 3.0, 2.0, 1.5, 1.0)
-"""Factor on every standard deviation, stage by stage; 1 on whole flights."""
+"""Factor on every standard deviation, stage by stage; it is 1 on whole flights."""
 WINDOWS = ((0.3, 20.0, False), (0.6, 5.0, True))
-"""Share of a window, noise inflation, whether offsets are free, before the windows are whole."""
+"""Share of a window, noise inflation and whether offsets are free, before the windows are whole."""
 GENTLE = 1.0
 """s of horizon below which a Jacobian costs so little that a stage may take its time."""
 ENOUGH = 0.01
@@ -20,14 +21,14 @@ OFFSETS_FROM = 5.0
 EVOLVED = (0.8, 3.0)
 """s of horizon at which CMA-ES looks for where to begin."""
 GENERATIONS = 60
-"""Of CMA-ES in one stage, at most."""
+"""Generations of CMA-ES in one stage, at most."""
 FEEDBACK_AT = 3.0
 """s of horizon at which the mixer's saturation feedback is tried both ways."""
 WHOLE = "whole length"
 USUAL = 5
-"""Steps that a stage takes, more or less."""
+"""Steps that a stage usually takes: predicts the time that is left."""
 PAUSE = 4000
-"""What a step takes beside its simulation, in samples of it."""
+"""Samples whose simulation takes as long as the rest of a step."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Stage:
     Attributes
     ----------
     name
-        For people.
+        What messages call it.
     horizon
         Samples of the simulation.
     noise_inflation
@@ -47,14 +48,14 @@ class Stage:
     offsets
         Whether clock offsets are free; in the polish, those that matter.
     steps
-        At most so many iterations.
+        How many iterations it takes at most.
     tolerance
         The stage ends when no start's loss falls by more than this share.
     weighs
-        Whether each channel of each flight is weighed by its residuals after it, rather than only
-        strays.
+        Whether its residuals rescale each channel of each flight for the next stage; otherwise they
+        rescale only flights that are met far worse than the rest.
     prunes
-        Whether offsets too small to matter are dropped before it.
+        Whether offsets too small to matter are set to zero before it.
     optimiser
         Name of an `tuner.search.optimiser.Optimiser`.
     coefficients
@@ -168,13 +169,13 @@ def plan(
         ``hybrid``: CMA-ES from far, then least squares; ``cma``: CMA-ES, the offsets alone by least
         squares; else the name of an optimiser, which takes every stage.
     samples, rate
-        Of the longest segment, at so many Hz.
+        Length of the longest segment, and its rate in Hz.
     windows
         Whether segments are windows with free starts.
     robust
         Whether large residuals count linearly at the end.
     steps
-        At most so many of a stage.
+        How many iterations a stage takes at most.
     """
     schedule = window_schedule if windows else schedule_of
     stages = schedule(samples, rate, robust=robust, steps=steps)

@@ -9,7 +9,7 @@ from tuner.objective.criterion import SegmentSums
 from tuner.objective.normal import Objective
 
 STRAY = 3.0
-"""A flight this many times worse than the others is weighed down, channel by channel."""
+"""A flight that is met this many times worse than the median one counts less."""
 
 
 def root_mean_squares(
