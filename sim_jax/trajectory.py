@@ -1,4 +1,4 @@
-"""The publisher's references: five shapes, a wind-up, and laps, one tick every 10 ms.
+"""The publisher's references: shapes, a wind-up, and laps, one tick every 10 ms.
 
 Everything the publisher does is kept, the odd things too: the velocity scaler runs time faster but
 leaves the velocity and acceleration references alone, and some shapes have none.
@@ -6,7 +6,9 @@ leaves the velocity and acceleration references alone, and some shapes have none
 
 from __future__ import annotations
 
-from typing import Literal, TypeAlias
+import abc
+import math
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -17,8 +19,6 @@ from jaxtyping import Array, Int
 from sim_jax.control.position import ReferencePoint
 from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
-
-ShapeName: TypeAlias = Literal["circle", "lemniscate", "straight", "diagonal", "stationary"]
 
 TICK_RATE = 100
 """Hz at which the publisher ticks."""
@@ -35,48 +35,155 @@ def _number(value: ArrayLike) -> Scalar:
 
 
 class Shape(eqx.Module):
-    """A closed curve, run through by an angle θ = omega·t."""
+    """A closed curve, run through by an angle θ = omega·t; each subclass is one trajectory.
 
-    name: ShapeName = eqx.field(static=True)
+    A subclass needs nothing beside itself: `shapes` finds it, a configuration may name it, ``tune
+    simulate`` flies it, and the design of next flights proposes it where it moves or spins.
+    """
+
+    name: ClassVar[str]
+    """What a configuration calls it."""
+    peak_speed: ClassVar[float]
+    """Largest speed of the curve, in radius·omega; 0 for a place."""
+    peak_acceleration: ClassVar[float]
+    """Largest acceleration of the curve, in peak speed²/radius."""
+    extent: ClassVar[tuple[float, float]]
+    """Half of what the curve spans along x and along y, in radius."""
+    spins: ClassVar[bool] = False
+    """Whether the vehicle is commanded a constant yaw rate instead of the position reference."""
+
     radius: Scalar = eqx.field(converter=_number, default=2.0)
     """m."""
     omega: Scalar = eqx.field(converter=_number, default=0.7)
     """rad/s of the angle while time runs at its own pace."""
     origin: Vec3 = eqx.field(default_factory=lambda: Vec3(_number(0.0), _number(0.0), _number(1.0)))
-    """m, centre of circle and lemniscate, place of the stationary reference. The straight and the
+    """m, centre of circle and lemniscate, place of hover and yaw spin. The straight and the
     diagonal do not look at it: they lie about (0, 0, 1)."""
 
-    def at(self, time: Scalar) -> ReferencePoint:
-        """Return position, velocity and acceleration reference at the shape's own time in s.
+    @abc.abstractmethod
+    def position(self, angle: Scalar) -> Vec3:
+        """Return the position reference, m."""
 
-        Circle: r(cos θ, sin θ); velocity is omega·z × position taken from the world's origin, not
-        the circle's, and acceleration omega·z × velocity. Lemniscate: r(cos θ, sin θ cos θ) with
-        its velocity, no acceleration. Straight: r(cos θ, 0). Diagonal: r(cos θ, cos θ). Neither has
-        velocity or acceleration.
-        """
+    def velocity(self, angle: Scalar) -> Vec3:
+        """Return the velocity reference that the publisher sends, m/s; for most shapes none."""
+        return Vec3.zeros(angle)
+
+    def acceleration(self, angle: Scalar) -> Vec3:
+        """Return the acceleration reference that the publisher sends, m/s²; for most none."""
+        return Vec3.zeros(angle)
+
+    def at(self, time: Scalar) -> ReferencePoint:
+        """Return position, velocity and acceleration reference at the shape's own time in s."""
         angle = self.omega * time
+        return ReferencePoint(self.position(angle), self.velocity(angle), self.acceleration(angle))
+
+
+class Circle(Shape):
+    """A circle, whose velocity and acceleration turn about the world's origin, not its own."""
+
+    name = "circle"
+    peak_speed = 1.0
+    peak_acceleration = 1.0
+    extent = (1.0, 1.0)
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return origin + r(cos θ, sin θ)."""
+        still = jnp.zeros_like(angle)
+        circle = Vec3(self.radius * jnp.cos(angle), self.radius * jnp.sin(angle), still)
+        return circle + self.origin
+
+    def velocity(self, angle: Scalar) -> Vec3:
+        """Return omega·z × position."""
+        return self._turned(self.position(angle))
+
+    def acceleration(self, angle: Scalar) -> Vec3:
+        """Return omega·z × velocity."""
+        return self._turned(self.velocity(angle))
+
+    def _turned(self, vector: Vec3) -> Vec3:
+        """Return omega·z × vector."""
+        return Vec3(-self.omega * vector.y, self.omega * vector.x, jnp.zeros_like(vector.z))
+
+
+class Lemniscate(Shape):
+    """A lemniscate of Gerono; the publisher sends no acceleration."""
+
+    name = "lemniscate"
+    peak_speed = math.sqrt(2)
+    peak_acceleration = 1.1
+    extent = (1.0, 0.5)
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return origin + r(cos θ, sin θ cos θ)."""
+        along = self.radius * jnp.cos(angle)
+        return Vec3(along, along * jnp.sin(angle), jnp.zeros_like(angle)) + self.origin
+
+    def velocity(self, angle: Scalar) -> Vec3:
+        """Return the derivative of the position while time runs at its own pace."""
+        speed = self.radius * self.omega
         cosine, sine = jnp.cos(angle), jnp.sin(angle)
-        still = Vec3.zeros(angle)
-        zero, level = still.x, jnp.full_like(angle, LEVEL)
-        along, turn = self.radius * cosine, self.omega
-        if self.name == "straight":
-            return ReferencePoint(Vec3(along, zero, level), still, still)
-        if self.name == "diagonal":
-            return ReferencePoint(Vec3(along, along, level), still, still)
-        if self.name == "stationary":
-            return ReferencePoint(still + self.origin, still, still)
-        if self.name == "circle":
-            position = Vec3(along, self.radius * sine, zero) + self.origin
-            velocity = Vec3(-turn * position.y, turn * position.x, zero)
-            return ReferencePoint(
-                position, velocity, Vec3(-turn * velocity.y, turn * velocity.x, zero)
-            )
-        speed = self.radius * turn
-        return ReferencePoint(
-            Vec3(along, along * sine, zero) + self.origin,
-            Vec3(-speed * sine, speed * (cosine * cosine - sine * sine), zero),
-            still,
-        )
+        across = speed * (cosine * cosine - sine * sine)
+        return Vec3(-speed * sine, across, jnp.zeros_like(angle))
+
+
+class Straight(Shape):
+    """A line along x."""
+
+    name = "straight"
+    peak_speed = 1.0
+    peak_acceleration = 1.0
+    extent = (1.0, 0.0)
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return (0, 0, 1) + r(cos θ, 0)."""
+        still = jnp.zeros_like(angle)
+        return Vec3(self.radius * jnp.cos(angle), still, jnp.full_like(angle, LEVEL))
+
+
+class Diagonal(Shape):
+    """A line along x = y."""
+
+    name = "diagonal"
+    peak_speed = math.sqrt(2)
+    peak_acceleration = 0.71
+    extent = (1.0, 1.0)
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return (0, 0, 1) + r(cos θ, cos θ)."""
+        along = self.radius * jnp.cos(angle)
+        return Vec3(along, along, jnp.full_like(angle, LEVEL))
+
+
+class Hover(Shape):
+    """A place."""
+
+    name = "hover"
+    peak_speed = 0.0
+    peak_acceleration = 0.0
+    extent = (0.0, 0.0)
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return the origin."""
+        return Vec3.zeros(angle) + self.origin
+
+
+class YawSpin(Shape):
+    """A place at which the vehicle is commanded a constant yaw rate."""
+
+    name = "yaw_spin"
+    peak_speed = 0.0
+    peak_acceleration = 0.0
+    extent = (0.0, 0.0)
+    spins = True
+
+    def position(self, angle: Scalar) -> Vec3:
+        """Return the origin."""
+        return Vec3.zeros(angle) + self.origin
+
+
+def shapes() -> dict[str, type[Shape]]:
+    """Return every trajectory by its name, in the order of their definition."""
+    return {shape.name: shape for shape in Shape.__subclasses__()}
 
 
 class Publication(eqx.Module):

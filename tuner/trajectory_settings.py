@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated
 
-from tuner.yaml_files.section import Number, Positive, Section
+from pydantic import AfterValidator
 
-TrajectoryName = Literal["circle", "lemniscate", "straight", "diagonal", "yaw_spin", "hover"]
+from tuner.yaml_files.section import Number, Positive, Section, refuse
+
+
+def _of_a_shape(name: str) -> str:
+    from sim_jax.trajectory import shapes  # noqa: PLC0415 (loads JAX, which most commands spare)
+
+    if name not in shapes():
+        raise refuse(f"there is no trajectory '{name}'", f"name one of {', '.join(shapes())}")
+    return name
+
+
+TrajectoryName = Annotated[str, AfterValidator(_of_a_shape)]
 
 
 class TrajectorySettings(Section):

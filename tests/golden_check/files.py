@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import get_args
 
 import pandas as pd
 
-from sim_jax.trajectory import ShapeName
 from tests.golden_check import flights, geometry, motor, plant, px4, trajectories
 from tests.golden_check.table import Deviation, Table
 
@@ -21,7 +19,7 @@ CHECKS: dict[str, Check] = {
     "geo_attcontrollers": geometry.attitude_laws,
     "geo_control_full": geometry.position_controller,
     "traj_shape": trajectories.shapes,
-    **{f"traj_update_{shape}_s2.1": trajectories.publisher(shape) for shape in get_args(ShapeName)},
+    **{f"traj_update_{name}_s2.1": trajectories.publisher(name) for name in trajectories.SHAPES},
     "px4_rate_control": px4.rate_control,
     "px4_gyro_filter": px4.gyro_filter,
     "px4_mixer_quad_x": px4.mixer_quad_x,

@@ -18,10 +18,11 @@ from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
-from sim_jax.trajectory import Publication, Shape, ShapeName, publish
+from sim_jax.trajectory import Publication, publish
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
 from tests.golden_check.controllers import golden_controller
 from tests.golden_check.table import Deviation, Table, deviation
+from tests.golden_check.trajectories import SHAPES
 
 POSITION = 2e-3
 """m."""
@@ -41,7 +42,7 @@ _NAME = re.compile(
 class Mission:
     """What a flight's file name says."""
 
-    shape: ShapeName
+    shape: str
     scaler: float
     yaw_rate: float | None
     coefficients: str
@@ -54,7 +55,7 @@ def mission_of(name: str) -> Mission | None:
         return None
     flown = match["shape"]
     return Mission(
-        shape="stationary" if flown in ("hover", "yawspin") else flown,  # type: ignore[arg-type]
+        shape="stationary" if flown in ("hover", "yawspin") else flown,
         scaler=float(match["scaler"] or 1.0),
         yaw_rate=float(match["yaw_rate"]) if match["yaw_rate"] else None,
         coefficients=match["set"],
@@ -71,7 +72,7 @@ def fly(mission: Mission, table: Table) -> list[Deviation]:
     """Fly the mission and compare it with the recorded samples."""
     ticks = np.rint(table.frame["t"].to_numpy() * 100).astype(int)
     samples = int(ticks[-1]) + 1
-    sent = publish(Shape(mission.shape), ticks=samples, velocity_scaler=mission.scaler)
+    sent = publish(SHAPES[mission.shape](), ticks=samples, velocity_scaler=mission.scaler)
     vehicle = golden_vehicle(mission.coefficients)
     place = jax.tree.map(lambda leaf: leaf[0], sent.points.position)
     flown = _rollout(

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from sim_jax.trajectory import Shape, ShapeName, publish
+from sim_jax.trajectory import Circle, Diagonal, Hover, Lemniscate, Straight, publish
 from sim_jax.vector import Vec3
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 SHAPE = 1e-12
 UPDATE = 1e-9
 SCALER = 2.1
+#: Shapes by the names in the golden files.
+SHAPES = {
+    "circle": Circle,
+    "lemniscate": Lemniscate,
+    "straight": Straight,
+    "diagonal": Diagonal,
+    "stationary": Hover,
+}
 
 
 def shapes(table: Table) -> list[Deviation]:
@@ -18,8 +26,7 @@ def shapes(table: Table) -> list[Deviation]:
 
 
 def _shape(table: Table) -> list[Deviation]:
-    shape = Shape(
-        name=table.frame["name"].iloc[0],
+    shape = SHAPES[table.frame["name"].iloc[0]](
         radius=table.column("radius"),
         omega=table.column("omega"),
         origin=table.vector("o"),
@@ -32,12 +39,12 @@ def _shape(table: Table) -> list[Deviation]:
     ]
 
 
-def publisher(name: ShapeName) -> Callable[[Table], list[Deviation]]:
+def publisher(name: str) -> Callable[[Table], list[Deviation]]:
     def check(table: Table) -> list[Deviation]:
         ticks = table.frame["k"].to_numpy()
         start = int(ticks[table.frame["started"].to_numpy() > 0][0])
         sent = publish(
-            Shape(name), ticks=int(ticks[-1]) + 1, velocity_scaler=SCALER, start_tick=start
+            SHAPES[name](), ticks=int(ticks[-1]) + 1, velocity_scaler=SCALER, start_tick=start
         )
         points = sent.points
 

@@ -16,7 +16,7 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
-from sim_jax.trajectory import Shape, ShapeName, publish
+from sim_jax.trajectory import publish, shapes
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import golden_vehicle
@@ -64,8 +64,8 @@ def wobble(craft: Vehicle, steps: int) -> ActuatorInlet:
     return ActuatorInlet((a, b, c, d))
 
 
-def reference(name: ShapeName, *, ticks: int, velocity_scaler: float = 2.1) -> ReferencePoint:
-    return publish(Shape(name), ticks=ticks, velocity_scaler=velocity_scaler).points
+def reference(name: str, *, ticks: int, velocity_scaler: float = 2.1) -> ReferencePoint:
+    return publish(shapes()[name](), ticks=ticks, velocity_scaler=velocity_scaler).points
 
 
 def at_first_point(craft: Vehicle, points: ReferencePoint) -> Start:

@@ -20,7 +20,7 @@ from sim_jax.rotation import Quaternion
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered, look_back
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
-from sim_jax.trajectory import Shape, publish
+from sim_jax.trajectory import Circle, publish
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Rotor, Vehicle
 from tests.sim_jax.derivatives import Differences, assert_derivatives
@@ -319,6 +319,6 @@ def test_delay_line_between_and_at_whole_steps() -> None:
 
 def test_publisher_in_its_numbers() -> None:
     def flown(radius: Array, omega: Array, scaler: Array) -> ReferencePoint:
-        return publish(Shape("circle", radius, omega), ticks=40, velocity_scaler=scaler).points
+        return publish(Circle(radius, omega), ticks=40, velocity_scaler=scaler).points
 
     assert_derivatives(flown, jnp.asarray(2.0), jnp.asarray(0.7), jnp.asarray(2.1))

@@ -107,7 +107,7 @@ def test_rotor_speeds_fed_in_below_give_nearly_the_same_flight(
 
 def test_a_yaw_spin_turns_at_the_asked_rate() -> None:
     craft = vehicle()
-    points = reference("stationary", ticks=300)
+    points = reference("hover", ticks=300)
     inlet = ReferenceInlet(points, jnp.asarray(True), jnp.asarray(2.0))
     flown = fly(craft, inlet, at_first_point(craft, points), Schedule(), 300).log
     assert float(flown.setpoints.rate.z[-1]) == 2.0
@@ -234,7 +234,7 @@ def test_unusable_schedules_are_refused() -> None:
 @pytest.mark.parametrize("name", ["circle", "lemniscate"])
 def test_halving_the_physics_step_moves_forty_seconds_by_less_than_2_mm(name: str) -> None:
     craft = delayed(estimate=0.012, actuator=0.002)
-    points = reference(name, ticks=4000, velocity_scaler=2.0)  # type: ignore[arg-type]
+    points = reference(name, ticks=4000, velocity_scaler=2.0)
     start = at_first_point(craft, points)
     flights = [
         fly(
@@ -256,7 +256,7 @@ def test_hover_of_the_updated_and_the_original_vehicle() -> None:
     """The thesis's anchors: 0.543, 616 rad/s and 0.12 m; 0.672, 772 rad/s and 0.013 m."""
     for name, command, speed, above in (("new", 0.543, 616, 0.12), ("old", 0.672, 772, 0.013)):
         craft = golden_vehicle(name)
-        points = reference("stationary", ticks=1500)
+        points = reference("hover", ticks=1500)
         flown = fly(
             craft, ReferenceInlet(points), hover(craft, vec(0.0, 0.0, 1.0)), Schedule(), 1500
         ).log

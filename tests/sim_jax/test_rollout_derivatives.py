@@ -56,7 +56,7 @@ def jump(samples: int) -> Array:
 def flown(values: Array, *, samples: int, shape: str) -> Array:
     """Return position, attitude, rates and rotor speeds, (channels, samples, *batch)."""
     craft = eqx.tree_at(places, vehicle(), list(values))
-    points = reference(shape, ticks=samples)  # type: ignore[arg-type]
+    points = reference(shape, ticks=samples)
     points = eqx.tree_at(lambda p: p.position.y, points, points.position.y + jump(samples))
     start = at_first_point(vehicle(), points)
     # exactly at their reference speed rotors are between rising and falling

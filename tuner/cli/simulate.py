@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from tuner.cli.options import ControllerName, Many, Quiet, VehicleName
-from tuner.trajectory_settings import TrajectoryName
 
 
 def simulate(
     *,
-    trajectory: TrajectoryName,
+    trajectory: str,
     out: Path,
     vehicle: VehicleName = "hovergames",
     controller: ControllerName = "hovergames",
@@ -31,7 +30,8 @@ def simulate(
     Parameters
     ----------
     trajectory
-        Fly this trajectory from rest, with the publisher's wind-up of ten seconds.
+        Fly this shape, such as circle or lemniscate, from rest, with the publisher's wind-up of
+        ten seconds. A name that does not exist lists all.
     out
         Write FILE.csv, or FILE.bag with the topics of a MAVROS lab.
     radius

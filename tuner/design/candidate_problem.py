@@ -15,6 +15,7 @@ from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
+from sim_jax.trajectory import shapes
 from sim_jax.vector import Vec3
 from tuner.design.candidates import Candidate
 from tuner.objective.criterion import Criterion, Point
@@ -69,7 +70,7 @@ def candidate_problem(
             for axis in ("x", "y", "z")
         )
     )
-    spins = np.array([flight.trajectory.name == "yaw_spin" for flight in flights])
+    spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
     segments = Segments(
         inlet=inlet,
         start=_hovering(objective, starts, len(flights)),

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from sim_jax.trajectory import Shape, shapes
 from tuner.config import TrajectorySettings
 from tuner.errors import InputError
 from tuner.simulation.trajectory import at_speed
@@ -21,16 +22,6 @@ SMALLEST = 0.5
 """Radius of a shape below which it is not worth flying, m."""
 HARDEST = 9.0
 """Acceleration of the reference beyond which it is not proposed, some 45° of tilt; m/s²."""
-
-#: Shape -> half its extent along x and y for a radius of 1.
-EXTENT = {
-    "circle": (1.0, 1.0),
-    "lemniscate": (1.0, 0.5),
-    "straight": (1.0, 0.0),
-    "diagonal": (1.0, 1.0),
-}
-#: Shape -> the most that its reference is accelerated at a peak speed v and radius r, in v²/r.
-BEND = {"circle": 1.0, "lemniscate": 1.1, "straight": 1.0, "diagonal": 0.71}
 
 
 @dataclass(frozen=True)
@@ -72,33 +63,30 @@ class Candidate:
 
 
 def candidates(arena: Arena) -> tuple[Candidate, ...]:
-    """Return every shape in two sizes and several speeds, and yaw spins."""
-    flights = []
-    for shape, (along_x, along_y) in EXTENT.items():
-        widest = (arena.x / 2 - CLEARANCE) / along_x
-        if along_y:
-            widest = min(widest, (arena.y / 2 - CLEARANCE) / along_y)
-        for radius in dict.fromkeys(max(widest * share, SMALLEST) for share in (1.0, 0.5)):
-            flights += [
-                _shape(shape, round(radius, 2), speed)
-                for speed in SPEEDS
-                if BEND[shape] * speed**2 / radius <= HARDEST
-            ]
-    flights += [
-        Candidate(
-            f"a yaw spin at {rate:g} rad/s", TrajectorySettings(name="yaw_spin", yaw_rate=rate)
-        )
-        for rate in YAW_RATES
-    ]
+    """Return every shape that moves in two sizes and several speeds, and the yaw spins."""
+    flights: list[Candidate] = []
+    for shape in shapes().values():
+        flights += _spins(shape) if shape.spins else _moving(shape, arena)
     return tuple(flights)
 
 
-def _shape(shape: str, radius: float, speed: float) -> Candidate:
-    name = {
-        "circle": f"a circle of {radius:g} m radius",
-        "lemniscate": f"a lemniscate of {2 * radius:g} m length",
-        "straight": f"a straight line of {2 * radius:g} m",
-        "diagonal": f"a diagonal across {2 * radius:g} m",
-    }[shape]
-    settings = TrajectorySettings.model_validate({"name": shape, "radius": radius})
-    return Candidate(f"{name} at {speed:g} m/s", at_speed(settings, speed))
+def _moving(shape: type[Shape], arena: Arena) -> Iterator[Candidate]:
+    walls = zip((arena.x, arena.y), shape.extent, strict=True)
+    widest = [(wall / 2 - CLEARANCE) / extent for wall, extent in walls if extent]
+    for share in (1.0, 0.5) if widest and shape.peak_speed else ():
+        radius = max(min(widest) * share, SMALLEST)
+        settings = TrajectorySettings(name=shape.name, radius=round(radius, 2))
+        for speed in SPEEDS:
+            if shape.peak_acceleration * speed**2 / radius <= HARDEST:
+                name = f"{_noun(shape)} of {settings.radius:g} m radius at {speed:g} m/s"
+                yield Candidate(name, at_speed(settings, speed))
+
+
+def _spins(shape: type[Shape]) -> Iterator[Candidate]:
+    for rate in YAW_RATES:
+        settings = TrajectorySettings(name=shape.name, yaw_rate=rate)
+        yield Candidate(f"{_noun(shape)} at {rate:g} rad/s", settings)
+
+
+def _noun(shape: type[Shape]) -> str:
+    return f"a {shape.name.replace('_', ' ')}"

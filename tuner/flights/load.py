@@ -76,7 +76,7 @@ def make_flight(
         series=own,
         initial=initial_state(around),
         yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
-        trajectory=sidecar.trajectory.model_dump() if sidecar.trajectory else None,
+        trajectory=sidecar.trajectory,
         notes=tuple(notes),
         damage=tuple(part.later(-start) for part in content.damage),
     )

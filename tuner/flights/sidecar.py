@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
-from tuner.trajectory_settings import TrajectorySettings
 from tuner.yaml_files.section import Number, Section, read_model
 
 
@@ -14,7 +14,8 @@ class Sidecar(Section):
     Attributes
     ----------
     trajectory
-        What was flown, for recordings without the reference.
+        What was flown, for recordings without the reference: name and numbers as in a
+        `TrajectorySettings`, which are checked where the simulator's shapes are known.
     start, end
         Seconds since the first pose between which the mission lies, instead of those found.
     topics
@@ -23,7 +24,7 @@ class Sidecar(Section):
         Prefix of its topics.
     """
 
-    trajectory: TrajectorySettings | None = None
+    trajectory: Mapping[str, str | Number] | None = None
     start: Number | None = None
     end: Number | None = None
     topics: str | None = None

@@ -11,23 +11,11 @@ from numpy.typing import NDArray
 
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.trajectory import TICK_RATE, Shape, ShapeName, publish
+from sim_jax.trajectory import TICK_RATE, publish, shapes
 from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.errors import InputError
 from tuner.flights.flight import Flight
-
-_SHAPES: dict[str, ShapeName] = {
-    "circle": "circle",
-    "lemniscate": "lemniscate",
-    "straight": "straight",
-    "diagonal": "diagonal",
-    "yaw_spin": "stationary",
-    "hover": "stationary",
-}
-
-#: Peak speed of each shape's reference, in radius·omega·velocity scaler.
-_PEAK = {"circle": 1.0, "lemniscate": math.sqrt(2), "straight": 1.0, "diagonal": math.sqrt(2)}
 
 
 @dataclass(frozen=True)
@@ -64,10 +52,8 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
     control_rate
         Hz of the position controller, which sees the last of the publisher's 100 Hz ticks.
     """
-    shape = Shape(
-        _SHAPES[settings.name],
-        radius=jnp.asarray(settings.radius),
-        omega=jnp.asarray(settings.omega),
+    shape = shapes()[settings.name](
+        radius=jnp.asarray(settings.radius), omega=jnp.asarray(settings.omega)
     )
     ticks = math.ceil(duration * TICK_RATE) + 1
     sent = publish(shape, ticks=ticks, velocity_scaler=settings.speed_scale)
@@ -75,7 +61,6 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
     seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
     rows = seen.astype(int)
     points = sent.points
-    spins = settings.name == "yaw_spin"
     return Published(
         ReferenceInlet(
             ReferencePoint(
@@ -84,8 +69,8 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
                     for part in (points.position, points.velocity, points.acceleration)
                 )
             ),
-            spins=jnp.asarray(spins),
-            yaw_rate=jnp.asarray(settings.yaw_rate if spins else 0.0),
+            spins=jnp.asarray(shape.spins),
+            yaw_rate=jnp.asarray(settings.yaw_rate if shape.spins else 0.0),
         ),
         np.asarray(sent.lap)[rows],
     )
@@ -107,7 +92,8 @@ def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight
     reference = {
         name: np.asarray(part.stacked(), dtype=np.float64).T[:count] for name, part in parts.items()
     }
-    spin = settings.yaw_rate if settings.name == "yaw_spin" else flight.yaw_rate_setpoint
+    spins = shapes()[settings.name].spins
+    spin = settings.yaw_rate if spins else flight.yaw_rate_setpoint
     return replace(flight, signals={**flight.signals, **reference}, yaw_rate_setpoint=spin)
 
 
@@ -126,8 +112,8 @@ def at_speed(settings: TrajectorySettings, speed: float) -> TrajectorySettings:
     InputError
         The trajectory stays in one place, or the speed is none.
     """
-    peak = _PEAK.get(settings.name)
-    if peak is None:
+    peak = shapes()[settings.name].peak_speed
+    if not peak:
         raise InputError("--speed", f"{settings.name} stays in one place", "leave it out")
     scale = speed / (peak * settings.radius * settings.omega)
     if not 0 < scale < math.inf:

@@ -36,7 +36,7 @@ def test_the_version_is_printed(capsys):
     [
         (["simulat"], "no command 'simulat'; did you mean 'simulate'?"),
         (["lab/a.bag"], "for a fit write: tune --flights lab/a.bag"),
-        (["simulate", "--trajectory", "square", "--out", "x.csv"], '"square"'),
+        (["simulate", "--trajectory", "square", "--out", "x.csv"], "no trajectory 'square'"),
         (["simulate", "--trajectory", "circle", "--rate", "fast", "--out", "x.csv"], "--rate"),
         (["simulate", "--trajectory", "circle", "--oot", "x.csv"], "--out"),
         (["simulate", "--trajectory", "circle", "--out", "x.csv", "extra"], "extra"),
@@ -137,7 +137,7 @@ def test_inspect_prints_tables_or_json(capsys):
     assert main(["inspect", bag]) == 0
     assert "/optitrack/pose" in capsys.readouterr().out
     assert main(["inspect", bag, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["schema_version"] == 1
+    assert json.loads(capsys.readouterr().out)["schema_version"] == 2
 
 
 def test_inspect_reports_which_recording_cannot_be_read(tmp_path, capsys):

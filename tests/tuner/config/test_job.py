@@ -75,7 +75,7 @@ def test_paths_count_from_the_job_file_and_bare_names_are_shipped_files(tmp_path
         ("search: {method: newton}", "search.method is 'newton'"),
         ("search: {starts: 0}", "search.starts is 0"),
         ("search: {seed: 1.5}", "search.seed is 1.5"),
-        ("flights: {a: {trajectory: {name: square}}}", "flights.a.trajectory.name is 'square'"),
+        ("flights: {a: {trajectory: {name: square}}}", "there is no trajectory 'square'"),
         ("export: {formats: [urdf]}", "unknown export format 'urdf'; did you mean 'sdf'?"),
     ],
 )

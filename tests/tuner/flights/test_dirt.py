@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.flights import making
-from tuner.errors import RecordingError
+from tuner.errors import ConfigError, RecordingError
 from tuner.flights import Flight, load_flight, load_flights
 from tuner.flights.damage import Cause
+from tuner.trajectory_settings import TrajectorySettings
 from tuner.wording.damage import damage_sentence
+from tuner.yaml_files.section import build
 
 POSE = "/optitrack/pose"
 GYRO = "/mavros/imu/data"
@@ -302,6 +304,8 @@ def test_side_car_names_the_trajectory_and_the_mission(short: Path, tmp_path: Pa
     assert got.trajectory["speed_scale"] == 2.1
     assert got.duration == pytest.approx(5.0, abs=0.02)
     (tmp_path / "side.yaml").write_text("trajectory: {name: cirlce}")
-    with pytest.raises(Exception, match="it should be 'circle'") as caught:
-        load_flight(path)
+    misnamed = load_flight(path).trajectory
+    assert misnamed is not None
+    with pytest.raises(ConfigError, match=r"no trajectory 'cirlce'.*one of circle, ") as caught:
+        build(TrajectorySettings, misnamed, "side.yaml")
     assert "\n" not in str(caught.value)
