@@ -124,7 +124,7 @@ def uncertainty_at(
     covariance = covariance_of(information)
     shares, prior_share = _shares(information, len(flights))
     directions = weakest(covariance.data_only, reference, space.names)
-    estimates = {}
+    estimates: dict[str, Estimate] = {}
     for index, parameter in enumerate(space.parameters):
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
         channel, flight = _source(shares[..., index], information.channels, flights)
@@ -144,26 +144,9 @@ def uncertainty_at(
             flight=flight,
             bound=_bound(parameter, scaled[index]),
         )
-        verdict, reason = judge(precision, directions)
-        tied = reason.model_copy(update={"tied_to": parameter.name})
+        judgement = judge(precision, directions)
         error = covariance.error[index]
-        low, high = (
-            float(np.clip(scaled[index] + side * error, *_limits(parameter)))
-            for side in (-QUANTILE, QUANTILE)
-        )
-        value = space.from_scaled(index, scaled[index])
-        slope = value if parameter.scale == "log" else 1.0
-        for name, ratio in parameter.ratios.items():
-            estimates[name] = Estimate(
-                value=value * ratio,
-                std_error=float(abs(slope * error * ratio)),
-                ci95=(
-                    space.from_scaled(index, low) * ratio,
-                    space.from_scaled(index, high) * ratio,
-                ),
-                verdict=verdict if name == parameter.name else Verdict.TIED,
-                reason=reason if name == parameter.name else tied,
-            )
+        estimates |= _estimates(space, index, scaled[index], error, judgement=judgement)
     return Uncertainty(
         estimates=estimates,
         names=space.names,
@@ -176,6 +159,30 @@ def uncertainty_at(
         prior_share=prior_share,
         directions=directions,
     )
+
+
+def _estimates(
+    space: Space, index: int, scaled: float, error: float, *, judgement: tuple[Verdict, Reason]
+) -> dict[str, Estimate]:
+    """Return the estimates of one parameter's coefficients: the first and those tied to it."""
+    parameter, (verdict, reason) = space.parameters[index], judgement
+    low, high = (
+        space.from_scaled(index, float(np.clip(scaled + side * error, *_limits(parameter))))
+        for side in (-QUANTILE, QUANTILE)
+    )
+    value = space.from_scaled(index, scaled)
+    slope = value if parameter.scale == "log" else 1.0
+    tied = reason.model_copy(update={"tied_to": parameter.name})
+    return {
+        name: Estimate(
+            value=value * ratio,
+            std_error=float(abs(slope * error * ratio)),
+            ci95=(low * ratio, high * ratio),
+            verdict=verdict if name == parameter.name else Verdict.TIED,
+            reason=reason if name == parameter.name else tied,
+        )
+        for name, ratio in parameter.ratios.items()
+    }
 
 
 def references(space: Space, vector: Array) -> Array:

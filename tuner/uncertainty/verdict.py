@@ -19,8 +19,8 @@ WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
 IDENTIFIABLE_ERROR = 0.25
 """Relative standard error from the flights alone above which they do not determine it."""
-NO_EFFECT_ERROR = 10.0
-"""Relative standard error from the flights alone above which they show no effect of it at all."""
+NO_INFORMATION_ERROR = 10.0
+"""Relative standard error from the flights alone above which they hold no information about it."""
 PRIOR_SHARE = 0.5
 """Share of the information above which a coefficient's interval is its prior's work."""
 CONFUSED = 0.9
@@ -50,8 +50,8 @@ class ReasonCode(StrEnum):
     """The flights determine it, to ``half_width``."""
     NULL_DIRECTION = "null_direction"
     """It takes part in ``direction``, along which nothing that was recorded changes."""
-    NO_EFFECT = "no_effect"
-    """Nothing that was recorded depends on it."""
+    NO_INFORMATION = "no_information"
+    """With the others free, the flights hold no information about it."""
     WIDE_INTERVAL = "wide_interval"
     """The flights alone determine it no better than ``half_width``."""
     PRIOR_DOMINATES = "prior_dominates"
@@ -186,8 +186,8 @@ def _not_identifiable(precision: Precision, directions: Sequence[Direction]) -> 
         if direction.null and precision.name in direction.moves and len(direction.moves) > 1:
             code = ReasonCode.NULL_DIRECTION
             return Reason(code=code, direction=direction, prior_given=given, bound=bound)
-    if precision.data_error >= NO_EFFECT_ERROR:
-        return Reason(code=ReasonCode.NO_EFFECT, prior_given=given, bound=bound)
+    if precision.data_error >= NO_INFORMATION_ERROR:
+        return Reason(code=ReasonCode.NO_INFORMATION, prior_given=given, bound=bound)
     if precision.data_error > IDENTIFIABLE_ERROR:
         half_width = QUANTILE * precision.data_error
         code = ReasonCode.WIDE_INTERVAL

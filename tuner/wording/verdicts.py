@@ -50,7 +50,7 @@ def _main_clause(reason: Reason) -> str:
         ReasonCode.NULL_DIRECTION: "the flights do not identify it: "
         f"{'' if direction is None else direction_in_words(direction)} "
         f"The interval is that of {prior}",
-        ReasonCode.NO_EFFECT: "it has no effect on anything recorded; "
+        ReasonCode.NO_INFORMATION: "the flights hold no information about it; "
         f"the interval is that of {prior}",
         ReasonCode.WIDE_INTERVAL: f"the flights alone determine it only to ±{_half_width(reason)}; "
         f"the interval is that of {prior}",

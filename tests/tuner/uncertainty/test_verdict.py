@@ -52,9 +52,9 @@ def test_an_interval_that_the_prior_made_is_not_identifiable() -> None:
     assert reason == Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
 
 
-def test_a_coefficient_without_effect() -> None:
+def test_a_coefficient_without_information() -> None:
     _, reason = judge(replace(GOOD, data_error=50.0), ())
-    assert reason.code is ReasonCode.NO_EFFECT
+    assert reason.code is ReasonCode.NO_INFORMATION
 
 
 def test_a_null_direction_is_the_reason() -> None:

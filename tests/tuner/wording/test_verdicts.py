@@ -46,8 +46,8 @@ def test_what_the_prior_determines() -> None:
     )
     reason = Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
     assert reason_in_words(reason) == "70% of the information about it is that of the given prior"
-    reason = Reason(code=ReasonCode.NO_EFFECT, prior_given=False)
-    assert reason_in_words(reason).startswith("it has no effect on anything recorded")
+    reason = Reason(code=ReasonCode.NO_INFORMATION, prior_given=False)
+    assert reason_in_words(reason).startswith("the flights hold no information about it")
 
 
 def test_a_null_direction_is_spelled_out() -> None:
