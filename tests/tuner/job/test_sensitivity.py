@@ -66,7 +66,7 @@ def test_an_arena_is_taken_from_the_flights(flight):
 
 @pytest.mark.parametrize(
     ("arena", "expected"),
-    [("8,x,3", "no list of lengths"), ("8,6", "three lengths"), ("1,1,1", "too small")],
+    [("8,x,3", "is not a list of lengths"), ("8,6", "three lengths"), ("1,1,1", "too small")],
 )
 def test_a_wrong_arena_is_one_line_and_writes_nothing(bag, tmp_path, capsys, arena, expected):
     out = tmp_path / "out"
