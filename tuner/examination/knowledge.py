@@ -60,7 +60,7 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         ],
         directions=list(uncertainty.directions),
         names=list(uncertainty.names),
-        correlation=uncertainty.correlation.tolist(),
+        correlation=uncertainty.covariance.correlation.tolist(),
         covariance=(uncertainty.covariance.matrix * np.outer(units, units)).tolist(),
         information=(information / np.outer(units, units)).tolist(),
     )

@@ -40,35 +40,37 @@ def with_undetermined_held(
     """Return the fit once all that it does not identify is held, and its examination."""
     examination = examine(fitted)
     for _ in range(MAX_ROUNDS):
-        held = held_by(examination.uncertainty) | dict(fitted.held)
-        names = sorted(set(held.values()))
+        stand_ins = stand_ins_of(examination.uncertainty) | dict(fitted.held)
+        names = sorted(set(stand_ins.values()))
         if set(names) <= set(fitted.held.values()):
             break
         on_message(
             f"the flights do not identify {listed(names)}: held at the initial value, "
             "and the others are fitted again"
         )
-        fitted = hold(job, fitted, held, on_progress)
+        fitted = hold(job, fitted, stand_ins, on_progress)
         examination = examine(fitted)
     return fitted, examination
 
 
-def held_by(uncertainty: Uncertainty) -> dict[str, str]:
-    """Return each coefficient that the flights do not identify -> the one held in its place.
+def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
+    """Return each coefficient that the flights do not identify -> its stand-in, which is held.
 
-    A coefficient is held itself unless it trades off against one that is.
+    A coefficient is its own stand-in unless it trades off against another one.
     """
     undetermined = [
         name for name in uncertainty.names if not uncertainty.estimates[name].identifiable
     ]
-    held: dict[str, str] = {}
+    stand_ins: dict[str, str] = {}
     for direction in uncertainty.directions:
-        members = [name for name in direction.moves if name in undetermined and name not in held]
+        members = [
+            name for name in direction.moves if name in undetermined and name not in stand_ins
+        ]
         if not direction.null or len(members) < 2:
             continue
         ranked = sorted(members, key=lambda name: _rank(name, direction.moves))
-        held |= dict.fromkeys(members, ranked[0])
-    return held | {name: name for name in undetermined if name not in held}
+        stand_ins |= dict.fromkeys(members, ranked[0])
+    return stand_ins | {name: name for name in undetermined if name not in stand_ins}
 
 
 def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
@@ -79,7 +81,7 @@ def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:
 def hold(
     job: Job,
     fitted: Fitted,
-    held: Mapping[str, str],
+    stand_ins: Mapping[str, str],
     on_progress: Callable[[Job, Progress], None],
 ) -> Fitted:
     """Return the fit with the held coefficients at their initial values and the others polished.
@@ -88,12 +90,12 @@ def hold(
     ----------
     job, fitted
         The problem and where its search ended.
-    held
-        Coefficient -> stand-in, as of `held_by`; the stand-ins are held, the others stay free.
+    stand_ins
+        Coefficient -> stand-in, as of `stand_ins_of`; the stand-ins are held, the others stay free.
     on_progress
         Called after every iteration.
     """
-    names, space = set(held.values()), job.space
+    names, space = set(stand_ins.values()), job.space
     is_held = np.array([name in names for name in space.names])
     if not is_held.any():
         return fitted
@@ -108,4 +110,6 @@ def hold(
         title=f"with {len(names)} held",
         on_progress=lambda progress: on_progress(job, progress),
     )
-    return replace(end, held=dict(held), wall_time=fitted.wall_time + time.perf_counter() - clock)
+    return replace(
+        end, held=dict(stand_ins), wall_time=fitted.wall_time + time.perf_counter() - clock
+    )

@@ -59,8 +59,6 @@ class Uncertainty:
         Coefficient -> estimate, tied ones each.
     names
         The K parameters, in the order of every array: for a tie, the first of the group.
-    correlation
-        (K, K) of the scaled coordinates.
     covariance
         See `Covariance`.
     reference
@@ -79,7 +77,6 @@ class Uncertainty:
 
     estimates: Mapping[str, Estimate]
     names: tuple[str, ...]
-    correlation: Array
     covariance: Covariance
     reference: Array
     channels: tuple[str, ...]
@@ -150,7 +147,6 @@ def uncertainty_at(
     return Uncertainty(
         estimates=estimates,
         names=space.names,
-        correlation=covariance.correlation,
         covariance=covariance,
         reference=reference,
         channels=information.channels,
