@@ -67,11 +67,7 @@ def read_recordings(
     names = [flight.name for flight in flights]
     for name in job.holdout:
         if name not in names:
-            raise InputError(
-                "--holdout",
-                f"there is no flight '{name}'",
-                did_you_mean(name, names),
-            )
+            raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
     return recordings_of(
         settings, (_with_reference(flight, settings) for flight in flights), holdout=holdout
     )
@@ -116,12 +112,7 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     chosen = inlet_for(flight, inlet)
     if INLETS[chosen].has_mixer:
         check_mixer(settings.vehicle)
-    return Recording(
-        flight,
-        chosen,
-        None if offset == "free" else float(offset),
-        holdout,
-    )
+    return Recording(flight, chosen, None if offset == "free" else float(offset), holdout)
 
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:

@@ -30,7 +30,7 @@ from tuner.comparison.errors import (
     limits_of,
     short_way,
 )
-from tuner.config import ControllerFile, VehicleFile
+from tuner.config import ControllerFile, VehicleFile, check_mixer
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.criterion import Criterion
@@ -73,7 +73,7 @@ class Comparison:
     controller
         What flew.
     window
-        s, length of the windows of flights that enter below the reference.
+        s, length of the windows of flights that are not simulated in a closed loop.
 
     Raises
     ------
@@ -93,7 +93,13 @@ class Comparison:
         ]
 
     def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
-        """Return flight name to its errors with a vehicle, in the recordings' order."""
+        """Return flight name to its errors with a vehicle, in the recordings' order.
+
+        Raises
+        ------
+        ConfigError
+            The vehicle has rotors that the mixer above an inlet cannot fly.
+        """
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
             errors |= group.fly(vehicle)
@@ -112,6 +118,7 @@ class _Group:
     ) -> None:
         self._recordings, self._controller = tuple(recordings), controller
         self._schedule = schedule_of(controller)
+        self._has_mixer = INLETS[inlet].has_mixer
         self._windowed = not INLETS[inlet].closed_loop
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self._windowed:
@@ -135,6 +142,8 @@ class _Group:
 
     def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
+        if self._has_mixer:
+            check_mixer(vehicle)
         model = model_of(vehicle, self._controller)
         simulated, crash_times = _poses_at_stamps(
             model,

@@ -13,7 +13,7 @@ from tuner.comparison.comparison import Comparison
 from tuner.comparison.table import table_of
 from tuner.comparison.write import write_table
 from tuner.config import ControllerFile, Options, configs_folder
-from tuner.errors import InputError
+from tuner.errors import ConfigError, InputError
 from tuner.recordings import Recording
 
 LAPS = np.array([20.0, 40.0])
@@ -163,6 +163,12 @@ def test_wrong_input_is_one_line_and_status_2(bag, arguments, expected, capsys):
     err = capsys.readouterr().err
     assert expected in err
     assert err.count("\n") == 1
+
+
+def test_a_vehicle_that_the_mixer_cannot_fly_is_refused(flight, updated):
+    six = updated.model_copy(update={"rotors": (*updated.rotors, *updated.rotors[:2])})
+    with pytest.raises(ConfigError, match="has 6 rotors"):
+        Comparison([Recording(flight)], ControllerFile()).fly(six)
 
 
 def test_a_recording_without_reference_is_refused(flight):
