@@ -145,7 +145,7 @@ def run(
     write_knowledge(folder, job, examination, fitted)
     background.begin(folder)
     write_next_flight(folder, job, examination, fitted)
-    render(folder, drawn=background.drawn)
+    render(folder, wait_for_plots=background.wait)
     for line in exports_of_job(
         folder, settings.job.export, refly=refly, today=datetime.date.today()
     ):

@@ -1,4 +1,4 @@
-"""The papers' figures drawn by a process of their own, while the rest of a run goes on.
+"""The figures of ``plots/`` drawn by another process, while the rest of a run goes on.
 
 ``python -m tuner.report.background`` reads a folder's name from its input, draws what the folder
 holds by then, and prints the keys of the figures.
@@ -17,7 +17,7 @@ from tuner.report.sections import sections_of
 
 
 class BackgroundDrawing:
-    """A process that draws; it starts up as soon as this is made."""
+    """A process that draws a folder's figures; it starts up as soon as this is made."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -35,22 +35,22 @@ class BackgroundDrawing:
             self._process.stdin.write(f"{folder.resolve()}\n")
             self._process.stdin.flush()
         except BrokenPipeError:
-            return  # it did not come up; `drawn` will tell of nothing
+            return  # it did not start; `wait` will return no key
 
-    def drawn(self) -> frozenset[str]:
-        """Wait for its end, and return the keys of the figures that are there.
+    def wait(self) -> frozenset[str]:
+        """Wait for its end, and return the keys of the figures that it has written.
 
-        A process that could not draw tells of none, so that they are drawn here after all.
+        They are none if it could not draw: then the caller draws them.
         """
-        told, _ = self._process.communicate()
-        return frozenset(json.loads(told)) if self._process.returncode == 0 else frozenset()
+        output, _ = self._process.communicate()
+        return frozenset(json.loads(output)) if self._process.returncode == 0 else frozenset()
 
 
 def main() -> None:
     """Draw one folder's figures and print their keys."""
     folder = sys.stdin.readline().rstrip("\n")
     if not folder:
-        return  # whoever asked has gone
+        return  # the run ended before it had anything to draw
     contents = read_contents(folder)
     charts = [chart for section in sections_of(contents) for chart in section.charts]
     write_plots(charts, contents.folder)
@@ -58,6 +58,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    from matplotlib import pyplot  # noqa: F401 (a second that is over before it matters)
+    from matplotlib import pyplot  # noqa: F401 (takes a second, during which the run goes on)
 
     main()

@@ -1,40 +1,41 @@
-"""The page: sections and interactive figures, everything inside one file."""
+"""The page: sections, figures as images and interactive ones, everything inside one file."""
 
 from __future__ import annotations
 
 import base64
 import gzip
+import hashlib
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from tuner.disk import write_text
-from tuner.report.chart import Chart
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
-from tuner.report.paper import write_plots
+from tuner.report.paper import plot_file, write_plots
+from tuner.report.section import Section
 from tuner.report.sections import sections_of
+from tuner.report.static import data_uri
 from tuner.report.summary import summary
 
 REPORT_FILE = "report.html"
 
 
 def render(
-    folder: str | Path, *, plots: bool = True, drawn: Callable[[], Collection[str]] = frozenset
+    folder: str | Path, *, wait_for_plots: Callable[[], Collection[str]] = frozenset
 ) -> Path:
-    """Write ``report.html`` of a result folder, and return its path.
+    """Write ``report.html`` and ``plots/*.svg`` of a result folder, and return the page's path.
 
     Parameters
     ----------
     folder
         Of a run, or of an examination without one.
-    plots
-        Whether to write the figures as ``plots/*.svg`` too.
-    drawn
-        Tells in the end which of these are there already.
+    wait_for_plots
+        Returns the keys of the figures that another process has written to ``plots/`` by then,
+        see `tuner.report.background`; the others are drawn here.
 
     Raises
     ------
@@ -44,33 +45,58 @@ def render(
     contents = read_contents(folder)
     sections = sections_of(contents)
     charts = [chart for section in sections for chart in section.charts]
+    figures = json.dumps([figure_of(chart) for chart in charts], allow_nan=False)
+    library = _plotly()
+    drawn = wait_for_plots()
+    write_plots([chart for chart in charts if chart.key not in drawn], contents.folder)
+    images = {
+        chart.key: data_uri(plot_file(contents.folder, chart).read_text()) for chart in charts
+    }
     path = contents.folder / REPORT_FILE
-    write_text(path, _page(contents, sections, charts))
-    if plots:
-        there = drawn()
-        write_plots([chart for chart in charts if chart.key not in there], contents.folder)
+    write_text(path, _page(contents, sections, images, figures, library))
     return path
 
 
-def _page(contents: Contents, sections: Sequence[object], charts: Sequence[Chart]) -> str:
-    loader = PackageLoader("tuner.report")
+def _page(
+    contents: Contents,
+    sections: Sequence[Section],
+    images: Mapping[str, str],
+    figures: str,
+    library: str,
+) -> str:
     environment = Environment(
-        loader=loader,
+        loader=PackageLoader("tuner.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
     environment.filters |= {"figures": _figures, "rmse": _rmse}
-    figures = json.dumps([figure_of(chart) for chart in charts], allow_nan=False)
+    script = _source(environment, "page.js")
     return environment.get_template("page.html.jinja").render(
         about=contents.about,
         summary=summary(contents),
         sections=sections,
+        images=images,
+        policy=_policy(script, library),
         style=Markup(_source(environment, "page.css")),
-        script=Markup(_source(environment, "page.js")),
+        script=Markup(script),
         figures=Markup(_packed(figures)),
-        plotly=Markup(_packed(_plotly())),
+        library=Markup(_packed(library)),
+    )
+
+
+def _policy(*scripts: str) -> str:
+    """Return the content-security policy that the page carries and works under.
+
+    It runs its own two scripts, known by their hashes, evaluates no text and opens no connection.
+    The plotting library sets style attributes, and saves a figure by way of a blob.
+    """
+    hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts)
+    allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
+    return (
+        f"default-src 'none'; script-src {allowed}; style-src 'unsafe-inline'; "
+        "img-src data: blob:; base-uri 'none'; form-action 'none'"
     )
 
 

@@ -39,10 +39,15 @@ def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
     written = []
     with mpl.rc_context(SETTINGS):
         for chart in charts:
-            path = folder / PLOTS / f"{chart.key}.svg"
+            path = plot_file(folder, chart)
             write_text(path, _svg(chart))
             written.append(path)
     return tuple(written)
+
+
+def plot_file(folder: Path, chart: Chart) -> Path:
+    """Return where a chart's SVG file lies in a result folder."""
+    return folder / PLOTS / f"{chart.key}.svg"
 
 
 def _svg(chart: Chart) -> str:

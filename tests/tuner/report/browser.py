@@ -1,156 +1,81 @@
-"""A headless Chromium spoken to over its debugging pipe: pages as a reader would see them."""
+"""The system's Chromium, headless and without a network: pages as a reader would see them."""
 
 from __future__ import annotations
 
-import base64
-import json
-import os
 import shutil
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-NAMES = ("chromium", "google-chrome", "chromium-browser", "chrome")
-PATIENCE = 60.0
-"""s."""
-#: The debugging pipe is file descriptors 3 and 4.
-LAUNCH = """
-import fcntl, os, sys
-ends = [fcntl.fcntl(int(end), fcntl.F_DUPFD, 10) for end in sys.argv[1:3]]
-for number, end in enumerate(ends, start=3):
-    os.dup2(end, number)
-os.execv(sys.argv[3], sys.argv[3:])
-"""
+from playwright.sync_api import Browser, Page, sync_playwright
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None
+)
+ARGUMENTS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--disable-quic",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+PATIENCE = 60_000.0
+"""ms within which a page has drawn its figures on a busy machine."""
 
 
-def find_chromium() -> str | None:
-    return next((path for path in map(shutil.which, NAMES) if path), None)
+@dataclass(frozen=True)
+class Reading:
+    """A page that is open, with its errors and warnings and what it asked the network for."""
 
+    page: Page
+    complaints: list[str] = field(default_factory=list)
+    requests: list[str] = field(default_factory=list)
 
-class Page:
-    """One tab."""
-
-    def __init__(self, to: int, answers: int) -> None:
-        self._to, self._answers = to, answers
-        self._buffer, self._number = b"", 0
-        self._session: str | None = None
-        self.complaints: list[str] = []
-
-    def open(self, file: Path, *, width: int, height: int, dark: bool = False) -> None:
-        """Load a file without a network and wait until its figures are drawn."""
-        created = self.ask("Target.createTarget", url="about:blank")
-        attached = self.ask("Target.attachToTarget", targetId=created["targetId"], flatten=True)
-        self._session = attached["sessionId"]
-        for domain in ("Page", "Runtime", "Log", "Network"):
-            self.ask(f"{domain}.enable")
-        self.ask(
-            "Network.emulateNetworkConditions",
-            offline=True,
-            latency=0,
-            downloadThroughput=-1,
-            uploadThroughput=-1,
-        )
-        self.ask(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=height,
-            deviceScaleFactor=1,
-            mobile=width < 600,
-        )
-        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-        self.ask("Emulation.setEmulatedMedia", features=scheme)
-        self.ask("Page.navigate", url=file.resolve().as_uri())
-        end = time.monotonic() + PATIENCE
-        while self.evaluate("document.body?.dataset.drawn") != "yes":
-            if self.complaints or time.monotonic() > end:
-                return
-            time.sleep(0.05)
-
-    def evaluate(self, expression: str) -> Any:
-        answer = self.ask(
-            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
-        )
-        return answer["result"].get("value")
-
-    def screenshot(self, path: Path, *, whole: bool = True) -> None:
-        taken = self.ask("Page.captureScreenshot", captureBeyondViewport=whole, format="png")
-        path.write_bytes(base64.b64decode(taken["data"]))
-
-    def ask(self, method: str, **parameters: object) -> dict[str, Any]:
-        self._number += 1
-        message: dict[str, object] = {"id": self._number, "method": method, "params": parameters}
-        if self._session:
-            message["sessionId"] = self._session
-        os.write(self._to, json.dumps(message).encode() + b"\0")
-        while True:
-            said = self._next()
-            if said.get("id") == self._number:
-                if "error" in said:
-                    raise RuntimeError(f"{method}: {said['error']['message']}")
-                result: dict[str, Any] = said["result"]
-                return result
-            self._listen(said)
-
-    def _listen(self, said: dict[str, Any]) -> None:
-        method, parameters = said.get("method"), said.get("params", {})
-        if method == "Runtime.exceptionThrown":
-            details = parameters["exceptionDetails"]
-            thrown = details.get("exception", {}).get("description", details["text"])
-            self.complaints.append(thrown)
-        elif method == "Log.entryAdded" and parameters["entry"]["level"] in ("error", "warning"):
-            self.complaints.append(parameters["entry"]["text"])
-        elif method == "Runtime.consoleAPICalled" and parameters["type"] in ("error", "warning"):
-            self.complaints.append(str([a.get("value") for a in parameters["args"]]))
-
-    def _next(self) -> dict[str, Any]:
-        while b"\0" not in self._buffer:
-            got = os.read(self._answers, 1 << 20)
-            if not got:
-                raise RuntimeError("the browser ended")
-            self._buffer += got
-        line, _, self._buffer = self._buffer.partition(b"\0")
-        said: dict[str, Any] = json.loads(line)
-        return said
+    def wait_until_drawn(self) -> None:
+        self.page.wait_for_selector("body[data-drawn]", timeout=PATIENCE)
 
 
 @contextmanager
-def browser(profile: Path) -> Iterator[Page]:
-    """Start a browser with its own profile folder and yield a tab; it ends with the block."""
-    chromium = find_chromium()
-    assert chromium is not None
-    theirs_in, ours_out = os.pipe()
-    ours_in, theirs_out = os.pipe()
-    arguments = [
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-dev-shm-usage",
-        "--no-first-run",
-        "--hide-scrollbars",
-        f"--user-data-dir={profile}",
-        "--remote-debugging-pipe",
-    ]
-    process = subprocess.Popen(
-        [sys.executable, "-c", LAUNCH, str(theirs_in), str(theirs_out), chromium, *arguments],
-        pass_fds=(theirs_in, theirs_out),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    os.close(theirs_in)
-    os.close(theirs_out)
-    page = Page(ours_out, ours_in)
-    try:
-        yield page
-    finally:
-        os.close(ours_out)
-        os.close(ours_in)
-        process.terminate()
+def chromium() -> Iterator[Browser]:
+    """Start a browser that ends with the block."""
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            yield browser
+        finally:
+            browser.close()
+
+
+@contextmanager
+def reading(
+    browser: Browser,
+    file: Path,
+    *,
+    width: int = 1280,
+    dark: bool = False,
+    scripts: bool = True,
+    before: str = "",
+) -> Iterator[Reading]:
+    """Open a file in a window of its own, a script run ``before`` those of the page."""
+    context = browser.new_context(
+        viewport={"width": width, "height": 900},
+        is_mobile=width < 600,
+        color_scheme="dark" if dark else "light",
+        java_script_enabled=scripts,
+        offline=True,
+    )
+    try:
+        page = context.new_page()
+        opened = Reading(page)
+        page.add_init_script(before)
+        page.on("pageerror", lambda error: opened.complaints.append(str(error)))
+        page.on("console", lambda message: opened.complaints.append(message.text))
+        page.on("request", lambda request: opened.requests.append(request.url))
+        page.goto(file.resolve().as_uri())
+        yield opened
+    finally:
+        context.close()

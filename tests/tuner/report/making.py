@@ -1,25 +1,25 @@
-"""A result folder without the half minute of a fit: two short flights with white noise."""
+"""A result folder that nothing was simulated or fitted for: numbers such as a run would leave."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 
-from tests.tuner.uncertainty import making
 from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, SignalErrors
-from tuner.config import values_of, write_vehicle
-from tuner.examination.examination import Examination, examine
-from tuner.examination.knowledge import knowledge_of
+from tuner.config import VehicleFile, read_vehicle, values_of, write_vehicle
+from tuner.examination.sensitivity_json import (
+    CoefficientKnowledge,
+    EffectOverTime,
+    Knowledge,
+    OutputSensitivity,
+    ResidualWhiteness,
+)
 from tuner.examination.tables import write_files
-from tuner.flights.flight import Array
-from tuner.objective.normal import Objective
-from tuner.report import write_laps
+from tuner.report import write_laps, write_traces
 from tuner.report.record import Move, SearchRecord, Start
-from tuner.report.traces import save_traces
 from tuner.result import (
     CoefficientResult,
     Ending,
@@ -29,34 +29,25 @@ from tuner.result import (
     Status,
     write_result,
 )
-from tuner.uncertainty.verdict import NOT_FITTED, Verdict
+from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
 from tuner.wording.verdicts import judgement_in_words
+from tuner.yaml_files.shipped import find_config
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
+FLIGHTS = ("swing", "spin")
+CHANNELS = {"position": ("m", "xyz"), "attitude": ("deg", ("roll", "pitch", "yaw"))}
+SECONDS = 6.0
 
 
-def problem(free: Sequence[str], *, without: Sequence[str] = ()) -> Objective:
-    exact = making.problem(free)
-    noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
-    kept = {name: one for name, one in noisy.segments.measured.items() if name not in without}
-    changed: Objective = eqx.tree_at(lambda o: o.segments.measured, noisy, kept)
-    return changed
-
-
-def write_run(folder: Path, free: Sequence[str], *, without: Sequence[str] = ()) -> Examination:
-    """Write what a run that ended at the truth would have written."""
-    objective = problem(free, without=without)
-    point = making.truth(objective)
-    found = examine(making.fitted_of(objective, point))
-    vehicle = making.vehicle_file()
+def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> None:
+    """Write what a run would write whose flights do not determine one direction."""
+    vehicle = read_vehicle(find_config("vehicles", "hovergames", Path()))
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
-    errors = [_errors(name, 0.2) for name in making.FLIGHTS]
-    better = [_errors(name, 0.002) for name in making.FLIGHTS]
-    write_result(_result(found, errors, better), folder)
-    write_laps(folder, {e.name: e for e in errors}, {e.name: e for e in better})
-    save_traces(
-        folder, {name: _traces(objective, segment) for segment, name in enumerate(making.FLIGHTS)}
-    )
+    initial = {name: _errors(name, 0.2) for name in FLIGHTS}
+    best = {name: _errors(name, 0.002) for name in FLIGHTS}
+    write_laps(folder, initial, best)
+    write_traces(folder, initial, best)
     values = values_of(vehicle)
     SearchRecord(
         iterations=[
@@ -76,76 +67,151 @@ def write_run(folder: Path, free: Sequence[str], *, without: Sequence[str] = ())
             Start(origin="random", loss=None, start=values, end=values),
         ],
     ).write(folder)
-    write_files(knowledge_of(found, objective.space, point), folder)
-    return found
+    knowledge = _knowledge(vehicle, free, undetermined)
+    write_files(knowledge, folder)
+    write_result(_result(vehicle, knowledge, initial, best), folder)
 
 
 def _errors(name: str, size: float) -> FlightErrors:
-    time = np.linspace(0.0, making.SECONDS, 300)
-    place = size * np.column_stack([np.sin(time), np.cos(time), 0.1 * time])
-    zero = np.zeros_like(place)
-    position, attitude = SignalErrors(time, zero, place), SignalErrors(time, zero, 10 * place)
+    time = np.linspace(0.0, SECONDS, 300)
+    recorded = np.column_stack([np.sin(2.2 * time), np.sin(3.1 * time), 1.0 + 0.1 * time])
+    error = size * np.column_stack([np.sin(time), np.cos(time), 0.1 * time])
+    position = SignalErrors(time, recorded, error)
+    attitude = SignalErrors(time, 10 * recorded, 10 * error)
     return FlightErrors(name, position, attitude, np.array([2.0, 4.0]), None)
 
 
-def _traces(objective: Objective, segment: int) -> dict[str, Array]:
-    channels = making.fly_at(objective, making.truth(objective))
-    place = np.asarray(channels["position"])[::4, :, segment]
-    time = np.arange(len(place)) * 4 / making.PHYSICS
-    turn = 10.0 * place
-    return {
-        "position_time": time,
-        "position": place,
-        "position_initial": place + 0.1,
-        "position_best": place + 0.001,
-        "attitude_time": time,
-        "attitude": turn,
-        "attitude_initial": turn + 3.0,
-        "attitude_best": turn + 0.05,
-    }
+def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Direction) -> Knowledge:
+    values = values_of(vehicle)
+    names = [*free, *(name for name in values if name not in free)]
+    size = len(free)
+    time = np.linspace(0.1, SECONDS - 0.1, 20)
+    rising, faint = (time / SECONDS).tolist(), dict.fromkeys(names, 0.01)
+    lags = np.arange(30)
+    apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+    return Knowledge(
+        coefficients={
+            name: _known(name, values[name], undetermined, fitted=name in free) for name in names
+        },
+        flights=list(FLIGHTS),
+        channels=list(CHANNELS),
+        outputs=[
+            OutputSensitivity(
+                flight=flight,
+                channel=channel,
+                axis=axis,
+                unit=unit,
+                rmse=0.002,
+                change=faint,
+                rmse_up=faint,
+                rmse_down=faint | {"motor_constant": None},
+            )
+            for flight in FLIGHTS
+            for channel, (unit, axes) in CHANNELS.items()
+            for axis in axes
+        ],
+        acting=[
+            EffectOverTime(
+                flight=flight,
+                time=time.tolist(),
+                change=dict.fromkeys(names, rising),
+                span=dict.fromkeys(names, (4.0, 6.0)),
+            )
+            for flight in FLIGHTS
+        ],
+        residuals=[
+            ResidualWhiteness(
+                flight=flight,
+                channel=channel,
+                rms=1.0,
+                spacing=0.02,
+                autocorrelation=(0.5**lags).tolist(),
+                limit=0.1,
+                memory=0.03,
+                white=False,
+            )
+            for flight in FLIGHTS
+            for channel in CHANNELS
+        ],
+        directions=[undetermined],
+        names=list(free),
+        correlation=(0.5**apart).tolist(),
+        covariance=np.eye(size).tolist(),
+        information=np.eye(size).tolist(),
+    )
+
+
+def _known(
+    name: str, value: float, undetermined: Direction, *, fitted: bool
+) -> CoefficientKnowledge:
+    open_ended = name in undetermined.moves
+    error = 0.01 * (abs(value) or 1.0)
+    precision = Precision(
+        name=name,
+        half_width=0.02,
+        unit=None,
+        relative_half_width=0.02,
+        data_error=undetermined.error if open_ended else 0.01,
+        prior_share=0.98 if open_ended else 0.02,
+        prior_given=False,
+        inflation=1.0,
+        partner=None,
+        correlation=0.0,
+        channel="position",
+        flight=None,
+        bound=None,
+    )
+    verdict, reason = judge(precision, [undetermined])
+    share = (1.0 - precision.prior_share) / (len(CHANNELS) * len(FLIGHTS))
+    return CoefficientKnowledge(
+        unit=COEFFICIENTS[name].unit,
+        fitted=fitted,
+        value=value,
+        std_error=error,
+        ci95=(value - 2 * error, value + 2 * error),
+        verdict=verdict,
+        reason=reason,
+        step=abs(value) or 1.0,
+        shares={channel: dict.fromkeys(FLIGHTS, share) for channel in CHANNELS},
+        prior_share=precision.prior_share,
+        bias={} if fitted else {"motor_constant": 0.2},
+    )
 
 
 def _result(
-    found: Examination, errors: Sequence[FlightErrors], better: Sequence[FlightErrors]
+    vehicle: VehicleFile,
+    knowledge: Knowledge,
+    initial: Mapping[str, FlightErrors],
+    best: Mapping[str, FlightErrors],
 ) -> RunResult:
     coefficients = {}
-    for name, value in values_of(making.vehicle_file()).items():
-        estimate = found.uncertainty.estimates.get(name)
-        unit = COEFFICIENTS[name].unit
-        if estimate is None:
-            coefficients[name] = CoefficientResult(
-                unit=unit,
-                initial=value,
-                best=value,
-                fitted=False,
-                verdict=Verdict.FIXED,
-                reason=NOT_FITTED,
-            )
-            continue
+    for name, value in values_of(vehicle).items():
+        known = knowledge.coefficients[name]
+        judged = (known.verdict, known.reason) if known.fitted else (Verdict.FIXED, NOT_FITTED)
         coefficients[name] = CoefficientResult(
-            unit=unit,
-            initial=1.1 * value,
+            unit=known.unit,
+            initial=1.1 * value if known.fitted else value,
             best=value,
-            fitted=True,
-            std_error=estimate.std_error,
-            ci95=estimate.ci95,
-            identifiable=estimate.identifiable,
-            verdict=estimate.verdict,
-            reason=estimate.reason,
-            note=judgement_in_words(estimate.verdict, estimate.reason),
+            fitted=known.fitted,
+            std_error=known.std_error if known.fitted else None,
+            ci95=known.ci95 if known.fitted else None,
+            identifiable=known.reason.identifiable if known.fitted else None,
+            verdict=judged[0],
+            reason=judged[1],
+            note=judgement_in_words(*judged),
         )
     flights = tuple(
         FlightResult(
-            name=before.name,
-            path=f"lab/{before.name}.bag",
+            name=name,
+            path=f"lab/{name}.bag",
             sha256="ab" * 32,
             split="fit" if number == 0 else "holdout",
-            duration=making.SECONDS,
+            duration=SECONDS,
             time_offset=0.0,
-            rmse_initial=before.rmse,
-            rmse_best=after.rmse,
+            rmse_initial=initial[name].rmse,
+            rmse_best=best[name].rmse,
         )
-        for number, (before, after) in enumerate(zip(errors, better, strict=True))
+        for number, name in enumerate(FLIGHTS)
     )
     return RunResult(
         schema_version=2,
