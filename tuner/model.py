@@ -77,7 +77,10 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
-    """Return the simulator's vehicle, float64 where that is switched on."""
+    """Return the simulator's vehicle, float64 where that is switched on.
+
+    A term at its neutral value is left out: it costs nothing.
+    """
     aerodynamics = file.aerodynamics
     return Vehicle(
         body=Body(
@@ -95,7 +98,11 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
         setup=Setup(
             jnp.asarray(file.setup.estimate_latency), jnp.asarray(file.setup.actuator_latency)
         ),
-        effects={name: jnp.asarray(value) for name, value in file.effects.items()},
+        effects={
+            name: jnp.asarray(value)
+            for name, value in file.effects.items()
+            if value != COEFFICIENTS[name].neutral
+        },
     )
 
 

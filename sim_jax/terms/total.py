@@ -6,19 +6,23 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.terms import rotor
+from sim_jax.terms import body, rotor
 from sim_jax.terms.air import Air
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
-Term: TypeAlias = Callable[[Vehicle, Motion, PerRotor, Air], Wrench]
-"""(vehicle, motion, rotor speeds in rad/s, air) -> what acts, in body axes."""
+Term: TypeAlias = Callable[[Vehicle, Motion, PerRotor, Air], Wrench | None]
+"""(vehicle, motion, rotor speeds in rad/s, air) -> what acts, in body axes.
+
+None where the vehicle lacks the term's coefficient: then nothing of it is traced or computed.
+"""
 
 TERMS: tuple[Term, ...] = (
     rotor.thrust,
     rotor.rotor_drag,
     rotor.rolling_moment,
     rotor.drag_torque,
+    body.fuselage_drag,
 )
 """Everything that acts on the vehicle besides gravity; a term that is added here flies."""
 
@@ -30,7 +34,8 @@ def total_wrench(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: A
     the other: so those of opposite rotors cancel to the last bit, which a sum over rotors term by
     term does not give where the processor rounds a product and a sum at once.
     """
-    wrenches = [term(vehicle, motion, rotor_speed, air) for term in TERMS]
+    acting = (term(vehicle, motion, rotor_speed, air) for term in TERMS)
+    wrenches = [wrench for wrench in acting if wrench is not None]
     force = moment = Vec3.zeros(air.velocity.x)
     for number, arm in enumerate(air.arms):
         forces = [wrench.at_rotors[number] for wrench in wrenches if wrench.at_rotors]

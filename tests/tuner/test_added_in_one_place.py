@@ -55,12 +55,11 @@ ROW = Coefficient(
 
 def sail_drag(vehicle, motion, rotor_speed, air):  # noqa: ARG001 (all terms take the same)
     """Return -d‖v‖v of the body through the air."""
-    still = Vec3.zeros(air.velocity.x)
     if NAME not in vehicle.effects:
-        return Wrench(still, still)
+        return None
     v = air.velocity
     speed = safe_sqrt(v.x * v.x + v.y * v.y + v.z * v.z)
-    return Wrench(v * (-vehicle.effects[NAME] * speed), still)
+    return Wrench(v * (-vehicle.effects[NAME] * speed), Vec3.zeros(v.x))
 
 
 @pytest.fixture

@@ -1,0 +1,46 @@
+"""Terms beyond Gazebo's motor model, which a vehicle may lack."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.rigid_body import Motion
+from sim_jax.terms import total
+from sim_jax.terms.air import Air
+from sim_jax.terms.body import fuselage_drag
+from tests.sim_jax.support import quaternion, vec, vehicle
+
+CRAFT = vehicle()
+SPEEDS = (jnp.asarray(600.0),) * 4
+
+
+def force(craft, velocity):
+    motion = Motion(vec(0, 0, 1), velocity, quaternion(1, 0, 0, 0), vec(0, 0, 0))
+    return total.total_wrench(craft, motion, SPEEDS, Air.around(craft, motion)).force.stacked()
+
+
+def draggy(coefficient):
+    return replace(CRAFT, effects={"fuselage_drag": coefficient})
+
+
+def test_fuselage_drag_is_quadratic_and_against_the_velocity():
+    velocity = vec(3.0, -4.0, 0.0)
+    added = force(draggy(jnp.asarray(0.02)), velocity) - force(CRAFT, velocity)
+    np.testing.assert_allclose(added, [-0.3, 0.4, 0.0], atol=1e-12)
+
+
+def test_its_derivatives_are_finite_at_rest():
+    at_rest = jax.jacfwd(lambda d, v: force(draggy(d), v), argnums=(0, 1))(
+        jnp.asarray(0.02), vec(0, 0, 0)
+    )
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(at_rest))
+
+
+def test_a_term_without_its_coefficient_is_not_traced(monkeypatch):
+    velocity = vec(3.0, -4.0, 0.0)
+    absent = str(jax.make_jaxpr(lambda v: force(CRAFT, v))(velocity))
+    assert fuselage_drag in total.TERMS
+    monkeypatch.setattr(total, "TERMS", tuple(t for t in total.TERMS if t is not fuselage_drag))
+    assert str(jax.make_jaxpr(lambda v: force(CRAFT, v))(velocity)) == absent
