@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.table import Section
+from tuner.flights.formats import open_recording
 from tuner.flights.locate import choose_map, locate
-from tuner.flights.opening import open_recording
 from tuner.flights.recording import Request
 from tuner.flights.topics import shipped_maps
 

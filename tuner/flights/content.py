@@ -13,10 +13,10 @@ from tuner.flights.clean import clean
 from tuner.flights.damage import Damage
 from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Note, Series
+from tuner.flights.formats import open_recording
 from tuner.flights.frames import correct_frames
 from tuner.flights.locate import Place, choose_map, locate, require_pose
 from tuner.flights.mission import Mission, find_missions
-from tuner.flights.opening import open_recording
 from tuner.flights.recording import Recording, Samples
 from tuner.flights.sidecar import Sidecar, sidecar_path
 from tuner.flights.sync import align_pose

@@ -13,6 +13,7 @@ from tuner.errors import RecordingError
 from tuner.flights.clock import fit_grid
 from tuner.flights.content import Content, Settings, given_map, read_content
 from tuner.flights.flight import SIGNALS, Array, Series
+from tuner.flights.formats import open_recording
 from tuner.flights.informs import informed, inlets
 from tuner.flights.inspection import (
     Inspection,
@@ -22,7 +23,6 @@ from tuner.flights.inspection import (
 )
 from tuner.flights.mission import yaw_spin
 from tuner.flights.motion import RATE, derivative, rotate, smooth
-from tuner.flights.opening import open_recording
 from tuner.flights.recording import Recording, Samples
 from tuner.flights.resample import resample
 from tuner.flights.sidecar import Sidecar, read_sidecar

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner.flights.flight import SIGNALS, Array, Note
+from tuner.flights.formats import is_tabular
 from tuner.flights.locate import Place
 from tuner.flights.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
 from tuner.flights.stamps import believe
@@ -64,7 +65,7 @@ def extract(
         if samples is None or not len(samples.receive):
             continue
         time, values = times[place.topic], _values(samples, signal, place)
-        if recording.format == "table":  # a row without the signal is no sample of it
+        if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
             time, values = time[there], values[there]
         if len(time):

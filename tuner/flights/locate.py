@@ -9,6 +9,7 @@ from fnmatch import fnmatchcase
 
 from tuner.errors import RecordingError
 from tuner.flights.flight import Note
+from tuner.flights.formats import is_tabular
 from tuner.flights.recording import Recording
 from tuner.flights.topics import Source, TopicMap
 
@@ -56,7 +57,7 @@ def locate(
         If `strict`: a topic is there, but not what the map says of it.
     """
     times = [recording.lacking("", (clock.field,)) for clock in topics.clocks]
-    if recording.format == "table" and all(times):
+    if is_tabular(recording.format) and all(times):
         return {}, ()
     places: dict[str, Place] = {}
     notes = []
@@ -99,7 +100,7 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         return "" if wild else f"it is not known where {topic} ({kind}) holds the {signal}"
     missing = recording.lacking(topic, fields)
     if missing:
-        absent = recording.format == "table" and len(missing) == len(fields)
+        absent = is_tabular(recording.format) and len(missing) == len(fields)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
         hint = f", did you mean '{near[0]}'?" if near else ""
         what = f"{topic} has no field" if topic else "there is no column"
@@ -119,7 +120,7 @@ def require_pose(recording: Recording, topics: TopicMap, found: Mapping[str, Pla
         raise RecordingError(
             recording.path, f"the topic map '{topics.name}' names no topic for {what}", "add one"
         )
-    if recording.format == "table":
+    if is_tabular(recording.format):
         columns = [name for source in sources for name in source.fields or ()]
         raise RecordingError(
             recording.path,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.errors import RecordingError
 from tuner.flights.damage import Damage
 from tuner.flights.flight import Array, Note
 
@@ -118,7 +120,7 @@ class Recording(Protocol):
 
     @property
     def format(self) -> str:
-        """``ros``, ``ulog`` or ``table``: what a topic map's ``format`` is matched with."""
+        """The `Reader.format` by which it was opened."""
         ...
 
     @property
@@ -147,3 +149,60 @@ class Recording(Protocol):
             A topic has no such field, or nothing can be read.
         """
         ...
+
+
+#: The one topic of a table.
+ROWS = ""
+
+
+class TabularRecording:
+    """A recording with one row a time and one number a column; the base of tabular formats.
+
+    Parameters
+    ----------
+    path
+        The file.
+    format_name
+        The `Reader.format`.
+    columns
+        Their names.
+    """
+
+    def __init__(self, path: Path, format_name: str, columns: Sequence[str]) -> None:
+        self.path = path
+        self.format = format_name
+        self.columns = columns
+        self.topics: Sequence[Topic] = (Topic(ROWS, "table", 1),)
+
+    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
+        """Return None: columns have no usual names."""
+        return None
+
+    def fields(self, topic: str) -> Sequence[str]:  # noqa: ARG002
+        """Return the columns."""
+        return self.columns
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
+        """Return those of some columns that are not there."""
+        return tuple(name for name in fields if name not in self.columns)
+
+    def clock(self, request: Request) -> Clock:
+        """Return the column that tells the time.
+
+        Raises
+        ------
+        RecordingError
+            None of those requested is there.
+        """
+        for clock in request.clocks:
+            if clock.field in self.columns:
+                return clock
+        raise RecordingError(
+            self.path,
+            f"has no time column among {', '.join(self.columns[:8])}, ...",
+            "name it under 'time' in the topic map",
+        )
+
+    @abstractmethod
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted columns of `ROWS`."""

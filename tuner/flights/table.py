@@ -14,20 +14,18 @@ from tuner.flights.damage import Cause, Damage
 from tuner.flights.flight import Array, Note
 from tuner.flights.recording import (
     NANOSECONDS,
+    ROWS,
     Clock,
     Contents,
     Nanoseconds,
     Request,
     Samples,
-    Topic,
-    Usual,
+    TabularRecording,
 )
 
 if TYPE_CHECKING:
     import pyarrow
 
-#: The one topic of a table.
-ROWS = ""
 #: A longer line, in bytes, is no row of a table.
 LONGEST_LINE = 1 << 20
 #: Tables with more columns or cells are no flight.
@@ -35,7 +33,7 @@ MOST_COLUMNS = 10_000
 MOST_CELLS = 500_000_000
 
 
-class Table:
+class Table(TabularRecording):
     """A CSV or Parquet file with a line of column names.
 
     Raises
@@ -44,46 +42,24 @@ class Table:
         It is no table.
     """
 
-    format = "table"
-
     def __init__(self, path: Path) -> None:
         self.path = path
         self._skipped = 0
         with path.open("rb") as stream:
             self._parquet = stream.read(4) == b"PAR1"
-        self.columns = self._parquet_columns() if self._parquet else self._csv_columns()
-        if len(set(self.columns)) < 2 or len(self.columns) > MOST_COLUMNS:
+        columns = self._parquet_columns() if self._parquet else self._csv_columns()
+        if len(set(columns)) < 2 or len(columns) > MOST_COLUMNS:
             raise RecordingError(
-                path,
-                f"{len(self.columns)} columns are no table of a flight",
-                "check its first line",
+                path, f"{len(columns)} columns are no table of a flight", "check its first line"
             )
-        self.topics = (Topic(ROWS, "table", 1),)
-
-    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
-        """Columns have no usual names."""
-        return None
-
-    def fields(self, topic: str) -> list[str]:  # noqa: ARG002
-        """Return the columns."""
-        return self.columns
-
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
-        """Return those of some columns that are not there."""
-        return tuple(name for name in fields if name not in self.columns)
+        super().__init__(path, "table", columns)
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted columns."""
         if ROWS not in wanted:
             return Contents({})
         request = wanted[ROWS]
-        clock = next((c for c in request.clocks if c.field in self.columns), None)
-        if clock is None:
-            raise RecordingError(
-                self.path,
-                f"no time column among {', '.join(self.columns[:8])}, ...",
-                "name it under 'time' in the topic map",
-            )
+        clock = self.clock(request)
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
         time = _nanoseconds(table.column(clock.field), clock)

@@ -10,7 +10,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, model_validator
 
 from tuner.errors import ConfigError, did_you_mean
+from tuner.flights import formats as recording_formats
 from tuner.flights.flight import SIGNALS
+from tuner.flights.formats import is_tabular
 from tuner.flights.recording import Clock
 from tuner.flights.units import UNITS
 from tuner.yaml_files.section import Section, Whole, read_model, refuse
@@ -104,7 +106,7 @@ class TopicMap(Section):
     """
 
     name: str
-    format: Literal["ros", "ulog", "table"]
+    format: str
     extends: str | None = None
     priority: Whole = 0
     time: Annotated[tuple[ClockField, ...], BeforeValidator(_as_list)] = ()
@@ -115,7 +117,7 @@ class TopicMap(Section):
     @classmethod
     def _columns(cls, value: Any) -> Any:
         """Let a table's signal be a list of columns, or one column."""
-        if not (isinstance(value, Mapping) and value.get("format") == "table"):
+        if not (isinstance(value, Mapping) and is_tabular(value.get("format"))):
             return value
         signals = value.get("signals")
         if not isinstance(signals, Mapping):
@@ -131,7 +133,10 @@ class TopicMap(Section):
         return {**value, "signals": {name: as_source(of) for name, of in signals.items()}}
 
     @model_validator(mode="after")
-    def _know_every_signal(self) -> Self:
+    def _know_format_and_signals(self) -> Self:
+        formats = [reader.format for reader in recording_formats.READERS]
+        if self.format not in formats:
+            raise refuse(f"unknown format '{self.format}'", did_you_mean(self.format, formats))
         for name, sources in self.signals.items():
             if name not in SIGNALS:
                 raise refuse(f"unknown signal '{name}'", did_you_mean(name, SIGNALS))

@@ -12,7 +12,7 @@ from tests.tuner.flights import making
 from tuner.errors import RecordingError
 from tuner.flights import Flight, load_flight
 from tuner.flights.damage import Cause
-from tuner.flights.opening import open_recording
+from tuner.flights.formats import open_recording
 from tuner.flights.recording import Request
 
 SLOW = pytest.mark.slow
@@ -144,8 +144,8 @@ def test_decoding_agrees_with_rosbags_bit_for_bit() -> None:
     [
         (b"", "is empty"),
         (b"\x1f\x8b\x08" + b"x" * 50, "is packed"),
-        (b"\x00\x01\x02\x03" * 50, "is of no known kind"),
-        (b"one column\n1\n2\n", "is of no known kind"),
+        (b"\x00\x01\x02\x03" * 50, "is of no known format"),
+        (b"one column\n1\n2\n", "is of no known format"),
         (b"a,b\n1,2\n", "no position and attitude"),
     ],
 )

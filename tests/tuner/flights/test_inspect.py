@@ -107,7 +107,7 @@ def test_one_broken_file_does_not_hide_the_others(tmp_path: Path) -> None:
     found, errors = inspect_recordings([tmp_path / "bad.bag", making.CIRCLE, tmp_path / "none"])
     assert [Path(one.path).name for one in found] == ["circle_3mps.bag"]
     assert [str(error).split(": ")[1].split(";")[0] for error in errors] == [
-        "is of no known kind",
+        "is of no known format",
         "no such file",
     ]
 

@@ -22,8 +22,10 @@ from tuner.flights.recording import (
     Topic,
     Usual,
 )
+from tuner.flights.ros.bag1 import Bag1
 from tuner.flights.ros.container import Connection, Container
 from tuner.flights.ros.definitions import Definitions
+from tuner.flights.ros.folder import Folder, open_file
 from tuner.flights.ros.usual import USUAL
 from tuner.flights.ros.wire import UnknownFieldError, Walk, decode, missing_fields, plan
 
@@ -31,6 +33,15 @@ _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
 
 #: Messages beyond this, of one topic, are no flight but an attack on the memory.
 MOST_MESSAGES = 50_000_000
+
+
+def open_container(path: Path) -> Container:
+    """Open the container of a ROS recording by what it begins with."""
+    if path.is_dir():
+        return Folder(path)
+    with path.open("rb") as stream:
+        magic = stream.read(7)
+    return Bag1(path) if magic in (b"#ROSBAG", b"") else open_file(path)
 
 
 class RosRecording:

@@ -1,0 +1,135 @@
+"""The formats of recordings: a reader each, which knows its files by how they begin.
+
+A format needs two things: a reader here, and a topic map whose ``format`` names it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tuner.errors import RecordingError
+from tuner.flights.recording import Recording
+
+
+@dataclass(frozen=True)
+class Head:
+    """What a recording shows before it is opened.
+
+    Attributes
+    ----------
+    path
+        The file or folder.
+    start
+        The first 4096 bytes; none of a folder.
+    """
+
+    path: Path
+    start: bytes
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format.
+
+    Attributes
+    ----------
+    format
+        What the ``format`` of a topic map is compared with.
+    files
+        Its files, as the message that refuses an unknown format lists them.
+    matches
+        Tells whether a recording is of this format.
+    open
+        Opens a recording, given ``.msg`` files for types that it does not define. It imports what
+        the format needs: together the formats' libraries take half a second.
+    tabular
+        Whether a recording is one table whose columns are named by the topic map alone.
+    """
+
+    format: str
+    files: str
+    matches: Callable[[Head], bool]
+    open: Callable[[Path, tuple[Path, ...]], Recording]
+    tabular: bool = False
+
+
+def _is_ros(head: Head) -> bool:
+    empty_bag = head.path.suffix == ".bag" and not head.start
+    magic = (b"#ROSBAG", b"\x89MCAP", b"SQLite format 3")
+    return head.path.is_dir() or head.start.startswith(magic) or empty_bag
+
+
+def _open_ros(path: Path, messages: tuple[Path, ...]) -> Recording:
+    from tuner.flights.ros.recording import RosRecording, open_container  # noqa: PLC0415
+
+    return RosRecording(path, open_container(path), messages)
+
+
+def _open_ulog(path: Path, _: tuple[Path, ...]) -> Recording:
+    from tuner.flights.ulog import ULogRecording  # noqa: PLC0415
+
+    return ULogRecording(path)
+
+
+def _is_table(head: Head) -> bool:
+    """Tell whether a file is Parquet, or text with a separator in its first line."""
+    line, _, _ = head.start.partition(b"\n")
+    printable = all(byte >= 32 or byte in b"\r\n\t" for byte in head.start)
+    text = printable and any(separator in line for separator in b",;\t")
+    return text or head.start.startswith(b"PAR1")
+
+
+def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:
+    from tuner.flights.table import Table  # noqa: PLC0415
+
+    return Table(path)
+
+
+#: The first that matches reads a recording.
+READERS: tuple[Reader, ...] = (
+    Reader("ros", "ROS 1 .bag, ROS 2 folders, .db3 and .mcap", _is_ros, _open_ros),
+    Reader("ulog", "PX4 .ulg", lambda head: head.start.startswith(b"ULog"), _open_ulog),
+    Reader("table", ".csv and .parquet", _is_table, _open_table, tabular=True),
+)
+
+
+def is_tabular(name: object) -> bool:
+    """Tell whether recordings of a format are tables; an unknown format's are not."""
+    return any(reader.format == name and reader.tabular for reader in READERS)
+
+
+def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
+    """Open a recording with the reader of what it begins with, whatever its name says.
+
+    Parameters
+    ----------
+    path
+        A file, or a folder as ROS 2 writes it.
+    messages
+        ``.msg`` files, or folders of them, for ROS types that the recording does not define.
+
+    Raises
+    ------
+    RecordingError
+        It is missing, unreadable or of no known format.
+    """
+    try:
+        start = b""
+        if not path.is_dir():
+            with path.open("rb") as stream:
+                start = stream.read(4096)
+        head = Head(path, start)
+        for reader in READERS:
+            if reader.matches(head):
+                return reader.open(path, messages)
+    except OSError as err:
+        missing = isinstance(err, FileNotFoundError)
+        what = "no such file" if missing else err.strerror or str(err)
+        raise RecordingError(path, what, "check the path") from None
+    if start.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
+        raise RecordingError(path, "is packed", "unpack it first")
+    known = "; ".join(reader.files for reader in READERS)
+    what = "is of no known format" if start else "is empty"
+    raise RecordingError(path, what, f"known formats are {known}")
