@@ -33,8 +33,8 @@ from tuner.config import (  # noqa: E402 (jax is configured first)
 )
 from tuner.findings import Code  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
+from tuner.job.best_fit import validate, vehicle_fitted  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
-from tuner.job.results import validate, vehicle_fitted  # noqa: E402
 from tuner.job.search import search  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
 from tuner.recordings import read_recordings  # noqa: E402

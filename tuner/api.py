@@ -100,6 +100,7 @@ def fit(
     InputError
         The input cannot be used; one line says what to do.
     """
+    configure()
     from tuner.job.run import run  # noqa: PLC0415 (jax)
 
     options = Options(

@@ -16,12 +16,9 @@ EXAMPLES = (
 
 def version() -> str:
     """Return the installed version."""
-    from importlib.metadata import PackageNotFoundError, version
+    from tuner.versions import installed
 
-    try:
-        return version("multirotor-tune")
-    except PackageNotFoundError:
-        return "not installed"
+    return installed()
 
 
 app = App(

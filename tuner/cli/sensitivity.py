@@ -65,7 +65,8 @@ def sensitivity(
         Write tables and report into this folder. Default: runs/ and the time.
     """
     from tuner.cli.options import lengths
-    from tuner.cli.progress import listening, print_examined
+    from tuner.cli.progress import listening
+    from tuner.cli.results import print_sensitivity
     from tuner.runtime import configure
 
     configure()
@@ -93,7 +94,11 @@ def sensitivity(
     )
     with listening(quiet=quiet) as listener:
         result = examine_vehicle(
-            options, request, out=folder_for(out), command=TYPED.get(), on_message=listener.message
+            options,
+            request,
+            out=folder_for(out),
+            command=TYPED.get(),
+            on_message=listener.on_message,
         )
     if not quiet:
-        print_examined(result)
+        print_sensitivity(result)

@@ -67,9 +67,9 @@ def print_export(done: Exported) -> None:
     screen.print(f"written to {done.path} and read back", markup=False)
 
 
-def print_settings(settings: Settings) -> None:
+def print_settings(settings: Settings, screen: Console | None = None) -> None:
     """Print where each setting comes from."""
-    screen = console()
+    screen = screen or console()
     for name, origin in settings.origin.items():
         screen.print(f"{name}: {origin}", markup=False)
 

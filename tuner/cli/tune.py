@@ -67,7 +67,11 @@ def tune(
     seed
         Start the random numbers from this seed. Default: the job file's, else 0.
     """
-    from tuner.cli.progress import listening, print_run
+    from tuner.cli.progress import listening
+    from tuner.cli.results import print_run
+    from tuner.runtime import configure
+
+    configure()
     from tuner.config import Options
     from tuner.job.run import run
 

@@ -1,10 +1,8 @@
-"""Each fitted flight left out in turn: how well the others predict it, and what they agree on."""
+"""Each fitted flight left out in turn: how well the fit to the others predicts it."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,15 +13,15 @@ import numpy as np
 from tuner.config import with_values
 from tuner.disk import write_text
 from tuner.errors import ConfigError, RecordingError
+from tuner.files import csv_text
+from tuner.job.best_fit import best_values, comparison_of
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
-from tuner.job.results import best_values, comparison_of
-from tuner.job.search import free_offsets
+from tuner.job.search import OnProgress, free_offsets
 from tuner.objective.normal import Objective
 from tuner.result import AxesRmse
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.search.progress import Progress
 
 CROSS_VALIDATION_FILE = "cross_validation.csv"
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -31,16 +29,16 @@ AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 @dataclass(frozen=True)
 class Fold:
-    """What the other flights say of one that was left out.
+    """The fit without one flight, and how well it predicts that flight.
 
     Attributes
     ----------
     left_out
         The flight.
     coefficients
-        Name -> value fitted to the others.
+        Name -> value fitted to the other flights.
     rmse
-        Of the flight left out, flown with them; None for what is no rigid body.
+        Of the flight left out, simulated with them; None where their inertia is no rigid body's.
     """
 
     left_out: str
@@ -49,7 +47,7 @@ class Fold:
 
 
 def cross_validate(
-    job: Job, fitted: Fitted, folder: Path, tell: Callable[[Job, Progress], None]
+    job: Job, fitted: Fitted, folder: Path, on_progress: OnProgress
 ) -> tuple[Fold, ...]:
     """Leave each fitted flight out in turn, polish the fit to the others, and write the table.
 
@@ -68,14 +66,14 @@ def cross_validate(
     folds = []
     for number, flight in enumerate(job.fitted):
         others = replace(fitted, objective=_without(fitted.objective, number))
-        found = polished(
+        polished_fit = polished(
             job,
             others,
             free=free,
             title=f"without {flight.name}",
-            on_progress=lambda now: tell(job, now),
+            on_progress=lambda now: on_progress(job, now),
         )
-        values = best_values(job, found)
+        values = best_values(job, polished_fit)
         try:
             rmse = comparison.fly(with_values(job.settings.vehicle, values))[flight.name].rmse
         except ConfigError:
@@ -102,9 +100,6 @@ def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:
     The last row holds the standard deviation of each column over the flights left out.
     """
     names = list(folds[0].coefficients)
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["left_out", *(f"rmse_{axis}" for axis in AXES), *names])
     rows = [
         [
             *(None if fold.rmse is None else getattr(fold.rmse, axis) for axis in AXES),
@@ -112,13 +107,13 @@ def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:
         ]
         for fold in folds
     ]
-    for fold, row in zip(folds, rows, strict=True):
-        table.writerow([fold.left_out, *("" if value is None else repr(value) for value in row)])
     spread = [
-        repr(float(np.std([value for value in column if value is not None], ddof=1)))
+        float(np.std([value for value in column if value is not None], ddof=1))
         if sum(value is not None for value in column) > 1
-        else ""
+        else None
         for column in zip(*rows, strict=True)
     ]
-    table.writerow(["spread", *spread])
-    write_text(folder / CROSS_VALIDATION_FILE, text.getvalue())
+    labels = (*(fold.left_out for fold in folds), "spread")
+    table = ([label, *row] for label, row in zip(labels, (*rows, spread), strict=True))
+    header = ("left_out", *(f"rmse_{axis}" for axis in AXES), *names)
+    write_text(folder / CROSS_VALIDATION_FILE, csv_text(header, table))

@@ -45,8 +45,8 @@ def with_undetermined_held(
         if set(names) <= set(fitted.held.values()):
             break
         on_message(
-            f"the flights do not identify {listed(names)}: held at the initial value, "
-            "and the others are fitted again"
+            f"The flights do not identify {listed(names)}: held at the initial value, and the "
+            "others are fitted again."
         )
         fitted = hold(job, fitted, stand_ins, on_progress)
         examination = examine(fitted)

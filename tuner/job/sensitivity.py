@@ -14,9 +14,9 @@ from tuner.errors import InputError, did_you_mean
 from tuner.examination.examination import Examination, examine
 from tuner.examination.sensitivity_json import Knowledge
 from tuner.findings import Finding
+from tuner.job.best_fit import comparison_of
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.prepare import Job, job_of
-from tuner.job.results import comparison_of, versions
 from tuner.job.unfitted import unfitted
 from tuner.recordings import read_recordings
 from tuner.report import render
@@ -28,6 +28,7 @@ from tuner.sensitivity_analysis.global_sensitivity_json import Method, write_glo
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import write_profiles
+from tuner.versions import versions
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from tuner.config import ControllerFile, Options, read_vehicle, values_of
 from tuner.errors import InputError
 from tuner.findings import Code
 from tuner.flights.load import load_flight
-from tuner.job.run import SILENT, Listener, run
+from tuner.job.listener import Listener
+from tuner.job.run import run
 from tuner.recordings import Recording
 from tuner.report import render
 
@@ -119,7 +120,7 @@ def short_job():
 
 
 @pytest.mark.slow
-def test_each_flight_is_foretold_by_the_others_and_the_fit_stays(tmp_path):
+def test_each_flight_is_predicted_from_the_others_and_the_fit_stays(tmp_path):
     bags = [str(FLIGHTS / f"{name}.bag") for name in ("yaw_spin_3rps", "circle_3mps")]
     folder, result = run(Options(bags, **SHORT), out=tmp_path / "run", cross_validated=True)
     rows = [line.split(",") for line in (folder / "cross_validation.csv").read_text().splitlines()]
@@ -135,18 +136,18 @@ def test_each_flight_is_foretold_by_the_others_and_the_fit_stays(tmp_path):
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
     _, whole = run(short_job(), out=tmp_path / "whole")
-    told = []
+    iterations = []
 
     def interrupt(*what):
-        told.append(what)
-        if len(told) == 7:
+        iterations.append(what)
+        if len(iterations) == 7:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(
             short_job(),
             out=tmp_path / "cut",
-            listener=Listener(SILENT.settled, interrupt, SILENT.message, SILENT.folds),
+            listener=Listener(on_iteration=interrupt),
         )
     assert (tmp_path / "cut" / "best_fit.yaml").exists()
     assert not (tmp_path / "cut" / "result.json").exists()

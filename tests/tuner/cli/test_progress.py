@@ -1,0 +1,41 @@
+"""What a run shows while it works, where standard output is no terminal."""
+
+from types import SimpleNamespace
+
+from tuner.cli.progress import listening
+from tuner.search.fitted import Iteration
+
+
+def iterations(stage, count, first=1):
+    return [
+        Iteration(stage, number, 1.0 / number, 0.1 / number, accepted=True, horizon=2.0)
+        for number in range(first, first + count)
+    ]
+
+
+def test_a_stage_is_one_line_with_its_last_iteration(capsys):
+    with listening(quiet=False) as listener:
+        listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
+        for iteration in (*iterations("2 s", 30), *iterations("whole flights", 60, first=31)):
+            listener.on_iteration(iteration, 12.0)
+        listener.on_message("Examining [how well] each coefficient is known.")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4
+    assert lines[0] == "mass: --mass"
+    assert lines[1].startswith("2 s: iteration 30, horizon 2 s, position RMSE 3.33 mm")
+    assert lines[2].startswith("whole flights: iteration 90, ")
+    assert lines[3] == "Examining [how well] each coefficient is known."
+
+
+def test_an_interrupted_stage_still_gets_its_line(capsys):
+    with listening(quiet=False) as listener:
+        for iteration in iterations("2 s", 3):
+            listener.on_iteration(iteration, 12.0)
+    assert capsys.readouterr().out.count("2 s: iteration 3,") == 1
+
+
+def test_quiet_shows_nothing(capsys):
+    with listening(quiet=True) as listener:
+        listener.on_iteration(iterations("2 s", 1)[0], 1.0)
+        listener.on_message("Examining.")
+    assert capsys.readouterr().out == ""

@@ -1,0 +1,139 @@
+"""The results of a run, or of an examination, as tables on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.table import Table
+
+from tuner.cli.tables import console
+
+if TYPE_CHECKING:
+    from tuner.job.cross_validation import Fold
+    from tuner.job.sensitivity import SensitivityResult
+    from tuner.result import RunResult
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+
+
+def print_run(folder: Path, result: RunResult) -> None:
+    """Print the coefficients, the RMSE before and after, and where everything lies."""
+    from tuner.wording.status import ending_sentence
+
+    screen = console()
+    screen.print(_coefficients(result))
+    screen.print(_errors(result))
+    search = result.search
+    screen.print(
+        f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "
+        f"{search.wall_time:.0f} s."
+    )
+    screen.print(
+        f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv, "
+        "sensitivity.csv)",
+        markup=False,
+    )
+
+
+def print_sensitivity(result: SensitivityResult) -> None:
+    """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    from tuner.wording.findings import one_line
+    from tuner.wording.proposals import proposals_in_words
+    from tuner.wording.verdicts import direction_in_words, judgement_in_words
+
+    screen = console()
+    table = Table(box=None, title="Coefficients", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("value", "±", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    table.add_column("+1 % moves position by")
+    table.add_column("how well it is known")
+    for name, known in result.knowledge.coefficients.items():
+        error = "" if known.std_error is None else f"{known.std_error:.2g}"
+        label = name if known.fitted else f"{name} (fixed)"
+        judgement = judgement_in_words(known.verdict, known.reason)
+        table.add_row(
+            label, f"{known.value:.5g}", error, known.unit, _largest_change(result, name), judgement
+        )
+    screen.print(table)
+    for finding in result.findings:
+        screen.print(one_line(finding), markup=False)
+    for direction in result.knowledge.directions[:1]:
+        screen.print(
+            f"The worst determined combination of coefficients: {direction_in_words(direction)}"
+        )
+    for sentence in proposals_in_words(result.proposals) if result.proposals else ():
+        screen.print(sentence)
+    screen.print(f"written to {result.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")
+
+
+def _largest_change(result: SensitivityResult, name: str) -> str:
+    """Return the largest RMS change of a position axis, and where."""
+    changes = [
+        (output.change[name], output.axis, output.flight)
+        for output in result.knowledge.outputs
+        if output.channel == "position" and name in output.change
+    ]
+    if not changes:
+        return ""
+    change, axis, flight = max(changes)
+    return f"{1000 * change:.3g} mm ({axis}, {flight})"
+
+
+def _coefficients(result: RunResult) -> Table:
+    from tuner.wording.verdicts import judgement_in_words
+
+    table = Table(box=None, title="Coefficients", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("initial", "best", "±", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    table.add_column("how well it is known")
+    for name, coefficient in result.coefficients.items():
+        table.add_row(
+            name,
+            f"{coefficient.initial:.5g}",
+            f"{coefficient.best:.5g}",
+            "" if coefficient.std_error is None else f"{coefficient.std_error:.2g}",
+            coefficient.unit,
+            judgement_in_words(coefficient.verdict, coefficient.reason),
+        )
+    return table
+
+
+def _errors(result: RunResult) -> Table:
+    table = _rmse_table("RMSE with the initial → with the best coefficients", "flight")
+    for flight in result.flights:
+        cells = []
+        for axis in AXES:
+            before, after = getattr(flight.rmse_initial, axis), getattr(flight.rmse_best, axis)
+            cells.append(f"{_number(before)} → {_number(after)}")
+        held_out = " (held out)" if flight.split == "holdout" else ""
+        table.add_row(flight.name + held_out, *cells)
+    return table
+
+
+def folds_table(folds: Sequence[Fold]) -> Table:
+    """Return how well each flight is predicted by the fit to the others."""
+    table = _rmse_table("RMSE of each flight with the fit to the others", "left out")
+    for fold in folds:
+        cells = [
+            "impossible" if fold.rmse is None else _number(getattr(fold.rmse, axis))
+            for axis in AXES
+        ]
+        table.add_row(fold.left_out, *cells)
+    return table
+
+
+def _rmse_table(title: str, first: str) -> Table:
+    table = Table(box=None, title=title, title_justify="left")
+    table.add_column(first)
+    for axis in AXES:
+        unit = "m" if axis in ("x", "y", "z") else "deg"
+        table.add_column(f"{axis} {unit}", justify="right")
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "crash" if value is None else f"{value:.4f}" if value < 0.1 else f"{value:.3f}"

@@ -1,0 +1,81 @@
+"""What a fit stands for: the vehicle, the controller and the clocks that it ended with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tuner.coefficients import COEFFICIENTS
+from tuner.comparison.comparison import Comparison
+from tuner.comparison.errors import FlightErrors
+from tuner.config import ControllerFile, VehicleFile, initial_values, with_values
+from tuner.job.prepare import Job
+from tuner.objective.criterion import OFFSET_UNIT
+from tuner.objective.segments import CLOCKS
+from tuner.recordings import with_offsets
+from tuner.search.fitted import Fitted
+
+
+def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
+    """Return the controller file with the saturation feedback that the search ended with."""
+    controller = job.settings.controller
+    feedback = bool(fitted.objective.model.controller.rate.saturation_feedback > 0.5)
+    return controller.replace(mixer=controller.mixer.replace(saturation_feedback=feedback))
+
+
+def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:
+    """Return the vehicle with the best coefficients, see `best_values`."""
+    return with_values(job.settings.vehicle, best_values(job, fitted))
+
+
+def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return each free coefficient's reported value: fitted, or initial for one that is held."""
+    initial = initial_of(job)
+    held = {*impossible_inertia(job, fitted), *_held(job, fitted)}
+    values = job.space.values(fitted.point.coefficients)
+    return {name: initial[name] if name in held else float(v) for name, v in values.items()}
+
+
+def initial_of(job: Job) -> dict[str, float]:
+    """Return every coefficient's initial value."""
+    return initial_values(job.settings.vehicle, job.settings.controller, job.space.free)
+
+
+def _held(job: Job, fitted: Fitted) -> frozenset[str]:
+    """Return the coefficients that were held at their initial values, tied ones too."""
+    held = set(fitted.held.values())
+    groups = (p.ratios for p in job.space.parameters if p.name in held)
+    return frozenset(name for ratios in groups for name in ratios)
+
+
+def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
+    """Return the fitted moments of inertia, if together they are no rigid body's."""
+    fit, initial = job.space.values(fitted.point.coefficients), initial_of(job)
+    inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
+    moments = {name: float(fit.get(name, initial[name])) for name in inertia}
+    if 2 * max(moments.values()) <= sum(moments.values()):
+        return ()
+    return tuple(name for name in inertia if name in fit)
+
+
+def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
+    """Return flight -> s by which its pose stamps are late."""
+    pose = np.asarray(fitted.point.offsets)[CLOCKS.index("pose")] * OFFSET_UNIT
+    offsets = {recording.flight.name: recording.time_offset or 0.0 for recording in job.recordings}
+    for flight, late in zip(job.fitted, pose, strict=True):
+        offsets[flight.name] += float(late)
+    return offsets
+
+
+def comparison_of(job: Job, fitted: Fitted) -> Comparison:
+    """Return the job's recordings laid out as the search ended: controller and clocks."""
+    recordings = with_offsets(job.recordings, offsets_of(job, fitted))
+    window = job.settings.job.search.window
+    return Comparison(recordings, controller_flown(job, fitted), window=window)
+
+
+def validate(
+    job: Job, fitted: Fitted, vehicle: VehicleFile
+) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
+    """Fly every flight whole with the initial and with the fitted vehicle."""
+    comparison = comparison_of(job, fitted)
+    return comparison.fly(job.settings.vehicle), comparison.fly(vehicle)
