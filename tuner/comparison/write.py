@@ -37,7 +37,7 @@ def _writer(path: Path) -> Callable[[Table], str]:
     writers = {".csv": _csv, ".json": _json, ".html": _html}
     if path.suffix not in writers:
         raise InputError(
-            path, f"no table is written as '{path.suffix}'", "name a .csv, .json or .html"
+            path, f"a table cannot be written as '{path.suffix}'", "name a .csv, .json or .html"
         )
     return writers[path.suffix]
 
