@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tuner.config import Options, settle, with_values, write_vehicle
 from tuner.disk import make_folder
-from tuner.errors import ConfigError, InputError
+from tuner.errors import ConfigError, InputError, OutputError
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
@@ -74,6 +74,8 @@ def run(
     ------
     InputError
         The input cannot be used; nothing was written.
+    OutputError
+        The result folder cannot be written to; a search goes on from there with ``resume``.
     """
     settings = settle(options)
     listener.on_settings(settings)
@@ -86,7 +88,7 @@ def run(
     on_progress = _keeping_best(folder, listener)
     try:
         fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, OutputError):
         listener.on_message(
             f"The best coefficients so far are in {folder}. "
             f"Continue the search with --out {folder} --resume."
