@@ -30,8 +30,7 @@ def simulate(
     Parameters
     ----------
     trajectory
-        Fly this shape, such as circle or lemniscate, from rest, with the publisher's wind-up of
-        ten seconds. A name that does not exist lists all.
+        Fly this shape, such as circle, from rest; a name that does not exist lists all of them.
     out
         Write FILE.csv, or FILE.bag with the topics of a MAVROS lab.
     radius
