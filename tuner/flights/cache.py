@@ -63,8 +63,8 @@ def _digest_of(path: Path) -> str:
     # Name, size and time of change stand for the content of what takes seconds to read.
     parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
     known = cached("digest", json.dumps(parts))
-    if (found := load(known)) is not None and len(found) == 64:
-        return found.decode()
+    if (known_digest := load(known)) is not None and len(known_digest) == 64:
+        return known_digest.decode()
     fresh = _digest(path, files)
     store(known, fresh.encode())
     return fresh

@@ -104,8 +104,8 @@ def read_content(
     recording = open_recording(path, given.messages if given is not None else ())
     namespace = settings.namespace or sidecar.namespace
     candidates = [given] if given is not None else list(shipped_maps())
-    candidates = [one.under(namespace) for one in candidates]
-    if all(one.format != recording.format for one in candidates):
+    candidates = [candidate.under(namespace) for candidate in candidates]
+    if all(candidate.format != recording.format for candidate in candidates):
         raise RecordingError(
             path,
             f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
@@ -116,23 +116,23 @@ def read_content(
     places, notes = locate(recording, chosen, strict=given is not None)
     require_pose(recording, chosen, places)
     raw, contents, noticed = extract(recording, places, chosen.clocks)
-    said = [
+    all_notes = [
         Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
         *notes,
         *contents.notes,
         *noticed,
     ]
-    series, epoch = _clean(path, raw, said)
+    series, epoch = _clean(path, raw, all_notes)
     # From the recorder's clock to that of the stamps, in which the series are.
     arrival = contents.samples[raw["position"].topic].receive
     later = float(np.median(raw["position"].time)) - float(np.median(arrival)) - epoch
     damage = tuple(part.later(later * 1e-9) for part in contents.damage)
     topics_of = {signal: data.topic for signal, data in raw.items()}
     series, noticed = align_pose(series, topics_of)
-    said.extend(noticed)
+    all_notes.extend(noticed)
     series, noticed = correct_frames(series, topics_of)
-    said.extend(noticed)
-    said.extend(_unmeasured(series, topics_of))
+    all_notes.extend(noticed)
+    all_notes.extend(_unmeasured(series, topics_of))
     missions = _missions(series, sidecar)
     return Content(
         recording,
@@ -142,7 +142,7 @@ def read_content(
         series,
         epoch,
         missions,
-        tuple(said),
+        tuple(all_notes),
         damage,
     )
 
@@ -162,13 +162,15 @@ def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | No
     return settings.topics
 
 
-def _clean(path: Path, raw: Mapping[str, Raw], said: list[Note]) -> tuple[dict[str, Series], int]:
+def _clean(
+    path: Path, raw: Mapping[str, Raw], all_notes: list[Note]
+) -> tuple[dict[str, Series], int]:
     epoch = int(raw["position"].time.min()) if "position" in raw else 0
     series = {}
     for signal, data in raw.items():
         seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
-        time, values, found = clean(signal, data.topic, seconds, data.values)
-        said.extend(found)
+        time, values, dropped = clean(signal, data.topic, seconds, data.values)
+        all_notes.extend(dropped)
         if len(time):
             series[signal] = Series(time, values)
     for needed in ("position", "attitude"):
@@ -179,7 +181,7 @@ def _clean(path: Path, raw: Mapping[str, Raw], said: list[Note]) -> tuple[dict[s
 
 
 def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:
-    """Say which rotors have no tachometer."""
+    """Note which rotors have no tachometer."""
     if "rotor_speed" not in series:
         return []
     missing = np.flatnonzero(np.isnan(series["rotor_speed"].values).all(axis=0))
@@ -190,12 +192,12 @@ def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list
 
 
 def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
-    found = find_missions(series)
+    missions = find_missions(series)
     if sidecar.start is None and sidecar.end is None:
-        return found
+        return missions
     pose = series["position"].time
-    start = found[0].start if found else float(pose[0])
-    end = found[-1].end if found else float(pose[-1])
+    start = missions[0].start if missions else float(pose[0])
+    end = missions[-1].end if missions else float(pose[-1])
     start = start if sidecar.start is None else max(sidecar.start, float(pose[0]))
     end = end if sidecar.end is None else min(sidecar.end, float(pose[-1]))
     return (Mission(start, end, "the side-car"),) if end > start else ()

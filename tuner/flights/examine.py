@@ -36,7 +36,7 @@ LOOKED_AT = 3600.0
 
 
 def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) -> Inspection:
-    """Say what a recording holds.
+    """Inspect a recording.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
     try:
         content = read_content(path, settings, sidecar, given)
     except RecordingError as err:
-        # What is in it may still be told, so that the user sees what to map.
+        # Its topics are listed nevertheless, so that the user sees what to map.
         recording = open_recording(path, given.messages if given else ())
         return _without_flight(recording, err)
     return _with_flight(content, sidecar)
@@ -167,15 +167,15 @@ def _seconds(samples: Samples) -> Array:
 
 
 def _clock(content: Content) -> Mapping[str, float]:
-    found = {}
+    clock = {}
     for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
         if name in content.series:
             grid = fit_grid(content.series[name].time, 100.0)
             if grid is not None:
-                found = {"spread": grid.spread, "drift": grid.drift}
+                clock = {"spread": grid.spread, "drift": grid.drift}
                 break
     offset = pose_offset(content.series)
-    return found if offset is None else {**found, "pose_offset": offset}
+    return clock if offset is None else {**clock, "pose_offset": offset}
 
 
 def _mission(content: Content, index: int) -> MissionReport:
@@ -188,8 +188,8 @@ def _mission(content: Content, index: int) -> MissionReport:
     rates = content.series.get("body_rate")
     turning = None
     if rates is not None:
-        own = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
-        turning = float(np.nanmax(own)) if np.isfinite(own).any() else None
+        turn_rates = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
+        turning = float(np.nanmax(turn_rates)) if np.isfinite(turn_rates).any() else None
     setpoints = content.series.get("rate_setpoint")
     known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1)
     return MissionReport(

@@ -66,8 +66,10 @@ def from_parquet(content: bytes) -> tuple[Flight, ...] | None:
             else:
                 series[i][name] = Series(time, values)
         return tuple(
-            _flight(one, own, raw)
-            for one, own, raw in zip(about["flights"], signals, series, strict=True)
+            _flight(details, columns_of_flight, raw)
+            for details, columns_of_flight, raw in zip(
+                about["flights"], signals, series, strict=True
+            )
         )
     except Exception as err:  # a damaged cache is read anew, whatever is wrong with it
         logger.info("a cached flight is damaged: %s", err)

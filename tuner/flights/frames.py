@@ -83,12 +83,12 @@ def correct_frames(
     def apply(signal: str, reading: _Reading | None, doubt: str) -> None:
         topic = topics.get(signal, signal)
         if reading is not None:
-            own = fixed[signal]
-            values = reading.read(own.values)
+            measured = fixed[signal]
+            values = reading.read(measured.values)
             known = np.isfinite(values).all(axis=1)
-            fixed[signal] = Series(own.time[known], values[known])
+            fixed[signal] = Series(measured.time[known], values[known])
             text = f"{signal} is {reading.name}, which the topic map does not say: turned"
-            notes.append(Note("warning", topic, text, len(own.time)))
+            notes.append(Note("warning", topic, text, len(measured.time)))
         elif doubt:
             notes.append(Note("warning", topic, doubt))
 
@@ -116,8 +116,9 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> tuple[_Readin
             scores.append(alike(smooth(up[:, :2], 0.2), push[:, :2]))
         if gyro is not None and rms(gyro) > ENOUGH_TURNING:
             # The gyro's own axes may be wrong too, though two errors are less likely than one.
-            own = smooth(body_rate_of(turned))
-            in_flu, in_frd = alike(own, smooth(gyro)), alike(own, smooth(_RATES[0].read(gyro)))
+            turning = smooth(body_rate_of(turned))
+            in_flu = alike(turning, smooth(gyro))
+            in_frd = alike(turning, smooth(_RATES[0].read(gyro)))
             scores.append(max(in_flu, in_frd - UNLIKELY))
         carried = up if force is None else rotate(turned, force) / GRAVITY
         upright = float(np.nanmean(carried[:, 2]))
@@ -173,10 +174,10 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> tuple[_Readin
     fit = alike(moving, velocity)
     if fit > 0.8:
         return None, ""
-    own = series["velocity"]
-    at_samples = on_clock(series, "attitude", own.time)
+    measured = series["velocity"]
+    at_samples = on_clock(series, "attitude", measured.time)
 
-    in_body = _Reading("in body axes", lambda _: rotate(at_samples, own.values))
+    in_body = _Reading("in body axes", lambda _: rotate(at_samples, measured.values))
     ned = _Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
     fits = {
         in_body: alike(moving, rotate(on_clock(series, "attitude", clock), velocity)),

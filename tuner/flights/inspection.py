@@ -89,7 +89,7 @@ class MissionReport:
     start, duration
         s, the start since the first pose.
     begins_with
-        What told its start.
+        What marks its start.
     laps
         Completed laps, None where none are recorded.
     mean_speed, top_speed
@@ -214,13 +214,13 @@ def inspect_recordings(
     tuple
         What was found in those that can be read, and an error for each that cannot.
     """
-    found, errors = [], []
+    inspections, errors = [], []
     for path in map(Path, paths):
         try:
-            found.append(_inspect(path, topics, namespace, cache=cache))
+            inspections.append(_inspect(path, topics, namespace, cache=cache))
         except InputError as err:
             errors.append(err)
-    return tuple(found), tuple(errors)
+    return tuple(inspections), tuple(errors)
 
 
 def _inspect(
@@ -247,7 +247,7 @@ def as_json(inspections: Iterable[Inspection], errors: Iterable[InputError] = ()
     """Return inspections as JSON; numbers that are not finite become null."""
     content = {
         "schema_version": SCHEMA_VERSION,
-        "recordings": [_finite(dataclasses.asdict(one)) for one in inspections],
+        "recordings": [_finite(dataclasses.asdict(inspection)) for inspection in inspections],
         "errors": [str(error) for error in errors],
     }
     return json.dumps(content, indent=2, allow_nan=False)

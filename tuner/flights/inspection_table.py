@@ -16,27 +16,27 @@ _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 
 def render(inspections: Iterable[Inspection]) -> RenderableType:
     """Return what was found in recordings, for rich to print."""
-    return Group(*(part for one in inspections for part in _one(one)))
+    return Group(*(part for inspection in inspections for part in _tables(inspection)))
 
 
-def _one(one: Inspection) -> list[RenderableType]:
-    size = f"{one.size / 1e6:.1f} MB"
-    about = [one.format, size, f"{one.duration:.1f} s"]
-    about += [one.started.replace("+00:00", " UTC")] if one.started else []
-    about += [f"topic map {one.topic_map}"] if one.topic_map else []
-    parts: list[RenderableType] = [Text(), Text(one.path, "bold"), Text(" · ".join(about))]
-    if one.problem:
-        parts.append(Text(one.problem, "red"))
-    parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in one.damage]
-    parts.append(_topics(one))
-    if one.missions:
-        parts.append(_missions(one))
-    if one.clock or one.battery:
-        parts.append(_clock_and_battery(one))
-    parts.append(_inlets(one))
-    if one.coefficients:
-        parts.append(_coefficients(one))
-    for note in one.notes:
+def _tables(inspection: Inspection) -> list[RenderableType]:
+    size = f"{inspection.size / 1e6:.1f} MB"
+    about = [inspection.format, size, f"{inspection.duration:.1f} s"]
+    about += [inspection.started.replace("+00:00", " UTC")] if inspection.started else []
+    about += [f"topic map {inspection.topic_map}"] if inspection.topic_map else []
+    parts: list[RenderableType] = [Text(), Text(inspection.path, "bold"), Text(" · ".join(about))]
+    if inspection.problem:
+        parts.append(Text(inspection.problem, "red"))
+    parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in inspection.damage]
+    parts.append(_topics(inspection))
+    if inspection.missions:
+        parts.append(_missions(inspection))
+    if inspection.clock or inspection.battery:
+        parts.append(_clock_and_battery(inspection))
+    parts.append(_inlets(inspection))
+    if inspection.coefficients:
+        parts.append(_coefficients(inspection))
+    for note in inspection.notes:
         colour = "yellow" if note["kind"] == "warning" else "dim"
         topic = f"{note['topic']}: " if note["topic"] else ""
         parts.append(Text(f"{note['kind']}: {topic}{note['text']}", colour))
@@ -47,12 +47,12 @@ def _number(value: float | None, form: str, scale: float = 1.0) -> str:
     return "" if value is None else format(value * scale, form)
 
 
-def _topics(one: Inspection) -> Table:
+def _topics(inspection: Inspection) -> Table:
     table = Table(title="topics", title_justify="left", title_style="bold", box=None)
     for name in ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for"):
         right = name not in ("topic", "type", "used for")
         table.add_column(name, justify="right" if right else "left", no_wrap=name == "topic")
-    for topic in one.topics:
+    for topic in inspection.topics:
         table.add_row(
             topic.name or "(table)",
             topic.type,
@@ -67,13 +67,13 @@ def _topics(one: Inspection) -> Table:
     return table
 
 
-def _missions(one: Inspection) -> Table:
+def _missions(inspection: Inspection) -> Table:
     table = Table(title="missions", title_justify="left", title_style="bold", box=None)
     for name in ("start s", "s", "begins with", "laps", "mean m/s", "top m/s", "tilt °"):
         table.add_column(name, justify="left" if name == "begins with" else "right")
     for name in ("turn rad/s", "height m", "pose known", "remark"):
         table.add_column(name, justify="left" if name == "remark" else "right")
-    for mission in one.missions:
+    for mission in inspection.missions:
         table.add_row(
             f"{mission.start:.2f}",
             f"{mission.duration:.2f}",
@@ -95,36 +95,45 @@ def _remark(mission: MissionReport) -> str:
     return "" if spin is None else f"yaw spin at {spin:g} rad/s"
 
 
-def _clock_and_battery(one: Inspection) -> Text:
-    said = []
-    if "spread" in one.clock:
-        said.append(f"reference's stamps late by up to {1e3 * one.clock['spread']:.2f} ms")
-    if one.clock.get("drift"):
-        said.append(f"its clock drifts by {1e6 * one.clock['drift']:+.0f} ppm")
-    if "pose_offset" in one.clock:
-        said.append(f"pose {1e3 * one.clock['pose_offset']:+.1f} ms late against the gyro")
-    text = f"clock: {', '.join(said)}" if said else ""
-    if one.battery:
-        text += f"{'   ' if text else ''}battery: {one.battery[0]:.2f} V to {one.battery[1]:.2f} V"
+def _clock_and_battery(inspection: Inspection) -> Text:
+    remarks = []
+    if "spread" in inspection.clock:
+        remarks.append(
+            f"the reference's stamps are late by up to {1e3 * inspection.clock['spread']:.2f} ms"
+        )
+    if inspection.clock.get("drift"):
+        remarks.append(f"its clock drifts by {1e6 * inspection.clock['drift']:+.0f} ppm")
+    offset = inspection.clock.get("pose_offset")
+    if offset is not None:
+        remarks.append(f"the pose's stamps are {1e3 * offset:+.1f} ms late against the gyro's")
+    text = f"clock: {', '.join(remarks)}" if remarks else ""
+    if inspection.battery:
+        first, last = inspection.battery
+        text += f"{'   ' if text else ''}battery: {first:.2f} V to {last:.2f} V"
     return Text(text)
 
 
-def _inlets(one: Inspection) -> Table:
+def _inlets(inspection: Inspection) -> Table:
     table = Table(title="inlets", title_justify="left", title_style="bold", box=None)
     table.add_column("inlet")
-    table.add_column("can be fed in")
-    for inlet in one.inlets:
-        usable = not inlet.missing and one.problem is None
+    table.add_column("can be fed from this recording")
+    for inlet in inspection.inlets:
+        usable = not inlet.missing and inspection.problem is None
         lacks = f"lacks {', '.join(inlet.missing)}" if inlet.missing else "no mission"
         table.add_row(inlet.name, "yes" if usable else lacks, style="" if usable else "dim")
     return table
 
 
-def _coefficients(one: Inspection) -> Table:
-    table = Table(title="could inform", title_justify="left", title_style="bold", box=None)
+def _coefficients(inspection: Inspection) -> Table:
+    table = Table(
+        title="could inform",
+        title_justify="left",
+        title_style="bold",
+        box=None,
+    )
     for name in ("coefficient", "", "because"):
         table.add_column(name)
-    for finding in one.coefficients:
+    for finding in inspection.coefficients:
         how = Text(finding.how, _COLOURS[finding.how])
         table.add_row(finding.coefficient, how, finding.why)
     return table

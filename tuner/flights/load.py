@@ -48,13 +48,13 @@ def make_flight(
     if count < 2:
         raise RecordingError(path, "its mission ends where it starts", "inspect the recording")
     if count > MOST_TICKS:
-        said = f"its mission lasts {(mission.end - start) / 3600:.0f} h"
-        raise RecordingError(path, said, "give 'start' and 'end' in a side-car")
+        what = f"its mission lasts {(mission.end - start) / 3600:.0f} h"
+        raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
     around = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
-    own = {name: _until(data, mission.end - start) for name, data in around.items()}
-    own = {name: data for name, data in own.items() if len(data.time)}
+    mission_series = {name: _until(data, mission.end - start) for name, data in around.items()}
+    mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
     ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
     if grid is not None and grid.drift:
@@ -63,9 +63,9 @@ def make_flight(
     if len(content.missions) > 1:
         text = f"mission {index + 1} of {len(content.missions)} in this recording"
         notes.append(Note("info", "", text, len(content.missions)))
-    signals = {name: _on_clock(name, around[name], clock, ticks) for name in own}
+    signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
     notes.extend(_gaps(signals, rate))
-    rates = own.get("rate_setpoint")
+    rates = mission_series.get("rate_setpoint")
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
         path=str(path),
@@ -73,7 +73,7 @@ def make_flight(
         rate=rate,
         time=clock,
         signals=signals,
-        series=own,
+        series=mission_series,
         initial=initial_state(around),
         yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
         trajectory=sidecar.trajectory,
@@ -132,8 +132,8 @@ def reading_key(
 ) -> tuple[str, ...]:
     """Return what a recording's reading depends on, beside the readers themselves."""
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
-    told = (settings.namespace, settings.rate, sidecar, given, messages)
-    return (digest(path), path.name, *(repr(one) for one in told))
+    inputs = (settings.namespace, settings.rate, sidecar, given, messages)
+    return (digest(path), path.name, *(repr(value) for value in inputs))
 
 
 def load_flights(

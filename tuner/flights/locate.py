@@ -27,13 +27,13 @@ class Place:
 
 def choose_map(recording: Recording, candidates: Iterable[TopicMap]) -> TopicMap:
     """Return the map that finds a pose and most signals, then the one of higher priority."""
-    suited = [one for one in candidates if one.format == recording.format]
+    suited = [topic_map for topic_map in candidates if topic_map.format == recording.format]
 
-    def worth(one: TopicMap) -> tuple[int, int, int]:
-        found = locate(recording, one)[0]
-        return len({"position", "attitude"} & set(found)), len(found), one.priority
+    def signals_found(topic_map: TopicMap) -> tuple[int, int, int]:
+        places = locate(recording, topic_map)[0]
+        return len({"position", "attitude"} & set(places)), len(places), topic_map.priority
 
-    return max(suited, key=worth)
+    return max(suited, key=signals_found)
 
 
 def locate(
@@ -48,7 +48,7 @@ def locate(
     topics
         The map.
     strict
-        Whether a user wrote the map, who is to be told of a topic without the fields named;
+        Whether a user wrote the map, so that a topic without the fields named is an error;
         otherwise such a topic is passed over with a note.
 
     Raises
@@ -63,8 +63,8 @@ def locate(
     notes = []
     for signal, sources in topics.signals.items():
         for source in sources:
-            found = [_place(recording, signal, source, t) for t in _matching(recording, source)]
-            good = [place for place in found if isinstance(place, Place)]
+            attempts = [_place(recording, signal, source, t) for t in _matching(recording, source)]
+            good = [place for place in attempts if isinstance(place, Place)]
             if good:
                 if len(good) > 1:
                     others = ", ".join(place.topic for place in good[1:4])
@@ -72,11 +72,11 @@ def locate(
                     notes.append(Note("warning", good[0].topic, text, len(good) - 1))
                 places[signal] = good[0]
                 break
-            said = next((text for text in found if isinstance(text, str) and text), None)
-            if said and strict:
-                raise RecordingError(recording.path, said, "correct the topic map")
-            if said:
-                notes.append(Note("warning", source.topic, f"passed over: {said}"))
+            refusal = next((text for text in attempts if isinstance(text, str) and text), None)
+            if refusal and strict:
+                raise RecordingError(recording.path, refusal, "correct the topic map")
+            if refusal:
+                notes.append(Note("warning", source.topic, f"passed over: {refusal}"))
     return places, tuple(notes)
 
 
@@ -109,9 +109,9 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
 
 
-def require_pose(recording: Recording, topics: TopicMap, found: Mapping[str, Place]) -> None:
+def require_pose(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) -> None:
     """Raise a `RecordingError` with the nearest topic names if a pose is missing."""
-    missing = [signal for signal in ("position", "attitude") if signal not in found]
+    missing = [signal for signal in ("position", "attitude") if signal not in places]
     if not missing:
         return
     what = " and ".join(missing)

@@ -36,7 +36,7 @@ class Mission:
     start, end
         Seconds in the time of the series.
     begins_with
-        What its start was told by, for the report.
+        What marks its start, for the report.
     """
 
     start: float
@@ -63,16 +63,16 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
             for start, end in spans:
                 for up, down in flying:
                     if start < up:  # they began on the ground
-                        begin, told_by = _motion_or_flight(series, up, min(end, down))
+                        begin, begins_with = _motion_or_flight(series, up, min(end, down))
                     else:
-                        begin, told_by = start, "attitude set-points"
-                    missions.append(Mission(begin, min(end, down, last), told_by))
+                        begin, begins_with = start, "attitude set-points"
+                    missions.append(Mission(begin, min(end, down, last), begins_with))
             return _long_enough(missions)
         flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
     for up, down in flying:
-        begin, told_by = _motion_or_flight(series, up, down)
+        begin, begins_with = _motion_or_flight(series, up, down)
         end = min(down, last, _reference_end(series, last))
-        missions.append(Mission(begin, end, told_by))
+        missions.append(Mission(begin, end, begins_with))
     return _long_enough(missions)
 
 
@@ -103,17 +103,17 @@ def _first_motion(series: Mapping[str, Series], start: float, end: float) -> flo
     for name in ("reference_position", "reference_velocity"):
         if name not in series:
             continue
-        own = series[name]
-        inside = np.flatnonzero((own.time >= start) & (own.time <= end))
+        samples = series[name]
+        inside = np.flatnonzero((samples.time >= start) & (samples.time <= end))
         if len(inside) == 0:
             continue
-        values = own.values[inside]
+        values = samples.values[inside]
         known = np.isfinite(values).all(axis=1)
         if not known.any():
             continue
         moving = np.abs(values - values[known][0]).max(axis=1) > AT_REST
         if (moving & known).any():
-            firsts.append(float(own.time[inside[np.argmax(moving & known)]]))
+            firsts.append(float(samples.time[inside[np.argmax(moving & known)]]))
     return min(firsts, default=start)
 
 
@@ -125,8 +125,8 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     """
     position = series["position"]
     time, height = position.time, position.values[:, 2]
-    idle, told = _idle(series, time)
-    grounded = idle | (_resting(time, height) & ~told)
+    idle, observed = _idle(series, time)
+    grounded = idle | (_resting(time, height) & ~observed)
     if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
     ground = _ground(time, height, grounded)
@@ -134,18 +134,18 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
 
 
 def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell at which times the motors idle, and at which times anything tells."""
+    """Tell at which times the motors idle, and at which times that was recorded."""
     for name, limit in (
         ("command", IDLE), ("rotor_speed", IDLE_SPEED), ("thrust_setpoint", IDLE),
     ):  # fmt: skip
         if name in series and len(series[name].time) > 1:
-            own = series[name]
-            known = np.isfinite(own.values).any(axis=1)
+            samples = series[name]
+            known = np.isfinite(samples.values).any(axis=1)
             if not known.any():
                 continue
-            at = np.interp(time, own.time[known], np.nanmean(own.values[known], axis=1))
-            told = (time >= own.time[0] - MOMENT) & (time <= own.time[-1] + MOMENT)
-            return told & np.asarray(at < limit, dtype=np.bool_), told
+            at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
+            observed = (time >= samples.time[0] - MOMENT) & (time <= samples.time[-1] + MOMENT)
+            return observed & np.asarray(at < limit, dtype=np.bool_), observed
     nothing = np.zeros(len(time), dtype=np.bool_)
     return nothing, nothing
 

@@ -29,7 +29,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class Clock:
-    """A field that tells the time of a message, or of a table's row.
+    """A field that holds the time of a message, or of a table's row.
 
     Attributes
     ----------

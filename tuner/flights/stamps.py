@@ -121,9 +121,9 @@ def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanos
         parts = list(pairwise(bounds))
         level = [int(np.median(fixed[a:b] - receive[a:b])) for a, b in parts]
         longest = max(range(len(parts)), key=lambda k: parts[k][1] - parts[k][0])
-        for (a, b), own in zip(parts, level, strict=True):
-            fixed[a:b] -= own - level[longest]
-        largest = max(abs(own - level[longest]) for own in level) / SECOND
+        for (a, b), offset in zip(parts, level, strict=True):
+            fixed[a:b] -= offset - level[longest]
+        largest = max(abs(offset - level[longest]) for offset in level) / SECOND
         text = f"its clock jumped {len(steps)} times, by up to {largest:.3f} s: joined again"
         notes.append(Note("warning", topic, text, len(steps)))
     return fixed, notes

@@ -78,8 +78,8 @@ def align_pose(
     if abs(offset) < WORTH_MOVING:
         text = f"stamps are {1e3 * offset:+.1f} ms late against the gyro, by correlation"
         return aligned, (Note("info", topic, text),)
-    for signal, own in series.items():
+    for signal, samples in series.items():
         if topics.get(signal) == topic:
-            aligned[signal] = Series(own.time - offset, own.values)
+            aligned[signal] = Series(samples.time - offset, samples.values)
     text = f"its clock is {1e3 * offset:+.1f} ms late against the gyro, by correlation: moved"
     return aligned, (Note("warning", topic, text, len(series["attitude"].time)),)

@@ -95,7 +95,7 @@ class Table(TabularRecording):
                     raise RecordingError(self.path, "claims an absurd size", "check it")
                 return list(file.schema_arrow.names)
         except (ArrowException, OSError, ValueError) as err:
-            raise RecordingError(self.path, _said(err), "write it again") from None
+            raise RecordingError(self.path, _why(err), "write it again") from None
 
     def _read(self, names: list[str]) -> pyarrow.Table:
         try:
@@ -107,7 +107,7 @@ class Table(TabularRecording):
         except MemoryError:
             raise RecordingError(self.path, "claims an absurd size", "check it") from None
         except Exception as err:  # whatever a hostile table makes of the library
-            raise RecordingError(self.path, _said(err), "write it again") from None
+            raise RecordingError(self.path, _why(err), "write it again") from None
 
     def _read_csv(self, names: list[str]) -> pyarrow.Table:
         import pyarrow  # noqa: PLC0415
@@ -143,7 +143,7 @@ class Table(TabularRecording):
 _NEVER = np.iinfo(np.int64).min
 
 
-def _said(err: Exception) -> str:
+def _why(err: Exception) -> str:
     return f"is no readable table ({' '.join(str(err).split())[:120]})"
 
 

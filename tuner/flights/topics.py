@@ -184,22 +184,24 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
         The file is missing, no YAML, or says something that no map can say.
     """
     path = find_config("topics", str(reference), base or Path())
-    found = read_model(TopicMap, path)
-    if found.messages:
-        found = found.replace(messages=tuple(path.parent / file for file in found.messages))
-    if found.extends is None:
-        return found
+    topic_map = read_model(TopicMap, path)
+    if topic_map.messages:
+        topic_map = topic_map.replace(
+            messages=tuple(path.parent / file for file in topic_map.messages)
+        )
+    if topic_map.extends is None:
+        return topic_map
     if depth >= DEEPEST:
-        raise ConfigError(path, f"extends '{found.extends}' in a circle", "break it")
-    under = load_topic_map(found.extends, base=path.parent, depth=depth + 1)
-    if under.format != found.format:
+        raise ConfigError(path, f"extends '{topic_map.extends}' in a circle", "break it")
+    under = load_topic_map(topic_map.extends, base=path.parent, depth=depth + 1)
+    if under.format != topic_map.format:
         raise ConfigError(
             path, f"extends '{under.name}' of another format", "extend one of its own"
         )
-    return found.replace(
-        signals={**under.signals, **found.signals},
-        time=found.time or under.time,
-        messages=(*found.messages, *under.messages),
+    return topic_map.replace(
+        signals={**under.signals, **topic_map.signals},
+        time=topic_map.time or under.time,
+        messages=(*topic_map.messages, *under.messages),
     )
 
 

@@ -1,4 +1,9 @@
-"""PX4 ULog files: the wanted messages, in PX4's own frames until the topic map turns them."""
+"""PX4 ULog files: the wanted messages, in PX4's own frames until the topic map turns them.
+
+pyulog reads the messages. What comes before is a check and a count without it: pyulog multiplies
+out a log's formats, and 77 bytes whose formats nest kept it busy for over 25 s, where this refuses
+them in 0.14 s; it also tells nothing of the bytes behind the last whole message of a cut log.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +72,7 @@ class ULogRecording:
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted fields of some messages."""
         names = sorted({topic.partition("[")[0] for topic in wanted})
-        log, said = _parse(self.path, names)
+        log, complaint = _parse(self.path, names)
         samples = {}
         for data in log.data_list:
             topic = data.name if data.multi_id == 0 else f"{data.name}[{data.multi_id}]"
@@ -86,7 +91,7 @@ class ULogRecording:
                     end=end,
                 )
             )
-        if log.file_corruption or said:
+        if log.file_corruption or complaint:
             damage.append(Damage(Cause.LOG_DAMAGED))
         if self._behind:
             last = log.last_timestamp * 1e-6
@@ -101,8 +106,8 @@ class ULogRecording:
         stamp = receive
         for clock in clocks:
             if clock.field in data:
-                own = data[clock.field].astype(np.int64) * NANOSECONDS[clock.unit]
-                stamp = np.where(own > 0, own, receive)
+                sampled = data[clock.field].astype(np.int64) * NANOSECONDS[clock.unit]
+                stamp = np.where(sampled > 0, sampled, receive)
                 break
         missing = [name for name in request.fields if name not in data]
         if missing:
@@ -141,8 +146,8 @@ def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
     for kind, buffer, at, end in _records(path, 16):
         if kind == ord("F"):
             name, _, fields = buffer[at:end].decode(errors="replace").partition(":")
-            found = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
-            formats[name] = [(what, int(count or 1), field) for what, count, field in found]
+            parts = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
+            formats[name] = [(what, int(count or 1), field) for what, count, field in parts]
         elif kind in (ord("A"), ord("L"), ord("C"), ord("D")):
             break
         start += 3 + end - at
@@ -205,5 +210,7 @@ def _parse(path: Path, names: list[str]) -> tuple[Any, str]:
         with contextlib.redirect_stdout(printed):
             return ULog(str(path), names), printed.getvalue()
     except Exception as err:  # pyulog's own and whatever a hostile log makes of it
-        said = " ".join(str(err).split())[:120]
-        raise RecordingError(path, f"is no readable PX4 log ({said})", "record it again") from None
+        complaint = " ".join(str(err).split())[:120]
+        raise RecordingError(
+            path, f"is no readable PX4 log ({complaint})", "record it again"
+        ) from None

@@ -82,13 +82,13 @@ def fly(
     InputError
         Something named does not exist, or cannot be flown.
     """
-    said = {
+    options = {
         "trajectory": dict(trajectory),
         "duration": duration,
         "rate": rate,
         "precision": precision,
     }
-    plan = build(Plan, said, "command line")
+    plan = build(Plan, options, "command line")
     shape = plan.trajectory if speed is None else at_speed(plan.trajectory, speed)
     check_names(grid or (), "grid")
     if isinstance(vehicle, str):

@@ -77,14 +77,14 @@ def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
         raise RecordingError(path, f"the definition of {kind} is absurdly long", "leave it out")
     parse = get_types_from_idl if text.format is MessageDefinitionFormat.IDL else None
     try:
-        found = parse(text.data) if parse else get_types_from_msg(text.data, kind)
-        return {name: fields for name, (_, fields) in found.items()}
+        types = parse(text.data) if parse else get_types_from_msg(text.data, kind)
+        return {name: fields for name, (_, fields) in types.items()}
     except InputError:
         raise
     except Exception as err:  # the parser meets hostile text and has no common error class
-        said = " ".join(str(err).split())[:120]
+        reason = " ".join(str(err).split())[:120]
         raise RecordingError(
-            path, f"the definition of {kind} makes no sense ({said})", "record it again"
+            path, f"the definition of {kind} makes no sense ({reason})", "record it again"
         ) from None
 
 

@@ -64,8 +64,8 @@ class Folder:
                 size = path.stat().st_size if path.is_file() else None
                 self._left_out.append(Damage(Cause.FILE_UNREADABLE, path.name, bytes_lost=size))
         if not self._files:
-            said = errors[0] if errors else "holds no .db3 or .mcap file"
-            raise RecordingError(self.path, said, "give the folder with metadata.yaml")
+            reason = errors[0] if errors else "holds no .db3 or .mcap file"
+            raise RecordingError(self.path, reason, "give the folder with metadata.yaml")
         for i, container in enumerate(self._files):
             for connection in container.connections.values():
                 number = len(self._numbers)
