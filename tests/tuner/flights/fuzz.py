@@ -66,8 +66,8 @@ def _packed(compression: str) -> Callable[[Path], Path]:
 
 def _ros2(storage: StoragePlugin, mode: CompressionMode) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        made = making.to_ros2(_short_bag(folder), folder / "base", storage, mode)
-        return next(path for path in made.iterdir() if path.suffix != ".yaml")
+        folder_written = making.to_ros2(_short_bag(folder), folder / "base", storage, mode)
+        return next(path for path in folder_written.iterdir() if path.suffix != ".yaml")
 
     return make
 
@@ -169,8 +169,8 @@ def _remove(raw: bytearray, random: Random) -> None:
 
 def _nest(raw: bytearray, random: Random) -> None:
     at = _place(random, len(raw))
-    opening = (b"[", b"{", b"(", b'"', b"[float64", b"\n")[int(random.integers(6))]
-    raw[at:at] = opening * int(2 ** random.uniform(0, 12))
+    bracket = (b"[", b"{", b"(", b'"', b"[float64", b"\n")[int(random.integers(6))]
+    raw[at:at] = bracket * int(2 ** random.uniform(0, 12))
 
 
 HARMS = (_flip, _flip, _cut, _absurd, _absurd, _repeat, _blank, _noise, _remove, _nest)
@@ -192,8 +192,8 @@ def attempt(path: Path) -> str:
         except InputError as err:
             outcome = "refused" if "\n" not in str(err) and len(str(err)) < 2000 else "babbled"
         assert outcome != "babbled"
-        found, errors = inspect_recordings([path], cache=False)
-        assert len(found) + len(errors) == 1
+        inspections, errors = inspect_recordings([path], cache=False)
+        assert len(inspections) + len(errors) == 1
         return outcome
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
@@ -219,8 +219,8 @@ def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
                 outcomes[attempt(path)] += 1
             except BaseException as err:  # a failure of any kind is what is looked for
                 outcomes["failed"] += 1
-                said = traceback.format_exception(err)[-3:]
-                failures.append({"case": case, "harm": harm.__name__, "error": "".join(said)})
+                lines = traceback.format_exception(err)[-3:]
+                failures.append({"case": case, "harm": harm.__name__, "error": "".join(lines)})
                 if isinstance(err, KeyboardInterrupt):
                     break
             slowest = max(slowest, time.perf_counter() - started)

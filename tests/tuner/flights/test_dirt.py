@@ -34,7 +34,7 @@ def dirty(short: Path, tmp_path: Path) -> Callable[[Change], Flight]:
     return lambda change: load_flight(making.rewrite(short, tmp_path / "dirty.bag", change))
 
 
-def told(flight: Flight, text: str, topic: str = "") -> int:
+def noted_count(flight: Flight, text: str, topic: str = "") -> int:
     """Return the count of the one note with a text."""
     (note,) = [n for n in flight.notes if text in n.text and topic in n.topic]
     return note.count
@@ -69,8 +69,8 @@ def test_dropped_duplicated_and_late_messages(clean: Flight, dirty: Any) -> None
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert told(got, "position samples with a stamp seen before dropped") > 30
-    assert told(got, "position samples out of order") > 30
+    assert noted_count(got, "position samples with a stamp seen before dropped") > 30
+    assert noted_count(got, "position samples out of order") > 30
 
 
 def test_nan_and_quaternion_dirt(clean: Flight, dirty: Any) -> None:
@@ -91,8 +91,8 @@ def test_nan_and_quaternion_dirt(clean: Flight, dirty: Any) -> None:
     got = dirty(change)
     near(got, clean, position=5e-3)
     near(got, clean, signal="attitude")
-    assert told(got, "position samples without a number dropped") > 10
-    assert told(got, "no unit quaternion") > 100
+    assert noted_count(got, "position samples without a number dropped") > 10
+    assert noted_count(got, "no unit quaternion") > 100
 
 
 def test_single_wrong_stamps_and_a_clock_that_was_set(clean: Flight, dirty: Any) -> None:
@@ -109,7 +109,7 @@ def test_single_wrong_stamps_and_a_clock_that_was_set(clean: Flight, dirty: Any)
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert told(got, "stamps far from their neighbours", POSE) > 5
+    assert noted_count(got, "stamps far from their neighbours", POSE) > 5
     assert "3600.0" in next(n.text for n in got.notes if "its clock jumped" in n.text)
 
 
@@ -121,7 +121,7 @@ def test_a_topic_on_another_clock_is_moved(clean: Flight, dirty: Any) -> None:
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert told(got, "stamped by another clock", POSE) > 1000
+    assert noted_count(got, "stamped by another clock", POSE) > 1000
 
 
 def test_motion_capture_behind_the_gyro_is_found_by_correlation(clean: Flight, dirty: Any) -> None:
@@ -160,8 +160,8 @@ def test_wrong_frame_and_order_are_turned(clean: Flight, dirty: Any) -> None:
     got = dirty(change)
     near(got, clean, position=1e-9, signal="attitude")
     near(got, clean, position=1e-9, signal="body_rate")
-    assert told(got, "attitude is scalar-last") > 1000
-    assert told(got, "body_rate is in FRD axes") > 1000
+    assert noted_count(got, "attitude is scalar-last") > 1000
+    assert noted_count(got, "body_rate is in FRD axes") > 1000
 
 
 def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:
@@ -287,9 +287,9 @@ def test_namespace_is_suggested_and_works(short: Path, tmp_path: Path, clean: Fl
     path = making.rewrite(short, tmp_path / "uav.bag", rename=lambda topic: f"/uav1{topic}")
     with pytest.raises(RecordingError) as caught:
         load_flight(path, topics="mavros")
-    said = str(caught.value)
-    assert "no topic /mavros/local_position/pose; found /uav1/mavros/local_position/pose" in said
-    assert said.endswith("use --namespace uav1")
+    message = str(caught.value)
+    assert "no topic /mavros/local_position/pose; found /uav1/mavros/local_position/pose" in message
+    assert message.endswith("use --namespace uav1")
     near(load_flight(path, namespace="uav1"), clean, position=1e-12)
 
 

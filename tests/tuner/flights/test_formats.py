@@ -140,7 +140,7 @@ def test_decoding_agrees_with_rosbags_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "is empty"),
         (b"\x1f\x8b\x08" + b"x" * 50, "is packed"),
@@ -149,9 +149,9 @@ def test_decoding_agrees_with_rosbags_bit_for_bit() -> None:
         (b"a,b\n1,2\n", "no position and attitude"),
     ],
 )
-def test_what_is_no_recording_is_told_so(tmp_path: Path, content: bytes, said: str) -> None:
+def test_what_is_no_recording_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "thing.dat"
     path.write_bytes(content)
-    with pytest.raises(RecordingError, match=said) as caught:
+    with pytest.raises(RecordingError, match=message) as caught:
         load_flight(path)
     assert "\n" not in str(caught.value)

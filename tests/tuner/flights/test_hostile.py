@@ -45,8 +45,8 @@ def refused(path: Path) -> str:
     with bounded(), pytest.raises(InputError) as caught:
         load_flight(path, cache=False)
     assert "\n" not in str(caught.value)
-    found, errors = inspect_recordings([path], cache=False)
-    assert len(found) + len(errors) == 1
+    inspections, errors = inspect_recordings([path], cache=False)
+    assert len(inspections) + len(errors) == 1
     return str(caught.value)
 
 
@@ -156,8 +156,8 @@ def test_metadata_that_multiplies(tmp_path: Path) -> None:
     lines += ["rosbag2_bagfile_information: {relative_file_paths: *a8}"]
     (folder / "metadata.yaml").write_text("\n".join(lines))
     with bounded():
-        found, errors = inspect_recordings([folder], cache=False)
-    assert len(found) + len(errors) == 1
+        inspections, errors = inspect_recordings([folder], cache=False)
+    assert len(inspections) + len(errors) == 1
 
 
 def test_message_longer_than_its_chunk_or_shorter_than_its_type(tmp_path: Path) -> None:

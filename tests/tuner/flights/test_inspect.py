@@ -19,16 +19,16 @@ from tuner.flights.inspection import as_json
 from tuner.flights.inspection_table import render
 
 
-def one(path: Path, **settings: str) -> Inspection:
-    (found,), errors = inspect_recordings([path], **settings)
+def inspect_one_recording(path: Path, **settings: str) -> Inspection:
+    (inspection,), errors = inspect_recordings([path], **settings)
     assert errors == ()
-    return found
+    return inspection
 
 
 @pytest.fixture(scope="module")
 def circle() -> Inspection:
-    (found,), _ = inspect_recordings([making.CIRCLE], cache=False)
-    return found
+    (inspection,), _ = inspect_recordings([making.CIRCLE], cache=False)
+    return inspection
 
 
 def test_topics_and_signals(circle: Inspection) -> None:
@@ -72,14 +72,14 @@ def test_inlets_and_coefficients(circle: Inspection) -> None:
     assert informed["mass"] == "no"
     assert informed["inertia_xx"] == "yes"
     assert informed["inertia_zz"] != "yes"
-    spin = one(making.FLIGHTS / "yaw_spin_3rps.bag")
+    spin = inspect_one_recording(making.FLIGHTS / "yaw_spin_3rps.bag")
     turned = {finding.coefficient: finding.how for finding in spin.coefficients}
     assert turned["inertia_zz"] == "yes"
     assert turned["rotor_drag_coefficient"] == "no"
     assert spin.missions[0].yaw_rate_setpoint == 3.0
 
 
-def test_json_and_table_tell_the_same(circle: Inspection) -> None:
+def test_json_and_table_agree(circle: Inspection) -> None:
     content = json.loads(as_json([circle]))
     assert content["schema_version"] == 2
     (recording,) = content["recordings"]
@@ -87,25 +87,29 @@ def test_json_and_table_tell_the_same(circle: Inspection) -> None:
     stream = io.StringIO()
     Console(file=stream, width=160).print(render([circle]))
     text = stream.getvalue()
-    for said in ("/optitrack/pose", "lacks rotor_speed of rotors 1, 2, 3", "2.84", "weigh it"):
-        assert said in text
+    for words in ("/optitrack/pose", "lacks rotor_speed of rotors 1, 2, 3", "2.84", "weigh it"):
+        assert words in text
 
 
-def test_without_a_pose_topics_are_still_told(short: Path, tmp_path: Path) -> None:
+def test_without_a_pose_topics_are_still_listed(short: Path, tmp_path: Path) -> None:
     path = making.rewrite(short, tmp_path / "uav.bag", rename=lambda name: f"/uav1{name}")
-    found = one(path)
-    assert found.problem is not None
-    assert found.problem.endswith("use --namespace uav1")
-    assert len(found.topics) == 11
-    assert all(inlet.missing for inlet in found.inlets)
-    assert one(path, namespace="uav1").problem is None
-    Console(file=io.StringIO()).print(render([found]))
+    inspection = inspect_one_recording(path)
+    assert inspection.problem is not None
+    assert inspection.problem.endswith("use --namespace uav1")
+    assert len(inspection.topics) == 11
+    assert all(inlet.missing for inlet in inspection.inlets)
+    assert inspect_one_recording(path, namespace="uav1").problem is None
+    Console(file=io.StringIO()).print(render([inspection]))
 
 
 def test_one_broken_file_does_not_hide_the_others(tmp_path: Path) -> None:
     (tmp_path / "bad.bag").write_bytes(b"nothing")
-    found, errors = inspect_recordings([tmp_path / "bad.bag", making.CIRCLE, tmp_path / "none"])
-    assert [Path(one.path).name for one in found] == ["circle_3mps.bag"]
+    inspection, errors = inspect_recordings(
+        [tmp_path / "bad.bag", making.CIRCLE, tmp_path / "none"]
+    )
+    assert [Path(inspect_one_recording.path).name for inspect_one_recording in inspection] == [
+        "circle_3mps.bag"
+    ]
     assert [str(error).split(": ")[1].split(";")[0] for error in errors] == [
         "is of no known format",
         "no such file",
@@ -120,11 +124,11 @@ def test_second_time_needs_neither_numpy_nor_jax() -> None:
         "('numpy', 'jax', 'pandas', 'pydantic', 'sim_jax') if m in sys.modules])"
     )
     command = [sys.executable, "-c", code, str(making.CIRCLE)]
-    said = [
+    words = [
         subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ).stdout
         for _ in range(2)
     ]
-    assert said[0].startswith("7 ")
-    assert "jax" not in said[0]
-    assert "pandas" not in said[0]
-    assert said[1] == "7 []\n"
+    assert words[0].startswith("7 ")
+    assert "jax" not in words[0]
+    assert "pandas" not in words[0]
+    assert words[1] == "7 []\n"

@@ -22,7 +22,7 @@ def own_map(folder: Path, lines: str) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("lines", "said"),
+    ("lines", "message"),
     [
         ("  position: /optitrack/pos\n", "similar are /optitrack/pose"),
         (
@@ -33,14 +33,16 @@ def own_map(folder: Path, lines: str) -> Path:
         ("  velocity: /mavros/local_position/velocity_local\n", "names no topic for position"),
     ],
 )
-def test_what_a_map_has_wrong_is_told(short: Path, tmp_path: Path, lines: str, said: str) -> None:
+def test_what_a_map_has_wrong_is_named(
+    short: Path, tmp_path: Path, lines: str, message: str
+) -> None:
     with pytest.raises(RecordingError) as caught:
         load_flight(short, topics=own_map(tmp_path, lines))
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_table_is_told_its_nearest_column(tmp_path: Path) -> None:
+def test_the_nearest_column_of_a_table_is_named(tmp_path: Path) -> None:
     path = tmp_path / "f.csv"
     rows = [f"{t / 100},0,0,1,1,0,0,0" for t in range(300)]
     path.write_text("\n".join(["time,px,py,pz,qw,qx,qy,qz", *rows]))

@@ -25,7 +25,7 @@ def flight(*, climb: float = 5.0, land: float = 35.0) -> dict[str, Series]:
     }
 
 
-def test_height_alone_tells_flight_from_ground() -> None:
+def test_height_alone_distinguishes_flight_from_ground() -> None:
     (mission,) = find_missions(flight())
     assert mission.start == pytest.approx(5.12, abs=0.05)
     assert mission.end == pytest.approx(35.88, abs=0.05)
@@ -35,37 +35,37 @@ def test_height_alone_tells_flight_from_ground() -> None:
 def test_motors_that_report_only_when_armed() -> None:
     armed = (TIME > 4) & (TIME < 37)
     command = np.where((TIME > 5) & (TIME < 36), 0.5, 0.05)
-    own = flight() | {"command": series(np.tile(command[armed, None], 4), TIME[armed])}
-    (mission,) = find_missions(own)
+    signals = flight() | {"command": series(np.tile(command[armed, None], 4), TIME[armed])}
+    (mission,) = find_missions(signals)
     assert mission.start == pytest.approx(5.12, abs=0.05)
     assert mission.end == pytest.approx(35.88, abs=0.05)
 
 
 def test_a_hover_is_no_ground() -> None:
-    own = flight(climb=-10, land=100)
-    assert airborne(own) == [(TIME[0], TIME[-1])]
+    signals = flight(climb=-10, land=100)
+    assert airborne(signals) == [(TIME[0], TIME[-1])]
     up_and_away = np.column_stack([0 * TIME, 0 * TIME, 1 + np.clip(TIME - 20, 0, 2)])
-    own["position"] = series(up_and_away)
-    own["command"] = series(np.full((len(TIME), 4), 0.5))
-    assert airborne(own) == [(TIME[0], TIME[-1])]
+    signals["position"] = series(up_and_away)
+    signals["command"] = series(np.full((len(TIME), 4), 0.5))
+    assert airborne(signals) == [(TIME[0], TIME[-1])]
 
 
 def test_set_points_that_begin_on_the_ground_wait_for_the_reference() -> None:
     after = TIME[TIME > 3]
     reference = np.column_stack([0 * TIME, np.clip(TIME - 12, 0, None), np.ones_like(TIME)])
-    own = flight() | {
+    signals = flight() | {
         "rate_setpoint": series(np.zeros((len(after), 3)), after),
         "reference_position": series(reference),
     }
-    (mission,) = find_missions(own)
+    (mission,) = find_missions(signals)
     assert mission.start == pytest.approx(12.0, abs=0.02)
     assert mission.begins_with == "the reference's motion"
 
 
 def test_set_points_that_begin_in_the_air_start_the_mission() -> None:
     during = TIME[(TIME > 10) & (TIME < 30)]
-    own = flight() | {"rate_setpoint": series(np.zeros((len(during), 3)), during)}
-    (mission,) = find_missions(own)
+    signals = flight() | {"rate_setpoint": series(np.zeros((len(during), 3)), during)}
+    (mission,) = find_missions(signals)
     assert (mission.start, mission.end) == pytest.approx((10.01, 29.99), abs=0.011)
     assert mission.begins_with == "attitude set-points"
 
@@ -73,17 +73,17 @@ def test_set_points_that_begin_in_the_air_start_the_mission() -> None:
 def test_two_flights_with_a_landing_between() -> None:
     height = np.clip(TIME - 2, 0, 1) - np.clip(TIME - 15, 0, 1)
     height += np.clip(TIME - 20, 0, 1) - np.clip(TIME - 36, 0, 1)
-    own = flight() | {"position": series(np.column_stack([0 * TIME, 0 * TIME, height]))}
+    signals = flight() | {"position": series(np.column_stack([0 * TIME, 0 * TIME, height]))}
     command = np.where(height > 0, 0.5, 0.0)
-    own["command"] = series(np.tile(command[:, None], 4))
-    first, second = find_missions(own)
+    signals["command"] = series(np.tile(command[:, None], 4))
+    first, second = find_missions(signals)
     assert (first.start, first.end) == pytest.approx((2.12, 15.88), abs=0.05)
     assert (second.start, second.end) == pytest.approx((20.12, 36.88), abs=0.05)
 
 
 def test_what_never_flies_has_no_mission() -> None:
-    own = flight(climb=100, land=200) | {"command": series(np.zeros((len(TIME), 4)))}
-    assert find_missions(own) == ()
+    signals = flight(climb=100, land=200) | {"command": series(np.zeros((len(TIME), 4)))}
+    assert find_missions(signals) == ()
 
 
 @pytest.mark.parametrize(

@@ -72,9 +72,9 @@ def test_the_shipped_vehicle_nearly_hovers(flight: Flight) -> None:
 
 
 def test_inspection_names_the_inlet(flight: Flight) -> None:
-    (found,), errors = inspect_recordings([flight.path], cache=False)
+    (inspection,), errors = inspect_recordings([flight.path], cache=False)
     assert errors == ()
-    assert found.topic_map == "crazyflie"
-    assert {inlet.name for inlet in found.inlets if not inlet.missing} >= {"actuator"}
-    assert found.battery is not None
-    assert 3.0 < min(found.battery) < max(found.battery) < 4.3
+    assert inspection.topic_map == "crazyflie"
+    assert {inlet.name for inlet in inspection.inlets if not inlet.missing} >= {"actuator"}
+    assert inspection.battery is not None
+    assert 3.0 < min(inspection.battery) < max(inspection.battery) < 4.3

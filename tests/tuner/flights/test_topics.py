@@ -31,7 +31,7 @@ def test_a_map_in_ten_lines_extends_a_shipped_one(tmp_path: Path) -> None:
     assert lab.signals["command"] == mavros.signals["command"]
 
 
-def test_maps_that_extend_each_other_are_told(tmp_path: Path) -> None:
+def test_maps_that_extend_each_other_are_refused(tmp_path: Path) -> None:
     for one, other in (("a", "b"), ("b", "a")):
         text = f"name: {one}\nformat: ros\nextends: {other}.yaml\nsignals: {{}}\n"
         (tmp_path / f"{one}.yaml").write_text(text)
@@ -40,7 +40,7 @@ def test_maps_that_extend_each_other_are_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("name: x\nformat: ros\nsignals: {positon: /a}", "did you mean 'position'"),
         ("name: x\nformat: ros\nsignals: {position: {topik: /a}}", "topik"),
@@ -51,12 +51,14 @@ def test_maps_that_extend_each_other_are_told(tmp_path: Path) -> None:
         ("name: x\nformat: rosbag\nsignals: {}", "format"),
     ],
 )
-def test_wrong_map_is_one_line_that_names_the_fault(tmp_path: Path, text: str, said: str) -> None:
+def test_wrong_map_is_one_line_that_names_the_fault(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "lab.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:
         load_topic_map(path)
-    assert said in str(caught.value)
+    assert message in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
