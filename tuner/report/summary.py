@@ -3,57 +3,64 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
 from tuner.report.contents import Contents
 from tuner.result import RunResult
+from tuner.uncertainty.verdict import Verdict
 from tuner.wording.phrases import listed
 from tuner.wording.proposals import proposals_in_words
 from tuner.wording.verdicts import verdict_in_words
 
 
 def summary(contents: Contents) -> list[str]:
-    """Return what was found, a sentence each."""
-    said = []
+    """Return the outcome in sentences."""
+    sentences = []
     if contents.run is not None:
-        said.append(of_run(contents.run.result))
-    if contents.knowledge is not None:
-        known = [one for one in contents.knowledge.coefficients.values() if one.fitted]
-        counts = Counter(verdict_in_words(one.verdict) for one in known)
-        parts = [f"{count} {'is' if count == 1 else 'are'} {v}" for v, count in counts.items()]
-        if len(parts) == 1 and len(known) > 1:
-            parts = [f"all {len(known)} are {next(iter(counts))}"]
-        verdicts = listed(parts)
-        if contents.run is None:
-            flights = len(contents.knowledge.flights)
-            said.append(
-                f"{len(known)} coefficients were examined on {flights} "
-                f"flight{'s' if flights != 1 else ''}, nothing fitted: {verdicts}."
-            )
-        elif verdicts:
-            said.append(f"Of the coefficients, {verdicts}.")
+        results = contents.run.result.coefficients
+        verdicts = [result.verdict for result in results.values() if result.fitted]
+        sentences.append(of_run(contents.run.result))
+        if verdicts:
+            sentences.append(f"Of the coefficients, {_counted(verdicts)}.")
+    elif contents.knowledge is not None:
+        known = contents.knowledge.coefficients.values()
+        verdicts = [coefficient.verdict for coefficient in known if coefficient.fitted]
+        flights = len(contents.knowledge.flights)
+        sentences.append(
+            f"{len(verdicts)} coefficient{'s were' if len(verdicts) != 1 else ' was'} examined on "
+            f"{flights} flight{'s' if flights != 1 else ''}, nothing fitted: {_counted(verdicts)}."
+        )
     if contents.proposals is not None:
-        said += proposals_in_words(contents.proposals)[:2]
-    return said
+        sentences += proposals_in_words(contents.proposals)[:2]
+    return sentences
+
+
+def _counted(verdicts: Sequence[Verdict]) -> str:
+    """Return how many coefficients have each verdict, as a clause."""
+    counts = Counter(verdict_in_words(verdict) for verdict in verdicts)
+    if len(counts) == 1 and len(verdicts) > 1:
+        return f"all {len(verdicts)} are {next(iter(counts))}"
+    return listed([f"{n} {'is' if n == 1 else 'are'} {words}" for words, n in counts.items()])
 
 
 def of_run(result: RunResult) -> str:
     """Return a fit in one sentence."""
     fitted = [flight for flight in result.flights if flight.split == "fit"]
-    held = [flight for flight in result.flights if flight.split == "holdout"]
-    known = [one for one in result.coefficients.values() if one.fitted]
-    unknown = sum(one.identifiable is False for one in known)
+    held_out = [flight for flight in result.flights if flight.split == "holdout"]
+    free = [coefficient for coefficient in result.coefficients.values() if coefficient.fitted]
+    unknown = sum(coefficient.identifiable is False for coefficient in free)
     text = (
-        f"{len(known)} coefficients were fitted to {len(fitted)} "
+        f"{len(free)} coefficients were fitted to {len(fitted)} "
         f"flight{'s' if len(fitted) != 1 else ''}"
     )
     text += f", of which the flights do not identify {unknown}" if unknown else ""
-    pairs = [(_length(f.rmse_initial), _length(f.rmse_best)) for f in held or fitted]
+    pairs = [(_length(f.rmse_initial), _length(f.rmse_best)) for f in held_out or fitted]
     numbers = [(before, after) for before, after in pairs if before is not None and after]
     if numbers:
         before, after = (float(value) for value in np.sqrt(np.mean(np.square(numbers), axis=0)))
-        where = "held-out" if held else "fitted"
+        where = "held-out" if held_out else "fitted"
         text += f"; on the {where} flights the position RMSE went from {_metres(before)} to "
         text += _metres(after)
     return text + "."

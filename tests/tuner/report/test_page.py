@@ -42,8 +42,8 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
         "Simulated against recorded",
         "What each coefficient does",
         "Where the knowledge comes from",
-        "What is left over",
-        "How it was found",
+        "Residuals",
+        "How the search went",
         "How it was made",
     ):
         assert heading in text

@@ -41,5 +41,5 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
 
 def sections_of(contents: Contents) -> tuple[Section, ...]:
     """Return the sections that apply."""
-    found = (section(contents) for section in SECTIONS)
-    return tuple(one for one in found if one is not None)
+    sections = (section(contents) for section in SECTIONS)
+    return tuple(section for section in sections if section is not None)

@@ -46,9 +46,10 @@ def coefficients(contents: Contents) -> Section | None:
     if contents.run is not None:
         known = {} if contents.knowledge is None else contents.knowledge.coefficients
         results = contents.run.result.coefficients
-        rows = [_fitted(name, one, known.get(name)) for name, one in results.items()]
+        rows = [_fitted(name, result, known.get(name)) for name, result in results.items()]
     elif contents.knowledge is not None:
-        rows = [_known(name, one) for name, one in contents.knowledge.coefficients.items()]
+        known = contents.knowledge.coefficients
+        rows = [_examined(name, knowledge) for name, knowledge in known.items()]
     else:
         return None
     charts = [] if contents.knowledge is None else _intervals(contents.knowledge.coefficients)
@@ -56,19 +57,24 @@ def coefficients(contents: Contents) -> Section | None:
     return Section("coefficients", "Coefficients", values, charts)
 
 
-def _fitted(name: str, one: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
-    reason = reason_in_words(one.reason)
-    if not one.fitted and known is not None:
+def _fitted(name: str, result: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
+    reason = reason_in_words(result.reason)
+    if not result.fitted and known is not None:
         judgement = judgement_in_words(known.verdict, known.reason)
         reason = f"were it fitted with the others: {judgement}"
-    return _row(name, (one.initial, one.best), (one.std_error, one.ci95), (one.verdict, reason))
+    return _row(
+        name,
+        (result.initial, result.best),
+        (result.std_error, result.ci95),
+        (result.verdict, reason),
+    )
 
 
-def _known(name: str, one: CoefficientKnowledge) -> Row:
-    reason = reason_in_words(one.reason)
-    if not one.fitted:
+def _examined(name: str, known: CoefficientKnowledge) -> Row:
+    reason = reason_in_words(known.reason)
+    if not known.fitted:
         reason = f"were it fitted with the others: {reason}"
-    return _row(name, (None, one.value), (one.std_error, one.ci95), (one.verdict, reason))
+    return _row(name, (None, known.value), (known.std_error, known.ci95), (known.verdict, reason))
 
 
 def _row(
@@ -86,29 +92,29 @@ def _row(
 def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
     """Return half the 95 % interval of every coefficient, relative to its value."""
     wide = {
-        name: min(196.0 * one.std_error / one.step, 1000.0)
-        for name, one in known.items()
-        if one.std_error and one.step
+        name: min(196.0 * coefficient.std_error / coefficient.step, 1000.0)
+        for name, coefficient in known.items()
+        if coefficient.std_error and coefficient.step
     }
     if not wide:
         return []
     order = sorted(wide, key=wide.__getitem__)
     bars = []
     for verdict, (_, sign, colour) in VERDICTS.items():
-        own = [wide[name] if known[name].verdict == verdict else None for name in order]
-        if any(value is not None for value in own):
+        widths = [wide[name] if known[name].verdict == verdict else None for name in order]
+        if any(value is not None for value in widths):
             texts = [
                 f"{name}: ±{wide[name]:.2g} %, {verdict_in_words(known[name].verdict)}"
                 for name in order
             ]
             labels = [name if known[name].fitted else f"{name} (fixed)" for name in order]
-            bars.append(Bars(f"{sign} {verdict_in_words(verdict)}", labels, own, colour, texts))
+            bars.append(Bars(f"{sign} {verdict_in_words(verdict)}", labels, widths, colour, texts))
     return [
         Chart(
             key="intervals",
             title="How closely each coefficient is known",
-            caption="Half the 95 % interval. For one that is fixed: what it would be, were it "
-            "fitted with the others.",
+            caption="Half the 95 % interval, relative to the value. For a fixed coefficient it is "
+            "the interval that it would have, were it fitted with the others.",
             panels=(Panel(bars, x_scale="log"),),
             x_title="± % of the value (of its usual uncertainty where the value is smaller)",
             height=120 + 24 * len(order),

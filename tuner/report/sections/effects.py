@@ -66,16 +66,18 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
     signals = list(dict.fromkeys((o.channel, o.axis, o.unit) for o in knowledge.outputs))
     rows, texts = [], []
     for name in names:
-        shares, says = [], []
+        shares, sentences = [], []
         for channel, axis, unit in signals:
-            own = [o for o in knowledge.outputs if (o.channel, o.axis) == (channel, axis)]
-            change = float(np.sqrt(np.mean([o.change[name] ** 2 for o in own])))
-            rmse = float(np.sqrt(np.mean([o.rmse**2 for o in own])))
+            outputs = [o for o in knowledge.outputs if (o.channel, o.axis) == (channel, axis)]
+            change = float(np.sqrt(np.mean([o.change[name] ** 2 for o in outputs])))
+            rmse = float(np.sqrt(np.mean([o.rmse**2 for o in outputs])))
             shares.append(float(np.log10(max(change / max(rmse, 1e-300), FAINTEST))))
-            each = "".join(f"<br>{o.flight}: {o.change[name]:.3g} {unit}" for o in own)
-            says.append(f"{name} +1 % changes {_name(channel, axis)} by {change:.3g} {unit}{each}")
+            each = "".join(f"<br>{o.flight}: {o.change[name]:.3g} {unit}" for o in outputs)
+            sentences.append(
+                f"{name} +1 % changes {_name(channel, axis)} by {change:.3g} {unit}{each}"
+            )
         rows.append(shares)
-        texts.append(says)
+        texts.append(sentences)
     heat = Heat(
         columns=[_name(channel, axis) for channel, axis, _ in signals],
         rows=_labels(knowledge, names),

@@ -1,4 +1,4 @@
-"""Which flight and which channel told each coefficient, and what it is confused with."""
+"""From which flights and channels each coefficient is known, and what it is correlated with."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tuner.report.section import Section
 from tuner.wording.verdicts import direction_in_words
 
 NOTICED = 0.05
-"""Percent of bias for each percent of a fixed coefficient below which it is not told."""
+"""Percent of bias for each percent of a fixed coefficient below which it is not listed."""
 MOST = 3
 """Biased coefficients named for each fixed one."""
 ANNOTATED = 14
@@ -31,7 +31,7 @@ def information(contents: Contents) -> Section | None:
     knowledge = contents.knowledge
     if knowledge is None:
         return None
-    directions = [(one.null, direction_in_words(one)) for one in knowledge.directions]
+    directions = [(d.null, direction_in_words(d)) for d in knowledge.directions]
     values = {"directions": directions, "biases": _biases(knowledge)}
     charts = [_by_channel(knowledge), _by_flight(knowledge)]
     if len(knowledge.names) > 1:
@@ -40,13 +40,13 @@ def information(contents: Contents) -> Section | None:
 
 
 def _biases(knowledge: Knowledge) -> list[Bias]:
-    found = []
+    biases = []
     for name, known in knowledge.coefficients.items():
         follows = sorted(known.bias.items(), key=lambda item: -abs(item[1]))[:MOST]
         noticed = [(other, share) for other, share in follows if abs(share) >= NOTICED]
         if noticed:
-            found.append(Bias(name, noticed))
-    return found
+            biases.append(Bias(name, noticed))
+    return biases
 
 
 def _by_channel(knowledge: Knowledge) -> Chart:
@@ -60,8 +60,8 @@ def _by_channel(knowledge: Knowledge) -> Chart:
         knowledge,
         parts,
         "shares_by_channel",
-        "Which channel told each coefficient",
-        "Share of what is known, the other coefficients fitted beside it.",
+        "Information about each coefficient by channel",
+        "Share of the Fisher information, the other coefficients fitted beside it.",
     )
 
 
@@ -73,7 +73,9 @@ def _by_flight(knowledge: Knowledge) -> Chart:
         ]
         for flight in knowledge.flights
     }
-    return _stacked(knowledge, parts, "shares_by_flight", "Which flight told each coefficient", "")
+    return _stacked(
+        knowledge, parts, "shares_by_flight", "Information about each coefficient by flight", ""
+    )
 
 
 def _stacked(
@@ -106,7 +108,7 @@ def _stacked(
         title=title,
         caption=caption,
         panels=(Panel(bars),),
-        x_title="% of what is known",
+        x_title="% of the information",
         height=130 + 24 * len(labels),
     )
 
@@ -129,7 +131,7 @@ def _correlation(knowledge: Knowledge) -> Chart:
     return Chart(
         key="correlation",
         title="Correlation of the estimates",
-        caption="Near ±1, two coefficients are hard to tell apart.",
+        caption="Near ±1, two coefficients are hard to distinguish.",
         panels=(Panel((heat,)),),
         height=190 + 30 * len(names),
     )

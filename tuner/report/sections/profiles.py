@@ -1,4 +1,4 @@
-"""How the likelihood falls when one coefficient is held and the others are fitted again."""
+"""How the likelihood falls when a coefficient is set to other values and the rest refitted."""
 
 from __future__ import annotations
 
@@ -15,23 +15,28 @@ def profiles(contents: Contents) -> Section | None:
     """Return a chart a profile."""
     if contents.profiles is None:
         return None
-    found = contents.profiles.profiles
-    charts = [_chart(one) for one in found]
-    return Section("profiles", "Profile likelihood", {"profiles": found}, charts)
+    profiles = contents.profiles.profiles
+    charts = [_chart(profile) for profile in profiles]
+    return Section("profiles", "Profile likelihood", {"profiles": profiles}, charts)
 
 
-def _chart(one: Profile) -> Chart:
-    rise = [None if value is None or value > HIGHEST else value for value in one.rise]
-    expected = [value if value <= HIGHEST else None for value in one.quadratic]
+def _chart(profile: Profile) -> Chart:
+    rise = [None if value is None or value > HIGHEST else value for value in profile.rise]
+    expected = [value if value <= HIGHEST else None for value in profile.quadratic]
     lines = (
-        Line("standard error's parabola", one.values, expected, Look(GREY, dash="dash", width=2.0)),
-        Line("profile", one.values, rise, Look(FITTED.colour, width=2.0, marks=True)),
+        Line(
+            "standard error's parabola",
+            profile.values,
+            expected,
+            Look(GREY, dash="dash", width=2.0),
+        ),
+        Line("profile", profile.values, rise, Look(FITTED.colour, width=2.0, marks=True)),
     )
     panel = Panel(lines, y_title="rise of χ²", levels=((THRESHOLD, "95 %"),))
     return Chart(
-        key=f"profile_{one.name}",
-        title=one.name,
+        key=f"profile_{profile.name}",
+        title=profile.name,
         panels=(panel,),
-        x_title=f"{one.name} [{one.unit}]" if one.unit else one.name,
+        x_title=f"{profile.name} [{profile.unit}]" if profile.unit else profile.name,
         height=340,
     )

@@ -11,22 +11,22 @@ def residuals(contents: Contents) -> Section | None:
     """Return a table of the residuals and their autocorrelation."""
     if contents.knowledge is None or not contents.knowledge.residuals:
         return None
-    found = contents.knowledge.residuals
+    known = contents.knowledge.residuals
     panels = []
-    for number, channel in enumerate(dict.fromkeys(one.channel for one in found)):
-        own = [one for one in found if one.channel == channel]
+    for number, channel in enumerate(dict.fromkeys(r.channel for r in known)):
+        of_channel = [residual for residual in known if residual.channel == channel]
         colour = PALETTE[number % len(PALETTE)]
         curves = [
             Line(
                 channel.replace("_", " "),
-                [round(i * one.spacing, 4) for i in range(1, len(one.autocorrelation))],
-                one.autocorrelation[1:],
+                [round(i * residual.spacing, 4) for i in range(1, len(residual.autocorrelation))],
+                residual.autocorrelation[1:],
                 Look(colour, width=1.2),
-                text=[f"{one.flight}: {r:+.2f}" for r in one.autocorrelation[1:]],
+                text=[f"{residual.flight}: {r:+.2f}" for r in residual.autocorrelation[1:]],
             )
-            for one in own
+            for residual in of_channel
         ]
-        limit = max(one.limit for one in own)
+        limit = max(residual.limit for residual in of_channel)
         levels = ((limit, ""), (-limit, ""))
         panels.append(Panel(curves, y_title=channel.replace("_", " "), levels=levels))
     chart = Chart(
@@ -37,4 +37,4 @@ def residuals(contents: Contents) -> Section | None:
         x_title="lag [s]",
         height=100 + 110 * len(panels),
     )
-    return Section("residuals", "What is left over", {"residuals": found}, (chart,))
+    return Section("residuals", "Residuals", {"residuals": known}, (chart,))

@@ -18,7 +18,7 @@ def search(contents: Contents) -> Section | None:
         charts = [*_waterfall(contents.search), *_trace(contents.search)]
     result = contents.run.result.search
     values = {"search": result, "ending": ending_sentence(result.message)}
-    return Section("search", "How it was found", values, charts)
+    return Section("search", "How the search went", values, charts)
 
 
 def _waterfall(record: SearchRecord) -> list[Chart]:
@@ -27,22 +27,22 @@ def _waterfall(record: SearchRecord) -> list[Chart]:
         return []
     marks = []
     for number, origin in enumerate(dict.fromkeys(start.origin for start in ends)):
-        own = [(rank, one) for rank, one in enumerate(ends, start=1) if one.origin == origin]
+        ranked = [(rank, s) for rank, s in enumerate(ends, start=1) if s.origin == origin]
         marks.append(
             Line(
                 f"start: {origin}",
-                [rank for rank, _ in own],
-                [one.loss for _, one in own],
+                [rank for rank, _ in ranked],
+                [start.loss for _, start in ranked],
                 Look(PALETTE[number % len(PALETTE)], marks=True),
                 joined=False,
-                text=[f"{origin}: loss {one.loss:.6g}" for _, one in own],
+                text=[f"{origin}: loss {start.loss:.6g}" for _, start in ranked],
             )
         )
     failed = len(record.starts) - len(ends)
     several = (
-        "Starts that end equally low have found the same minimum; a step is another minimum."
+        "Starts with the same loss ended in the same minimum; a step is another minimum."
         if len(ends) > 1
-        else "One start was searched from; more (search.starts in the job file) would tell "
+        else "The search began at a single start; more (search.starts in the job file) would show "
         "whether another minimum lies lower."
     )
     return [

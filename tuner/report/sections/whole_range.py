@@ -10,20 +10,22 @@ from tuner.sensitivity_analysis.global_sensitivity_json import MEANING, GlobalSe
 
 def whole_range(contents: Contents) -> Section | None:
     """Return the indices over all and for each channel of each flight."""
-    found = contents.whole_range
-    if found is None:
+    indices = contents.whole_range
+    if indices is None:
         return None
-    values = {"found": found, "meaning": MEANING[found.method]}
-    return Section("whole_range", "Over the whole range", values, (_over_all(found), _each(found)))
+    values = {"found": indices, "meaning": MEANING[indices.method]}
+    return Section(
+        "whole_range", "Over the whole range", values, (_over_all(indices), _each(indices))
+    )
 
 
-def _over_all(found: GlobalSensitivity) -> Chart:
-    own = sorted((i for i in found.indices if not i.flight), key=lambda i: -i.total)
-    meaning = MEANING[found.method]
+def _over_all(indices: GlobalSensitivity) -> Chart:
+    overall = sorted((i for i in indices.indices if not i.flight), key=lambda i: -i.total)
+    meaning = MEANING[indices.method]
     texts = [
-        f"{i.coefficient}: {meaning[1]} {i.total:.3g}, {meaning[2]} {i.spread:.3g}" for i in own
+        f"{i.coefficient}: {meaning[1]} {i.total:.3g}, {meaning[2]} {i.spread:.3g}" for i in overall
     ]
-    names, totals = [i.coefficient for i in own], [i.total for i in own]
+    names, totals = [i.coefficient for i in overall], [i.total for i in overall]
     bars = Bars(meaning[1], names, totals, PALETTE[0], texts)
     return Chart(
         key="global",
@@ -31,14 +33,14 @@ def _over_all(found: GlobalSensitivity) -> Chart:
         caption="Of the mean logarithm (base 10) of all channels' RMSE.",
         panels=(Panel((bars,)),),
         x_title=meaning[1],
-        height=120 + 24 * len(own),
+        height=120 + 24 * len(overall),
     )
 
 
-def _each(found: GlobalSensitivity) -> Chart:
-    outputs = list(dict.fromkeys((i.flight, i.channel) for i in found.indices if i.flight))
-    names = list(found.bounds)
-    totals = {(i.coefficient, i.flight, i.channel): i.total for i in found.indices}
+def _each(indices: GlobalSensitivity) -> Chart:
+    outputs = list(dict.fromkeys((i.flight, i.channel) for i in indices.indices if i.flight))
+    names = list(indices.bounds)
+    totals = {(i.coefficient, i.flight, i.channel): i.total for i in indices.indices}
     heat = Heat(
         columns=[f"{flight} {channel.replace('_', ' ')}" for flight, channel in outputs],
         rows=names,
@@ -50,7 +52,7 @@ def _each(found: GlobalSensitivity) -> Chart:
             ]
             for name in names
         ],
-        bar=MEANING[found.method][1],
+        bar=MEANING[indices.method][1],
     )
     return Chart(
         key="global_each",
