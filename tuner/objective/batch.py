@@ -14,9 +14,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.flier import Flier
 from tuner.objective.loss import robust_loss
 from tuner.objective.normal import Objective
+from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -56,7 +56,7 @@ def evaluate(
     point
         Its clock offsets hold for all.
     """
-    evaluate_chunk = _shared(objective.flier)
+    evaluate_chunk = _shared(objective.simulator)
     parts = []
     for first in range(0, len(vectors), CHUNK):
         chunk = vectors[first : first + CHUNK]
@@ -79,12 +79,12 @@ def _first(batch: Batch, count: int) -> Batch:
 
 
 @lru_cache(maxsize=16)
-def _shared(flier: Flier) -> Callable[..., Batch]:
+def _shared(simulator: Simulator) -> Callable[..., Batch]:
     def segmentwise(
         data: SegmentData, model: Tunable, vectors: Array, horizon: Array, huber: Array
     ) -> Batch:
         def at(vector: Array) -> Batch:
-            trace, errors = flier.compared(data, model, vector, horizon)
+            trace, errors = simulator.compared(data, model, vector, horizon)
             scaled = {name: error / data.scale[name] for name, error in errors.items()}
             squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
             return Batch(robust_loss(scaled, huber), squares, trace.crash_time)

@@ -23,8 +23,8 @@ from tuner.objective.criterion import (
     SegmentData,
     SegmentSums,
 )
-from tuner.objective.flier import MEMORY, Flier
 from tuner.objective.segments import OFFSETS, Segments
+from tuner.objective.simulator import MEMORY, Simulator
 from tuner.objective.tunable import Tunable, tunable_of
 from tuner.padding import padded_size
 from tuner.parallel import in_pieces, over_devices
@@ -64,9 +64,9 @@ class Objective(eqx.Module):
         return Point(jnp.asarray(vector), jnp.zeros((len(OFFSETS), self.flights)))
 
     @property
-    def flier(self) -> Flier:
+    def simulator(self) -> Simulator:
         """The static half, by which compiled functions are kept."""
-        return Flier(self.schedule, padded_size(self.samples), self.limits, self.memory)
+        return Simulator(self.schedule, padded_size(self.samples), self.limits, self.memory)
 
     @property
     def tunable(self) -> Tunable:
@@ -85,7 +85,7 @@ class Objective(eqx.Module):
         self, points: Point, criterion: Criterion, *, derivatives: bool = True
     ) -> SegmentSums:
         """Return every segment's contribution at S points; all leaves have S first."""
-        sums: SegmentSums = _shared_sums(self.flier, derivatives)(
+        sums: SegmentSums = _shared_sums(self.simulator, derivatives)(
             self.data(points.offsets, criterion),
             self.tunable,
             np.asarray(points.coefficients),
@@ -108,7 +108,7 @@ class Objective(eqx.Module):
         for first in range(0, len(vector), count):
             some = Space(self.space.parameters[first : first + count], {})
             moved = np.pad(vector[first : first + count], (0, count - len(some)))
-            jacobian = _shared_jacobian(self.flier)(
+            jacobian = _shared_jacobian(self.simulator)(
                 data, tunable_of(model, some, count=count), moved, np.asarray(criterion.horizon)
             )
             parts.append((len(some), jacobian))
@@ -145,9 +145,11 @@ def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
 
 
 @lru_cache(maxsize=16)
-def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
+def _shared_jacobian(simulator: Simulator) -> Callable[..., Jacobian]:
     def segmentwise(data: SegmentData, *rest: Any) -> Jacobian:
-        pieces = in_pieces(flier.jacobian, flier.segments_at_once(data, len(rest[0].coordinates)))
+        pieces = in_pieces(
+            simulator.jacobian, simulator.segments_at_once(data, len(rest[0].coordinates))
+        )
         jacobian: Jacobian = pieces(data, *rest)
         return jacobian
 
@@ -155,14 +157,14 @@ def _shared_jacobian(flier: Flier) -> Callable[..., Jacobian]:
 
 
 @lru_cache(maxsize=16)
-def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., SegmentSums]:
+def _shared_sums(simulator: Simulator, derivatives: bool) -> Callable[..., SegmentSums]:
     """Return the sums over all devices for S points, compiled once however often used."""
 
     def some(data: SegmentData, model: Tunable, coefficients: Array, *rest: Any) -> SegmentSums:
         def at(point: tuple[Array, Array]) -> SegmentSums:
             vector, offsets = point
             at_offsets = eqx.tree_at(lambda d: d.offsets, data, offsets)
-            return flier.sums(at_offsets, model, vector, *rest, derivatives=derivatives)
+            return simulator.sums(at_offsets, model, vector, *rest, derivatives=derivatives)
 
         # one start after the other: segments and columns fill the processor already
         sums: SegmentSums = lax.map(at, (coefficients, data.offsets))
@@ -170,7 +172,7 @@ def _shared_sums(flier: Flier, derivatives: bool) -> Callable[..., SegmentSums]:
 
     def segmentwise(data: SegmentData, *rest: Any) -> SegmentSums:
         moving = len(rest[0].coordinates) if derivatives or data.states is not None else 0
-        pieces = in_pieces(some, flier.segments_at_once(data, moving))
+        pieces = in_pieces(some, simulator.segments_at_once(data, moving))
         sums: SegmentSums = pieces(data, *rest)
         return sums
 

@@ -19,9 +19,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.flier import Flier
 from tuner.objective.loss import robust_loss
 from tuner.objective.normal import Objective
+from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
 
@@ -60,7 +60,7 @@ def gradients(
     point
         Its clock offsets hold for all.
     """
-    result: Gradients = _shared(objective.flier)(
+    result: Gradients = _shared(objective.simulator)(
         np.asarray(vectors).T,
         objective.data(point.offsets, criterion),
         objective.tunable,
@@ -71,13 +71,13 @@ def gradients(
 
 
 @lru_cache(maxsize=16)
-def _shared(flier: Flier) -> Callable[..., Gradients]:
+def _shared(simulator: Simulator) -> Callable[..., Gradients]:
     def some(
         vectors: Array, data: SegmentData, model: Tunable, horizon: Array, huber: Array
     ) -> Gradients:
         def loss(vector: Array) -> Array:
-            trace = flier.fly(model, data.segments, vector, None, data.states)
-            errors = flier.residuals(data, horizon, trace, data.offsets)
+            trace = simulator.fly(model, data.segments, vector, None, data.states)
+            errors = simulator.residuals(data, horizon, trace, data.offsets)
             scaled = {name: error / data.scale[name] for name, error in errors.items()}
             return jnp.sum(robust_loss(scaled, huber))
 
@@ -85,14 +85,16 @@ def _shared(flier: Flier) -> Callable[..., Gradients]:
         return Gradients(values, slopes)
 
     def share(vectors: Array, data: SegmentData, *rest: Any) -> Gradients:
-        result: Gradients = in_pieces(some, _vectors_at_once(flier, data))(vectors, data, *rest)
+        result: Gradients = in_pieces(some, _vectors_at_once(simulator, data))(vectors, data, *rest)
         return result
 
     return over_devices(share)
 
 
-def _vectors_at_once(flier: Flier, data: SegmentData) -> int:
+def _vectors_at_once(simulator: Simulator, data: SegmentData) -> int:
     segments = data.segments.count
-    bytes_of_vector = 8 * _REMEMBERED * flier.capacity * flier.schedule.blocks_per_sample * segments
-    memory = flier.memory // len(jax.devices())
+    bytes_of_vector = (
+        8 * _REMEMBERED * simulator.capacity * simulator.schedule.blocks_per_sample * segments
+    )
+    memory = simulator.memory // len(jax.devices())
     return max(1, min(piece_that_fits(8) // segments, memory // bytes_of_vector))

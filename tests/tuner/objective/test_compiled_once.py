@@ -12,7 +12,7 @@ from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
 from tuner.flights.flight import Series
 from tuner.job.prepare import job_of
-from tuner.objective import flier
+from tuner.objective import simulator
 from tuner.objective.normal import Objective
 from tuner.recordings import recordings_of
 
@@ -22,7 +22,7 @@ def program(objective: Objective) -> object:
     point = objective.start(objective.space.initial)
     arguments = objective.data(point.offsets, criterion_of(objective)), objective.tunable
     leaves = [jax.typeof(np.asarray(leaf)) for leaf in jax.tree.leaves(arguments)]
-    return objective.flier, jax.tree.structure(arguments), leaves
+    return objective.simulator, jax.tree.structure(arguments), leaves
 
 
 def shortened(flight, seconds):
@@ -62,8 +62,8 @@ def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypat
     fit = problem((*groups[0], *groups[1]))
     names, criterion = list(fit.space.names), criterion_of(fit)
     traced = []
-    forward = flier._jacobian_forward
-    monkeypatch.setattr(flier, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
+    forward = simulator._jacobian_forward
+    monkeypatch.setattr(simulator, "_jacobian_forward", lambda *a: traced.append(1) or forward(*a))
     together = fit.jacobian(fit.start(fit.space.initial), criterion, columns=3)
     for group in groups:
         part = problem(group)

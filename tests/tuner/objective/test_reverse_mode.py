@@ -38,8 +38,8 @@ def test_a_smaller_memory_gives_the_same_sums(fit):
     point = fit.start(np.asarray(fit.space.initial))
     small = type(fit)(**{**vars(fit), "memory": 1})
     data = small.data(point.offsets, criterion)
-    assert small.flier.segments_at_once(data, len(fit.space)) == 1
-    assert fit.flier.segments_at_once(data, len(fit.space)) > 1
+    assert small.simulator.segments_at_once(data, len(fit.space)) == 1
+    assert fit.simulator.segments_at_once(data, len(fit.space)) > 1
     want, got = fit.sums(point, criterion), small.sums(point, criterion)
     np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
     np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)

@@ -16,7 +16,7 @@ from tuner.search.optimiser import OPTIMISERS, Free
 from tuner.search.progress import beginning
 from tuner.search.stages import WHOLE, plan
 
-FREE = ("inertia_zz", "motor_constant")
+FREE = ("inertia_zz", "motor_constant", "moment_constant")
 MODULE = '''
 import jax.numpy as jnp
 import numpy as np
@@ -73,12 +73,12 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
     stages = plan(added, fit.samples, rate, windows=False, robust=False, steps=40)
     stages = [stage for stage in stages if stage.name in ("first 3 s", WHOLE)]
     reports = []
-    start = np.asarray(fit.space.initial) + np.array([0.3, -0.2])
+    start = np.asarray(fit.space.initial) + np.array([0.3, -0.2, 0.0])
     progress = grow(
         fit,
         tuple(stages),
         beginning(fit, start[None]),
-        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        free=Free(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
         clipped=False,
         on_progress=reports.append,
     )

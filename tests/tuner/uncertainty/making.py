@@ -19,9 +19,9 @@ from tuner.coefficients.space import space_of
 from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
 from tuner.model import model_of, schedule_of
 from tuner.objective.criterion import Criterion, Point
-from tuner.objective.flier import Flier
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
+from tuner.objective.simulator import Simulator
 from tuner.search.fitted import Fitted
 from tuner.yaml_files.shipped import find_config
 
@@ -110,12 +110,12 @@ def with_data(
     return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
 
 
-_fly = eqx.filter_jit(Flier.fly)
+_fly = eqx.filter_jit(Simulator.fly)
 
 
 def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
     trace = _fly(
-        objective.flier,
+        objective.simulator,
         objective.tunable,
         objective.segments,
         point.coefficients,

@@ -29,7 +29,7 @@ MEMORY = 2**30
 
 
 @dataclass(frozen=True)
-class Flier:
+class Simulator:
     """The static half of an objective: its methods are functions of arrays alone."""
 
     schedule: Schedule
