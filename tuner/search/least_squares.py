@@ -58,20 +58,20 @@ class LeastSquares(Optimiser):
     def terminate(self, problem: StageProblem, state: Descent) -> bool:
         """Return whether every start is good enough for the next stage, or gains no more.
 
-        optimistix's own rule, `Step.still`, asks for nine digits of every parameter, which no
-        recording has; a stage ends as soon as the loss gains less than its tolerance, by the last
-        accepted step or by the last three tries.
+        optimistix's own rule, `Step.still`, ends a start whose nine leading digits no longer
+        change. No recording has so many, so that a stage's tolerance ends it sooner: as soon as the
+        loss gains less than that, by the last accepted step or by the last three tries.
         """
         if not state.losses:
             return False
         tolerance, last = problem.stage.tolerance, state.losses[-1]
-        enough = last <= problem.stage.enough
+        ended = (last <= problem.stage.enough) | np.asarray(state.step.still)
         if len(state.losses) == 1:
-            return bool(np.all(enough))
+            return bool(np.all(ended))
         accepted = np.asarray(state.step.accepted)
         by_last_step = accepted & _gains_little(state.losses[-2:], tolerance)
         by_three_tries = len(state.losses) > 3 and _gains_little(state.losses[-4:], tolerance)
-        return bool(np.all(by_last_step | by_three_tries | enough))
+        return bool(np.all(by_last_step | by_three_tries | ended))
 
 
 def _gains_little(losses: Sequence[NDArray[np.float64]], tolerance: float) -> NDArray[np.bool_]:
