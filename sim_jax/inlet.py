@@ -1,21 +1,94 @@
-"""Where a recorded signal enters the loop and replaces everything upstream of it."""
+"""Where a recorded signal enters the loop and replaces the stages upstream of it.
+
+An inlet is a class. What it does not override, the loop's own stages do::
+
+    position control ──> rate control ──>   motors   ──>   rigid body
+     next_setpoints      next_command   next_rotor_speeds  next_motion
+"""
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from collections.abc import Callable
+from typing import Protocol, TypeVar, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from sim_jax.control.position import ReferencePoint
 from sim_jax.numeric import Scalar
+from sim_jax.rigid_body import Motion
+from sim_jax.state import Setpoints, State
+from sim_jax.trees import like, replaced, row_of, where
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
+T = TypeVar("T")
+Step = Int[Array, ""]
+"""Number of a physics step."""
 
-class ReferenceInlet(eqx.Module):
+
+@runtime_checkable
+class Stages(Protocol):
+    """The loop's own stages, on which an inlet calls for what it does not replace."""
+
+    def position_control(self, state: State, step: Step, reference: ReferenceInlet) -> Setpoints:
+        """Return the set-points of position and attitude control."""
+        ...
+
+    def rate_control(self, state: State, step: Step) -> State:
+        """Return the state after gyro filters, rate control and mixer, where they are due."""
+        ...
+
+    def commanded(self, state: State, command: PerRotor) -> State:
+        """Return the state in which the motors have received commands 0..1."""
+        ...
+
+    def motors(self, state: State, step: Step) -> tuple[PerRotor, PerRotor]:
+        """Return the rotor speeds in rad/s after a step, and those that act during it."""
+        ...
+
+
+class Inlet(eqx.Module):
+    """What is fed into the loop; a subclass overrides the stages that it replaces."""
+
+    @property
+    def needs_mixer(self) -> bool:
+        """Whether commands come from the mixer, which is a quad X's."""
+        return False
+
+    def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
+        """Return what the rate controller is to follow."""
+        del stages, step
+        return state.setpoints
+
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        """Return the state with the motor commands of a step."""
+        return stages.rate_control(state, step)
+
+    def next_rotor_speeds(
+        self, stages: Stages, state: State, step: Step
+    ) -> tuple[PerRotor, PerRotor]:
+        """Return the rotor speeds in rad/s after a step, and those that act during it."""
+        return stages.motors(state, step)
+
+    def next_motion(self, moved: Motion, step: Step) -> Motion:
+        """Return the motion after a step, of which an inlet may replace a part."""
+        del step
+        return moved
+
+    def batch_shape(self) -> tuple[int, ...]:
+        """Return the shape of the batch: that of all leaves, without their first axis of time."""
+        return jnp.broadcast_shapes(*(jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(self)))
+
+    def rotor_counts(self) -> set[int]:
+        """Return for how many rotors something is fed in; empty where nothing is."""
+        return set()
+
+
+class ReferenceInlet(Inlet):
     """The whole loop is simulated; leaves of ``points`` are (ticks, \\*batch), one a control tick.
 
     After its end the last point is held.
@@ -27,37 +100,107 @@ class ReferenceInlet(eqx.Module):
     yaw_rate: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
     """rad/s, body z."""
 
+    @property
+    def needs_mixer(self) -> bool:
+        return True
 
-class BodyRateInlet(eqx.Module):
-    """Rate and thrust set-points enter; leaves are (physics steps, \\*batch)."""
+    def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
+        return stages.position_control(state, step, self)
+
+    def batch_shape(self) -> tuple[int, ...]:
+        series = (jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(self.points))
+        return jnp.broadcast_shapes(*series, jnp.shape(self.spins), jnp.shape(self.yaw_rate))
+
+
+class BodyRateInlet(Inlet):
+    """Rate and thrust set-points replace position control; leaves are (physics steps, \\*batch)."""
 
     rate: Vec3
     """rad/s, body FLU."""
     thrust: Float[Array, "steps *batch"]
 
+    @property
+    def needs_mixer(self) -> bool:
+        return True
 
-class ActuatorInlet(eqx.Module):
-    """Motor commands 0..1 enter; leaves are (physics steps, \\*batch)."""
+    def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
+        del stages
+        return like(row_of(Setpoints(self.rate, self.thrust), step), state.setpoints)
+
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        setpoints = self.next_setpoints(stages, state, step)
+        return stages.rate_control(replaced(state, setpoints=setpoints), step)
+
+
+class ActuatorInlet(Inlet):
+    """Motor commands 0..1 replace all control; leaves are (physics steps, \\*batch)."""
 
     command: PerRotor
 
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        return stages.commanded(state, like(row_of(self.command, step), state.command))
 
-class RotorSpeedInlet(eqx.Module):
-    """Rotor speeds in rad/s enter the aerodynamics; leaves are (physics steps, \\*batch)."""
+    def rotor_counts(self) -> set[int]:
+        return {len(self.command)}
+
+
+class RotorSpeedInlet(Inlet):
+    """Rotor speeds in rad/s replace control and motors; leaves are (physics steps, \\*batch)."""
 
     speed: PerRotor
 
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        del stages, step
+        return state
 
-SingleInlet: TypeAlias = ReferenceInlet | BodyRateInlet | ActuatorInlet | RotorSpeedInlet
+    def next_rotor_speeds(
+        self, stages: Stages, state: State, step: Step
+    ) -> tuple[PerRotor, PerRotor]:
+        del stages
+        before = like(row_of(self.speed, step), state.rotor_speed)
+        after = like(row_of(self.speed, step + 1), state.rotor_speed)
+        return after, tuple(0.5 * (old + new) for old, new in zip(before, after, strict=True))
+
+    def rotor_counts(self) -> set[int]:
+        return {len(self.speed)}
 
 
-class MixedInlet(eqx.Module):
+class MixedInlet(Inlet):
     """Each vehicle of a batch has its own inlet; the loop is stepped once for every part."""
 
-    parts: tuple[SingleInlet, ...]
+    parts: tuple[Inlet, ...]
     """For the whole batch each; what a part holds for a vehicle of another part is ignored."""
     kind: Int[Array, "*batch"]
     """Number of the part that each vehicle uses."""
 
+    @property
+    def needs_mixer(self) -> bool:
+        return any(part.needs_mixer for part in self.parts)
 
-Inlet: TypeAlias = SingleInlet | MixedInlet
+    def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
+        return self._of_each(lambda part: part.next_setpoints(stages, state, step))
+
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        return self._of_each(lambda part: part.next_command(stages, state, step))
+
+    def next_rotor_speeds(
+        self, stages: Stages, state: State, step: Step
+    ) -> tuple[PerRotor, PerRotor]:
+        return self._of_each(lambda part: part.next_rotor_speeds(stages, state, step))
+
+    def next_motion(self, moved: Motion, step: Step) -> Motion:
+        return self._of_each(lambda part: part.next_motion(moved, step))
+
+    def batch_shape(self) -> tuple[int, ...]:
+        shapes = (part.batch_shape() for part in self.parts)
+        return jnp.broadcast_shapes(*shapes, jnp.shape(self.kind))
+
+    def rotor_counts(self) -> set[int]:
+        return set().union(*(part.rotor_counts() for part in self.parts))
+
+    def _of_each(self, result: Callable[[Inlet], T]) -> T:
+        """Return for every vehicle the result of its own part."""
+        chosen, *others = [result(part) for part in self.parts]
+        for number, other in enumerate(others, start=1):
+            chosen = where(self.kind == number, other, chosen)
+        return chosen

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Int
 
+from sim_jax.control import mixer
 from sim_jax.control.gains import Controller
 from sim_jax.crash import Limits
-from sim_jax.inlet import Inlet, MixedInlet, ReferenceInlet
+from sim_jax.inlet import Inlet
 from sim_jax.motor import Lag, SwitchedLag
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.plant import Plant, Sample
@@ -36,7 +37,7 @@ class Rollout(eqx.Module):
 
     @property
     def crashed(self) -> Array:
-        """Tell which vehicles crashed, shape (\\*batch)."""
+        """Which vehicles crashed, shape (\\*batch)."""
         return jnp.isfinite(self.crash_time)
 
 
@@ -50,14 +51,26 @@ def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
 def _batch_shape(
     vehicle: Vehicle, controller: Controller, inlet: Inlet, start: Start
 ) -> tuple[int, ...]:
-    if isinstance(inlet, MixedInlet):
-        shapes = [_batch_shape(vehicle, controller, part, start) for part in inlet.parts]
-        return jnp.broadcast_shapes(*shapes, jnp.shape(inlet.kind))
-    series = inlet.points if isinstance(inlet, ReferenceInlet) else inlet
-    flags = (inlet.spins, inlet.yaw_rate) if isinstance(inlet, ReferenceInlet) else ()
-    shapes = [jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(series)]
-    shapes += [jnp.shape(leaf) for leaf in jax.tree.leaves((vehicle, controller, start, flags))]
-    return jnp.broadcast_shapes(*shapes)
+    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves((vehicle, controller, start))]
+    return jnp.broadcast_shapes(*shapes, inlet.batch_shape())
+
+
+def _check_rotors(vehicle: Vehicle, inlet: Inlet, start: Start) -> None:
+    count = len(vehicle.rotors)
+    if inlet.needs_mixer and count != mixer.ROTORS:
+        raise ValueError(
+            f"the vehicle has {count} rotors, and PX4's quad-X mixer commands {mixer.ROTORS}: "
+            "feed in motor commands or rotor speeds (inlet actuator or rotor_speed)"
+        )
+    for name, counts in {
+        "inlet": inlet.rotor_counts(),
+        "start": {len(start.rotor_speed), len(start.command)},
+    }.items():
+        if counts - {count}:
+            raise ValueError(
+                f"the vehicle has {count} rotors, the {name} has values for "
+                + ", ".join(map(str, sorted(counts)))
+            )
 
 
 def _advanced(batch: tuple[State, Plant], shared: Plant, number: Int[Array, ""]) -> Any:
@@ -114,10 +127,17 @@ def rollout(
     -------
     Rollout
         Log with leaves (samples, \\*batch), and the time of a crash.
+
+    Raises
+    ------
+    ValueError
+        The inlet or the start is for another number of rotors than the vehicle's, or the inlet
+        needs the mixer and the vehicle is no quadrotor.
     """
-    given = vehicle, controller, inlet, start
-    dtype = precision_of(given) if precision is None else jnp.dtype(precision)
-    vehicle, controller, inlet, start = in_precision(given, dtype)
+    _check_rotors(vehicle, inlet, start)
+    arguments = vehicle, controller, inlet, start
+    dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
+    vehicle, controller, inlet, start = in_precision(arguments, dtype)
     shape = _batch_shape(vehicle, controller, inlet, start)
     plant = Plant(
         vehicle=vehicle,

@@ -25,7 +25,7 @@ class Start(eqx.Module):
     rotor_speed: PerRotor
     """rad/s."""
     command: PerRotor
-    """0..1, what the motors were told before the start."""
+    """0..1, what the motors received before the start."""
     rate_integral: Vec3
     """State of the rate controller's integrator, FRD."""
 
@@ -48,24 +48,25 @@ class State(eqx.Module):
     integral: Vec3
     gyro: GyroMemory
     command: PerRotor
-    asked: PerRotor
-    """rad/s that the command asks for."""
-    estimates: Float[Array, "estimate_history 10 *batch"] | None
-    asked_before: Float[Array, "asked_history 4 *batch"] | None
+    reference_speed: PerRotor
+    """rad/s, what the command asks of the motors."""
+    estimate_history: Float[Array, "past_estimates 10 *batch"] | None
+    reference_history: Float[Array, "past_references rotors *batch"] | None
     crash_time: Scalar
     """s, infinite while flying."""
 
 
 def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Start:
     """Return a level vehicle at rest at a position in m, its rotors carrying its weight."""
-    thrust = vehicle.body.mass * gravity / 4.0
+    count = len(vehicle.rotors)
+    thrust = vehicle.body.mass * gravity / count
     speed = jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
     command = (speed - vehicle.motor.zero_position_armed) / vehicle.motor.input_scaling
     rest = Vec3.zeros(position.x)
     return Start(
         motion=Motion(position, rest, Quaternion.identity(position.x), rest),
-        rotor_speed=(speed, speed, speed, speed),
-        command=(command, command, command, command),
+        rotor_speed=(speed,) * count,
+        command=(command,) * count,
         rate_integral=rest,
     )
 
@@ -77,20 +78,20 @@ def first_state(
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), start)
     speeds = (reference_speed(motor, command) for command in start.command)
-    a, b, c, d = (jnp.broadcast_to(speed, shape).astype(dtype) for speed in speeds)
-    asked = a, b, c, d
-    estimates = asked_before = None
+    references = tuple(jnp.broadcast_to(speed, shape).astype(dtype) for speed in speeds)
+    estimate_history = reference_history = None
     if schedule.longest_estimate_latency > 0:
         hold = 0.0 if schedule.pose_rate is None else 1.0 / schedule.pose_rate
         length = history_length(schedule.longest_estimate_latency + hold, schedule.step)
-        estimates = past_of(start.motion, length, schedule.step)
+        estimate_history = past_of(start.motion, length, schedule.step)
     elif schedule.pose_rate is not None:
         raise ValueError("pose_rate needs a delay line: set longest_estimate_latency")
     if schedule.longest_actuator_latency > 0:
         length = history_length(schedule.longest_actuator_latency, schedule.step)
-        asked_before = jnp.broadcast_to(jnp.stack(asked), (length, 4, *shape))
+        now = jnp.stack(references)
+        reference_history = jnp.broadcast_to(now, (length, *now.shape))
     memory = GyroMemory.settled(gyro, start.motion.body_rate)
-    thrust = sum(start.command[1:], start.command[0]) * 0.25
+    thrust = sum(start.command[1:], start.command[0]) * (1.0 / len(start.command))
     return State(
         motion=start.motion,
         rotor_speed=start.rotor_speed,
@@ -98,8 +99,8 @@ def first_state(
         integral=start.rate_integral,
         gyro=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), memory),
         command=start.command,
-        asked=asked,
-        estimates=estimates,
-        asked_before=asked_before,
+        reference_speed=references,
+        estimate_history=estimate_history,
+        reference_history=reference_history,
         crash_time=jnp.full(shape, jnp.inf, dtype),
     )

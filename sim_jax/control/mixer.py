@@ -25,6 +25,8 @@ from sim_jax.numeric import Flag, Scalar, anyone, larger, magnitude, saturate, s
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
+ROTORS = 4
+"""How many rotors a quad X has."""
 LOW_CLIP = 0.00499998
 """A command below this counts as clipped low. PX4 asks for output < -0.99 on its -1..1 scale in
 single precision, where a command of exactly 0.005 comes out as -0.99 and does not count."""

@@ -57,7 +57,7 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
     attitude = motion.attitude.product(
         Quaternion(jnp.ones_like(turn[0]), 0.5 * turn[0], 0.5 * turn[1], 0.5 * turn[2])
     ).normalized()
-    a, b, c, d = (
+    speeds = tuple(
         speed * (1.0 + share)
         for speed, share in zip(start.rotor_speed, parts["rotor_speed"], strict=True)
     )
@@ -68,7 +68,7 @@ def moved(start: Start, change: Float[Array, "L F"]) -> Start:
             attitude,
             motion.body_rate + Vec3.of(parts["body_rate"]),
         ),
-        rotor_speed=(a, b, c, d),
+        rotor_speed=speeds,
         command=start.command,
         rate_integral=start.rate_integral + Vec3.of(parts["rate_integral"]),
     )
@@ -103,11 +103,11 @@ def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Sta
     """
     measured = jnp.isnan(turning)
     asked = jnp.where(measured, 0.5, turning)
-    a, b, c, d = (
+    speeds = tuple(
         jnp.where(measured[i], speed, reference_speed(vehicle.motor, asked[i]))
         for i, speed in enumerate(start.rotor_speed)
     )
-    return Start(start.motion, (a, b, c, d), start.command, start.rate_integral)
+    return Start(start.motion, speeds, start.command, start.rate_integral)
 
 
 def eliminated(

@@ -24,7 +24,6 @@ from sim_jax.inlet import (
     MixedInlet,
     ReferenceInlet,
     RotorSpeedInlet,
-    SingleInlet,
 )
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
@@ -42,7 +41,7 @@ class RecordedInlet(ABC):
     """How recordings feed an inlet of the simulator."""
 
     name: ClassVar[InletName]
-    feeds: ClassVar[type[SingleInlet]]
+    feeds: ClassVar[type[Inlet]]
     """The simulator's inlet."""
     needs: ClassVar[tuple[str, ...]]
     """Signals that a recording must hold, the characteristic one first."""
@@ -75,7 +74,7 @@ class RecordedInlet(ABC):
         return None
 
     @abstractmethod
-    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> SingleInlet:
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> Inlet:
         """Lay what was recorded side by side; after its end the last value holds.
 
         Set-points and commands hold until the loop that computes them runs again. Where they were
@@ -177,14 +176,13 @@ class RecordedCommand(RecordedInlet):
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
         """Lay the commands out step by step."""
-        a, b, c, d = self._resampled("command", flights, schedule)
-        return ActuatorInlet((a, b, c, d))
+        return ActuatorInlet(tuple(self._resampled("command", flights, schedule)))
 
     def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
         """Add the trim to the commands."""
         assert isinstance(inlet, ActuatorInlet)
-        a, b, c, d = (command + more for command, more in zip(inlet.command, trim, strict=True))
-        return ActuatorInlet((a, b, c, d))
+        pairs = zip(inlet.command, trim, strict=True)
+        return ActuatorInlet(tuple(command + more for command, more in pairs))
 
 
 class RecordedRotorSpeed(RecordedInlet):
@@ -198,14 +196,13 @@ class RecordedRotorSpeed(RecordedInlet):
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
         """Lay the speeds out step by step."""
-        a, b, c, d = self._resampled("rotor_speed", flights, schedule)
-        return RotorSpeedInlet((a, b, c, d))
+        return RotorSpeedInlet(tuple(self._resampled("rotor_speed", flights, schedule)))
 
     def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
         """Change the speeds by the trim's share."""
         assert isinstance(inlet, RotorSpeedInlet)
-        a, b, c, d = (speed * (1.0 + more) for speed, more in zip(inlet.speed, trim, strict=True))
-        return RotorSpeedInlet((a, b, c, d))
+        pairs = zip(inlet.speed, trim, strict=True)
+        return RotorSpeedInlet(tuple(speed * (1.0 + more) for speed, more in pairs))
 
 
 #: Every inlet, the upstream ones first.
@@ -271,7 +268,7 @@ def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Sc
     return MixedInlet(tuple(parts), jnp.asarray([order.index(name) for name in names]))
 
 
-def recorded_inlet_of(inlet: SingleInlet) -> RecordedInlet:
+def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:
     """Return what feeds an inlet of the simulator."""
     (recorded,) = (r for r in INLETS.values() if isinstance(inlet, r.feeds))
     return recorded
