@@ -17,6 +17,7 @@ from sim_jax.control.position import (
     wanted_acceleration,
 )
 from sim_jax.crash import Limits
+from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_rk4, step_semi_implicit
@@ -57,6 +58,7 @@ class Plant(eqx.Module):
 
     vehicle: Vehicle
     controller: Controller
+    environment: Environment
     schedule: Schedule = eqx.field(static=True)
     limits: Limits = eqx.field(static=True)
     gravity: float = eqx.field(static=True)
@@ -168,7 +170,7 @@ class Plant(eqx.Module):
         speeds, acting = self.inlet.next_rotor_speeds(self, state, step)
 
         def wrench_at(motion: Motion) -> Wrench:
-            air = Air.around(self.vehicle, motion)
+            air = Air.around(self.vehicle, motion, self.environment)
             return total_wrench(self.vehicle, motion, acting, air)
 
         advance = _INTEGRATORS[self.schedule.integrator]

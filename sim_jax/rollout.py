@@ -9,11 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
-from jaxtyping import Int
+from jaxtyping import Int, PyTree
 
 from sim_jax.control import mixer
 from sim_jax.control.gains import Controller
 from sim_jax.crash import Limits
+from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
 from sim_jax.motor import Lag, SwitchedLag
 from sim_jax.numeric import GRAVITY, Scalar
@@ -48,10 +49,8 @@ def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
     return SwitchedLag.over(vehicle.motor, schedule.step, age - jnp.floor(age))
 
 
-def _batch_shape(
-    vehicle: Vehicle, controller: Controller, inlet: Inlet, start: Start
-) -> tuple[int, ...]:
-    shapes = [jnp.shape(leaf) for leaf in jax.tree.leaves((vehicle, controller, start))]
+def _batch_shape(inlet: Inlet, others: PyTree[Array]) -> tuple[int, ...]:
+    shapes = (jnp.shape(leaf) for leaf in jax.tree.leaves(others))
     return jnp.broadcast_shapes(*shapes, inlet.batch_shape())
 
 
@@ -86,6 +85,7 @@ def rollout(
     start: Start,
     *,
     samples: int,
+    environment: Environment = NOTHING_AROUND,
     horizon: Int[Array, ""] | None = None,
     limits: Limits | None = None,
     gravity: float = GRAVITY,
@@ -107,6 +107,8 @@ def rollout(
     samples
         How many samples to log at ``schedule.log_rate``, the first at time 0: the sample logged for
         a time is the state at that time, before the physics that follows it.
+    environment
+        What surrounds the flight; by default nothing.
     horizon
         If given, only so many samples are flown, and the rest of the log is zero. It may be traced:
         one compiled function serves every horizon; derivatives are then forward-mode only. Reverse
@@ -135,13 +137,14 @@ def rollout(
         needs the mixer and the vehicle is no quadrotor.
     """
     _check_rotors(vehicle, inlet, start)
-    arguments = vehicle, controller, inlet, start
+    arguments = vehicle, controller, inlet, start, environment
     dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
-    vehicle, controller, inlet, start = in_precision(arguments, dtype)
-    shape = _batch_shape(vehicle, controller, inlet, start)
+    vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
+    shape = _batch_shape(inlet, (vehicle, controller, start, environment))
     plant = Plant(
         vehicle=vehicle,
         controller=controller,
+        environment=environment,
         schedule=schedule,
         limits=Limits() if limits is None else limits,
         gravity=gravity,
@@ -150,7 +153,7 @@ def rollout(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
-    causes = vehicle, controller
+    causes = vehicle, controller, environment
     first = first_state(start, vehicle.motor, schedule, plant.gyro, shape)
     state = replaced(following(first, causes), crash_time=first.crash_time)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 
+from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.rigid_body import Motion
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
@@ -22,9 +23,12 @@ class Air(eqx.Module):
     """The world's z axis."""
 
     @staticmethod
-    def around(vehicle: Vehicle, motion: Motion) -> Air:
+    def around(vehicle: Vehicle, motion: Motion, environment: Environment = NOTHING_AROUND) -> Air:
         """Return the air as a vehicle meets it in a motion."""
-        velocity = motion.attitude.to_body(motion.velocity)
+        through = motion.velocity
+        if environment.wind is not None:
+            through = through - environment.wind
+        velocity = motion.attitude.to_body(through)
         arms = tuple(rotor.position for rotor in vehicle.rotors)
         return Air(
             velocity=velocity,
