@@ -20,7 +20,7 @@ class Limits(eqx.Module):
     """rad/s of body rate about any axis beyond which the vehicle tumbles."""
 
     def broken_by(self, motion: Motion) -> Flag:
-        """Tell which vehicles are outside the limits; not-a-number counts as outside."""
+        """Return which vehicles are outside the limits; not-a-number counts as outside."""
         position, rate = motion.position, motion.body_rate
         inside = position.z >= self.floor
         for distance in (position.x, position.y, position.z):

@@ -91,7 +91,7 @@ class Inlet(eqx.Module):
 class ReferenceInlet(Inlet):
     """The whole loop is simulated; leaves of ``points`` are (ticks, \\*batch), one a control tick.
 
-    After its end the last point is held.
+    After its end the last point stays.
     """
 
     points: ReferencePoint

@@ -23,14 +23,14 @@ def saturate(value: Scalar, lower: Scalar | float, upper: Scalar | float) -> Sca
     return jnp.where(value < lower, lower, jnp.where(value > upper, upper, value))
 
 
-def smaller(one: Scalar, other: Scalar) -> Scalar:
+def smaller(first: Scalar, second: Scalar) -> Scalar:
     """Return the smaller of two; where they are equal the derivative is the second's."""
-    return jnp.where(one < other, one, other)
+    return jnp.where(first < second, first, second)
 
 
-def larger(one: Scalar, other: Scalar) -> Scalar:
+def larger(first: Scalar, second: Scalar) -> Scalar:
     """Return the larger of two; where they are equal the derivative is the second's."""
-    return jnp.where(one > other, one, other)
+    return jnp.where(first > second, first, second)
 
 
 def magnitude(value: Scalar) -> Scalar:
@@ -52,7 +52,7 @@ def safe_divide(numerator: Scalar, denominator: Scalar) -> Scalar:
 
 @jax.custom_batching.custom_vmap
 def anyone(flags: Flag) -> Bool[Array, ""]:
-    """Tell whether any vehicle is flagged, those of an outer `jax.vmap` included.
+    """Return whether any vehicle is flagged, those of an outer `jax.vmap` included.
 
     One truth value for all, so that a `lax.cond` on it remains a branch under `jax.vmap`.
     """

@@ -28,7 +28,7 @@ class Schedule(eqx.Module):
     """Second order with the rotors' mean speed over the step; first order as Gazebo's engine; or
     fourth order. The last two hold the rotor speed of before the step, as Gazebo does."""
     pose_rate: float | None = eqx.field(static=True, default=None)
-    """Hz at which poses reach the controller, held in between; None: every tick."""
+    """Hz at which poses reach the controller, which keeps the last in between; None: every tick."""
     longest_estimate_latency: float = eqx.field(static=True, default=0.0)
     """s that the estimate's delay line holds; 0 leaves it out."""
     longest_actuator_latency: float = eqx.field(static=True, default=0.0)
@@ -71,14 +71,14 @@ class Schedule(eqx.Module):
         return lax.div(step * self.position_control_rate, steps)
 
     def control_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
-        """Tell whether the position controller runs at a physics step."""
+        """Return whether the position controller runs at a physics step."""
         return _begins(step, self.position_control_rate, self.physics_rate)
 
     def rate_due(self, step: Int[Array, ""]) -> Bool[Array, ""]:
-        """Tell whether the rate controller runs at a physics step."""
+        """Return whether the rate controller runs at a physics step."""
         return _begins(step, self.rate_control_rate, self.physics_rate)
 
 
 def _begins(step: Int[Array, ""], rate: int, of: int) -> Bool[Array, ""]:
-    """Tell whether ⌊step·rate/of⌋ is greater than it was at the last step."""
+    """Return whether ⌊step·rate/of⌋ is greater than it was at the last step."""
     return lax.rem(step * rate, jnp.asarray(of, step.dtype)) < rate

@@ -94,7 +94,7 @@ def _quantised(command: Scalar) -> Scalar:
 
 
 def _outside(middle: Scalar, reach: Scalar) -> Flag:
-    """Tell whether outputs this far either side of a middle leave 0..1."""
+    """Return whether outputs this far either side of a middle leave 0..1."""
     return (middle < reach) | (middle + reach > 1.0)
 
 
