@@ -96,9 +96,14 @@ class ReferenceInlet(Inlet):
 
     points: ReferencePoint
     spins: Bool[Array, "*batch"] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
-    """Where true, the rate set-point is (0, 0, yaw_rate) and only thrust is position-controlled."""
+    """Where true, the rate set-point is (0, 0, yaw_rate) and only thrust is position-controlled,
+    but for a vehicle that is held level."""
     yaw_rate: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
     """rad/s, body z."""
+    level_held: Bool[Array, "*batch"] | None = None
+    """Where true, a spin's roll and pitch rate set-points are those of position and attitude
+    control, which take the vehicle's own heading for the wanted one; None where no vehicle's are.
+    """
 
     @property
     def needs_mixer(self) -> bool:
@@ -109,7 +114,9 @@ class ReferenceInlet(Inlet):
 
     def batch_shape(self) -> tuple[int, ...]:
         series = (jnp.shape(leaf)[1:] for leaf in jax.tree.leaves(self.points))
-        return jnp.broadcast_shapes(*series, jnp.shape(self.spins), jnp.shape(self.yaw_rate))
+        modes = (self.spins, self.yaw_rate, self.level_held)
+        shapes = (jnp.shape(mode) for mode in modes if mode is not None)
+        return jnp.broadcast_shapes(*series, *shapes)
 
 
 class BodyRateInlet(Inlet):

@@ -84,16 +84,19 @@ class Plant(eqx.Module):
         point = row_of(reference.points, self.schedule.control_tick(step))
         position, velocity, estimate = self._estimate(state, step)
         gains = self.controller
-        heading = heading_of(gains.position, velocity)
+        heading, turns_freely = heading_of(gains.position, velocity), reference.spins
+        if reference.level_held is not None:
+            heading = where(reference.level_held, estimate.heading(), heading)
+            turns_freely = turns_freely & ~reference.level_held
         wanted = wanted_acceleration(gains.position, point, position, velocity, heading)
         goal = attitude_from_acceleration(wanted, heading)
         turn = attitude.rate_setpoint(gains.attitude, estimate, goal)
-        spins, still = reference.spins, jnp.zeros_like(turn.x)
+        still = jnp.zeros_like(turn.x)
         return Setpoints(
             rate=Vec3(
-                jnp.where(spins, still, turn.x),
-                jnp.where(spins, still, turn.y),
-                jnp.where(spins, reference.yaw_rate, turn.z),
+                jnp.where(turns_freely, still, turn.x),
+                jnp.where(turns_freely, still, turn.y),
+                jnp.where(reference.spins, reference.yaw_rate, turn.z),
             ),
             thrust=thrust_setpoint(gains.attitude, wanted, estimate),
         )

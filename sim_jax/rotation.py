@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
-from sim_jax.numeric import Scalar, saturate
+from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate
 from sim_jax.vector import Vec3
 
 
@@ -124,6 +124,17 @@ class Quaternion(eqx.Module):
             2.0 * (self.x * self.z + self.w * self.y),
             2.0 * (self.y * self.z - self.w * self.x),
             1.0 - 2.0 * (self.x * self.x + self.y * self.y),
+        )
+
+    def heading(self) -> Vec3:
+        """Return the body's x axis, seen from above: (cos ψ, sin ψ, 0) in world coordinates."""
+        east = 1.0 - 2.0 * (self.y * self.y + self.z * self.z)
+        north = 2.0 * (self.w * self.z + self.x * self.y)
+        length = safe_sqrt(east * east + north * north)
+        upright = length > 0
+        zero = jnp.zeros_like(length)
+        return Vec3(
+            jnp.where(upright, safe_divide(east, length), 1.0), safe_divide(north, length), zero
         )
 
     def roll_pitch_yaw(self) -> Vec3:

@@ -115,6 +115,31 @@ def test_a_yaw_spin_turns_at_the_asked_rate() -> None:
     assert float(jnp.max(jnp.abs(flown.motion.position.x))) < 1e-9
 
 
+def level_held_spin(points: ReferencePoint, level_held: Array | None) -> ReferenceInlet:
+    return ReferenceInlet(points, jnp.asarray(True), jnp.asarray(2.0), level_held)
+
+
+def test_a_spin_that_is_held_level_returns_to_its_place_whatever_it_has_turned() -> None:
+    craft, points = vehicle(), reference("hover", ticks=600)
+    start = at_first_point(craft, points)
+    moved = eqx.tree_at(lambda s: s.motion.position.x, start, start.motion.position.x + 0.3)
+    held = fly(craft, level_held_spin(points, jnp.asarray(True)), moved, Schedule(), 600).log
+    assert float(held.setpoints.rate.z[-1]) == 2.0
+    assert float(held.motion.body_rate.z[-1]) == pytest.approx(2.0, abs=0.02)
+    assert float(jnp.max(jnp.abs(held.setpoints.rate.y))) > 0.1
+    assert abs(float(held.motion.position.x[-1] - points.position.x[-1])) < 0.02
+    free = fly(craft, level_held_spin(points, None), moved, Schedule(), 600).log
+    assert float(free.motion.position.x[-1] - points.position.x[-1]) == pytest.approx(0.3, abs=1e-6)
+
+
+def test_where_no_spin_is_held_level_nothing_changes() -> None:
+    craft, points = vehicle(), reference("circle", ticks=100)
+    start = at_first_point(craft, points)
+    flown = fly(craft, ReferenceInlet(points), start, Schedule(), 100)
+    none = ReferenceInlet(points, level_held=jnp.asarray(False))
+    assert apart(flown.log.motion, fly(craft, none, start, Schedule(), 100).log.motion) == 0.0
+
+
 def member_of(flown: Rollout, member: int) -> Sample:
     return jax.tree.map(lambda leaf: leaf[:, member], flown.log)  # type: ignore[no-any-return]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from hypothesis import given
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from sim_jax.rotation import Matrix3, Quaternion
 from sim_jax.vector import Vec3
+from tests.sim_jax.derivatives import assert_derivatives
 
 component = st.floats(-1.0, 1.0, allow_subnormal=False)
 
@@ -79,15 +81,32 @@ def test_z_axis_is_the_third_column(a: Quaternion) -> None:
     assert apart(a.z_axis(), a.matrix().z_axis) < 1e-15
 
 
-@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
-def test_roll_pitch_yaw_come_back(roll: float, pitch: float, yaw: float) -> None:
+def of_angles(roll: float, pitch: float, yaw: float) -> Quaternion:
     def about(angle: float, axis: str) -> Quaternion:
         parts = dict.fromkeys("xyz", jnp.asarray(0.0)) | {axis: jnp.asarray(np.sin(angle / 2))}
         return Quaternion(jnp.asarray(np.cos(angle / 2)), **parts)
 
-    attitude = about(yaw, "z").product(about(pitch, "y")).product(about(roll, "x"))
+    return about(yaw, "z").product(about(pitch, "y")).product(about(roll, "x"))
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_roll_pitch_yaw_come_back(roll: float, pitch: float, yaw: float) -> None:
     wanted = Vec3.of(jnp.asarray([roll, pitch, yaw]))
-    assert apart(attitude.roll_pitch_yaw(), wanted) < 1e-12
+    assert apart(of_angles(roll, pitch, yaw).roll_pitch_yaw(), wanted) < 1e-12
+
+
+@given(st.floats(-1.5, 1.5), st.floats(-1.5, 1.5), st.floats(-3.1, 3.1))
+def test_the_heading_is_the_yaw_angle(roll: float, pitch: float, yaw: float) -> None:
+    attitude = of_angles(roll, pitch, yaw)
+    wanted = Vec3.of(jnp.asarray([np.cos(yaw), np.sin(yaw), 0.0]))
+    assert apart(attitude.heading(), wanted) < 1e-12
+
+
+def test_the_heading_has_derivatives_even_where_the_nose_points_up() -> None:
+    assert_derivatives(lambda q: Quaternion.of(q).heading(), jnp.asarray([0.9, 0.1, -0.2, 0.4]))
+    upright = jnp.sqrt(jnp.asarray([0.5, 0.0, 0.5, 0.0]))
+    slope = jax.jacfwd(lambda q: Quaternion.of(q).heading().stacked())(upright)
+    assert np.isfinite(slope).all()
 
 
 @given(rotations(), vectors())

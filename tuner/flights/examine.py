@@ -190,7 +190,7 @@ def _mission(content: Content, index: int) -> MissionReport:
     if rates is not None:
         turn_rates = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
         turning = float(np.nanmax(turn_rates)) if np.isfinite(turn_rates).any() else None
-    setpoints = content.series.get("rate_setpoint")
+    spin = yaw_spin(content.series.get("rate_setpoint"), mission.start, mission.end)
     known = np.isfinite(position).all(axis=1) & np.isfinite(attitude).all(axis=1)
     return MissionReport(
         start=mission.start,
@@ -201,9 +201,8 @@ def _mission(content: Content, index: int) -> MissionReport:
         top_speed=_of(np.nanmax, speed),
         largest_tilt=float(np.degrees(np.arccos(np.clip(_of(np.nanmin, up), -1, 1)))),
         top_turn_rate=turning,
-        yaw_rate_setpoint=(
-            yaw_spin(setpoints, mission.start, mission.end) if setpoints is not None else None
-        ),
+        yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
+        level_held=spin is not None and spin.level_held,
         height=(_of(np.nanmin, position[:, 2]), _of(np.nanmax, position[:, 2])),
         known=float(known.mean()),
     )

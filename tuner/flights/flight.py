@@ -129,6 +129,8 @@ class Flight:
         The vehicle at time 0.
     yaw_rate_setpoint
         rad/s of a yaw spin, recognised by its rate set-points; None for a position mission.
+    level_held
+        Whether roll, pitch and position were controlled during a yaw spin.
     trajectory
         Name and parameters of the trajectory from a side-car, where no reference was recorded.
     notes
@@ -146,6 +148,7 @@ class Flight:
     series: Mapping[str, Series]
     initial: InitialState
     yaw_rate_setpoint: float | None = None
+    level_held: bool = False
     trajectory: Mapping[str, object] | None = None
     notes: tuple[Note, ...] = ()
     damage: tuple[Damage, ...] = ()
@@ -154,6 +157,11 @@ class Flight:
     def duration(self) -> float:
         """Seconds from the start of the mission to the last sample of the uniform clock."""
         return float(self.time[-1])
+
+    @property
+    def spins_freely(self) -> bool:
+        """Whether it is a yaw spin in which nothing holds position, roll and pitch."""
+        return self.yaw_rate_setpoint is not None and not self.level_held
 
     def has(self, signal: str) -> bool:
         """Tell whether any sample of a signal was recorded."""

@@ -88,6 +88,7 @@ def _about(flight: Flight) -> dict[str, Any]:
             for field in dataclasses.fields(flight.initial)
         },
         "yaw_rate_setpoint": flight.yaw_rate_setpoint,
+        "level_held": flight.level_held,
         "trajectory": flight.trajectory,
         "notes": [dataclasses.asdict(note) for note in flight.notes],
         "damage": [dataclasses.asdict(damage) for damage in flight.damage],
@@ -109,6 +110,7 @@ def _flight(
             **{name: np.array(values) for name, values in about["initial"].items()}
         ),
         yaw_rate_setpoint=about["yaw_rate_setpoint"],
+        level_held=about["level_held"],
         trajectory=about["trajectory"],
         notes=tuple(Note(**note) for note in about["notes"]),
         damage=tuple(

@@ -100,6 +100,8 @@ class MissionReport:
         rad/s.
     yaw_rate_setpoint
         rad/s of a yaw spin.
+    level_held
+        Whether roll, pitch and position were controlled during a yaw spin.
     height
         m, lowest and highest.
     known
@@ -115,6 +117,7 @@ class MissionReport:
     largest_tilt: float
     top_turn_rate: float | None
     yaw_rate_setpoint: float | None
+    level_held: bool
     height: tuple[float, float]
     known: float
 

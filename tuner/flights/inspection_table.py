@@ -92,7 +92,9 @@ def _missions(inspection: Inspection) -> Table:
 
 def _remark(mission: MissionReport) -> str:
     spin = mission.yaw_rate_setpoint
-    return "" if spin is None else f"yaw spin at {spin:g} rad/s"
+    if spin is None:
+        return ""
+    return f"yaw spin at {spin:g} rad/s" + (", held level" if mission.level_held else "")
 
 
 def _clock_and_battery(inspection: Inspection) -> Text:

@@ -65,7 +65,7 @@ def make_flight(
         notes.append(Note("info", "", text, len(content.missions)))
     signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
     notes.extend(_gaps(signals, rate))
-    rates = mission_series.get("rate_setpoint")
+    spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
         path=str(path),
@@ -75,7 +75,8 @@ def make_flight(
         signals=signals,
         series=mission_series,
         initial=initial_state(around),
-        yaw_rate_setpoint=yaw_spin(rates, 0.0, float(clock[-1])) if rates is not None else None,
+        yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
+        level_held=spin is not None and spin.level_held,
         trajectory=sidecar.trajectory,
         notes=tuple(notes),
         damage=tuple(part.later(-start) for part in content.damage),

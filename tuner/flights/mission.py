@@ -188,13 +188,41 @@ def _stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
     ]
 
 
-def yaw_spin(rate_setpoint: Series, start: float, end: float) -> float | None:
-    """Return the yaw rate, rad/s, of a mission whose rate set-points are one constant yaw rate."""
+@dataclass(frozen=True)
+class YawSpin:
+    """A mission whose yaw rate set-point is constant.
+
+    Attributes
+    ----------
+    yaw_rate
+        rad/s, body z.
+    level_held
+        Whether attitude control sets the roll and pitch rates, so that position and attitude are
+        held; else both set-points are zero, and only thrust is controlled.
+    """
+
+    yaw_rate: float
+    level_held: bool
+
+
+def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin | None:
+    """Return how a mission spins, by its rate set-points; None for one that does not."""
+    if rate_setpoint is None:
+        return None
     during = (rate_setpoint.time >= start - 1e-3) & (rate_setpoint.time <= end)
     if during.sum() < 10:
         return None
     rates = rate_setpoint.values[during]
     yaw = float(np.median(rates[:, 2]))
-    level = (np.abs(rates[:, :2]) < 1e-6).all(axis=1)
     constant = np.abs(rates[:, 2] - yaw) < 1e-3 * abs(yaw)
-    return yaw if abs(yaw) > 0.05 and float((level & constant).mean()) > 0.95 else None
+    if abs(yaw) < 0.05 or not _nearly_always(constant):
+        return None
+    if _nearly_always(constant & (np.abs(rates[:, :2]) < 1e-6).all(axis=1)):
+        return YawSpin(yaw, level_held=False)
+    # what a controller corrects changes from one set-point to the next
+    corrected = np.ptp(rates[constant, :2], axis=0) > 1e-6
+    return YawSpin(yaw, level_held=True) if corrected.all() else None
+
+
+def _nearly_always(flags: NDArray[np.bool_]) -> bool:
+    return float(flags.mean()) > 0.95

@@ -21,8 +21,8 @@ from tuner.objective.segments import Segments, segments_of, window_segments
 from tuner.objective.start import begins_gently
 from tuner.recordings import Recording, read_recordings
 
-#: What a yaw spin is compared by: nothing holds its position, so that a gust or a tilt of a
-#: hundredth of a degree moves it by metres without meaning anything.
+#: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust
+#: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
 SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
 
 CLIPPED = 0.005
@@ -174,13 +174,13 @@ def _shifted(flight: Flight, late: float) -> Flight:
 def _weights(
     settings: Settings, flights: Sequence[Flight], *, whole: bool
 ) -> dict[str, dict[str, float]]:
-    """Return flight -> channel -> factor; a whole yaw spin's position means nothing."""
+    """Return flight -> channel -> factor; a whole free yaw spin's position means nothing."""
     weights: dict[str, dict[str, float]] = {}
     for flight in flights:
         flight_settings = settings.job.flights.get(flight.name)
         factor = 1.0 if flight_settings is None else flight_settings.weight
         of_channel = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
-        if whole and flight.yaw_rate_setpoint is not None:
+        if whole and flight.spins_freely:
             of_channel |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
         weights[flight.name] = of_channel
     return weights

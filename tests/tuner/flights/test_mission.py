@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.flights.flight import Series
-from tuner.flights.mission import airborne, find_missions, yaw_spin
+from tuner.flights.mission import YawSpin, airborne, find_missions, yaw_spin
 
 TIME = np.arange(0, 40, 0.01)
 
@@ -89,12 +89,16 @@ def test_what_never_flies_has_no_mission() -> None:
 @pytest.mark.parametrize(
     ("rates", "expected"),
     [
-        (np.tile([0.0, 0.0, -2.5], (len(TIME), 1)), -2.5),
+        (np.tile([0.0, 0.0, -2.5], (len(TIME), 1)), YawSpin(-2.5, level_held=False)),
+        (
+            np.column_stack([0.1 * np.sin(TIME), 0.1 * np.cos(TIME), 0 * TIME + 3]),
+            YawSpin(3.0, level_held=True),
+        ),
         (np.tile([0.0, 0.0, 0.0], (len(TIME), 1)), None),
         (np.tile([0.01, 0.0, 2.5], (len(TIME), 1)), None),
         (np.column_stack([0 * TIME, 0 * TIME, np.sin(TIME)]), None),
     ],
-    ids=["spin", "hover", "tilted", "wobble"],
+    ids=["spin", "held level", "hover", "tilted", "wobble"],
 )
-def test_yaw_spin(rates: np.ndarray, expected: float | None) -> None:
+def test_yaw_spin(rates: np.ndarray, expected: YawSpin | None) -> None:
     assert yaw_spin(series(rates), 0.0, 40.0) == expected
