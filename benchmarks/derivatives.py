@@ -15,9 +15,9 @@ STEPS = FLIGHTS * SAMPLES * 10
 def measure() -> Section:
     """Run all three in turn."""
     module = "benchmarks.contestants.derivatives"
-    found = {
-        one.name: one
-        for one in compete(
+    measured = {
+        contestant.name: contestant
+        for contestant in compete(
             [
                 Contestant(what, (sys.executable, "-m", module, what), {})
                 for what in (FORWARD, JACOBIAN, GRADIENT)
@@ -25,8 +25,11 @@ def measure() -> Section:
             ROUNDS,
         )
     }
-    times = {name: _time(one.rate) for name, one in found.items()}
-    memory = {name: [float(word) for word in one.remark.split()] for name, one in found.items()}
+    times = {name: _time(contestant.rate) for name, contestant in measured.items()}
+    memory = {
+        name: [float(word) for word in contestant.remark.split()]
+        for name, contestant in measured.items()
+    }
     base = times[FORWARD].median
     rows = [
         [
@@ -36,7 +39,7 @@ def measure() -> Section:
             figure(memory[name][0] / 1e6),
             figure(memory[name][1] / 1e6),
         ]
-        for name in found
+        for name in measured
     ]
     temporary, output = memory[JACOBIAN]
     return Section(

@@ -78,9 +78,9 @@ def _fit(flights: Sequence[Path], folder: Path, name: str) -> tuple[float, float
 
 
 def _copies(folder: Path, times: int) -> list[Path]:
-    made = []
+    copies = []
     for number in range(times):
         for flight in FLIGHTS:
-            made.append(folder / f"{flight.stem}_{number}.bag")
-            shutil.copyfile(flight, made[-1])
-    return made
+            copies.append(folder / f"{flight.stem}_{number}.bag")
+            shutil.copyfile(flight, copies[-1])
+    return copies

@@ -29,11 +29,11 @@ CIRCLE = Path(__file__).parents[1] / "reference_flights" / "circle_3mps.bag"
 def lengthen(target: Path, repeat: int) -> Path:
     """Write the circle several times in a row into one bag."""
     with Reader(CIRCLE) as reader, Writer(target) as writer:
-        own = {
+        connections = {
             c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
             for c in reader.connections
         }
-        messages = [(own[c.id], when, bytes(raw)) for c, when, raw in reader.messages()]
+        messages = [(connections[c.id], when, bytes(raw)) for c, when, raw in reader.messages()]
         for again in range(repeat):
             for connection, when, raw in messages:
                 writer.write(connection, when + again * 41_000_000_000, raw)
@@ -49,12 +49,14 @@ def to_ros2(bag: Path, folder: Path, storage: StoragePlugin) -> Path:
             types.update(get_types_from_msg(connection.msgdef.data, connection.msgtype))
         header = get_typestore(Stores.ROS2_HUMBLE).fielddefs["std_msgs/msg/Header"]
         store.register({**types, "std_msgs/msg/Header": header})
-        own = {
+        connections = {
             c.id: writer.add_connection(c.topic, c.msgtype, typestore=store)
             for c in reader.connections
         }
         for connection, when, raw in reader.messages():
-            writer.write(own[connection.id], when, store.ros1_to_cdr(raw, connection.msgtype))
+            writer.write(
+                connections[connection.id], when, store.ros1_to_cdr(raw, connection.msgtype)
+            )
     return folder
 
 

@@ -23,9 +23,9 @@ def measure() -> Section:
 
     devices = len(jax.devices())
 
-    def timed(function: object, vehicles: int, lanes: int) -> float:
+    def timed(function: object, vehicles: int, piece: int) -> float:
         factor = factors(vehicles)
-        run = jax.jit(shared_among(in_pieces(function, lanes), devices)).lower(factor).compile()
+        run = jax.jit(shared_among(in_pieces(function, piece), devices)).lower(factor).compile()
         jax.block_until_ready(run(factor))
         times = []
         for _ in range(REPEATS):

@@ -40,23 +40,23 @@ def contestants(vehicles: int, yardstick: Path | None) -> list[Contestant]:
     cores, batch = str(runtime.cores()), str(vehicles)
     peers = os.environ.get("TUNE_PEERS", sys.executable)
     module = "benchmarks.contestants."
-    found = [
+    all_contestants = [
         Contestant(f"tune, {p}", (sys.executable, "-m", module + "ours", p, batch), {})
         for p in ("float32", "float64")
     ]
     if yardstick is not None:
-        found += [
+        all_contestants += [
             Contestant(
                 f"C++, {p}", (str(yardstick), p, batch, cores), {"OMP_WAIT_POLICY": "passive"}
             )
             for p in ("float32", "float64")
         ]
-    found += [
+    all_contestants += [
         Contestant("drone-models", (peers, "-m", module + "drone_models", batch), ONE_THREAD),
         Contestant("crazyflow", (peers, "-m", module + "crazyflow", batch), ONE_THREAD),
         Contestant("MuJoCo C", (peers, "-m", module + "mujoco", batch, cores), {}),
     ]
-    return found
+    return all_contestants
 
 
 def measure() -> Section:
@@ -64,11 +64,11 @@ def measure() -> Section:
     with tempfile.TemporaryDirectory() as folder:
         yardstick = _yardstick(Path(folder))
         results = {batch: compete(contestants(batch, yardstick), ROUNDS) for batch in BATCHES}
-    names = [one.name for one in results[BATCHES[0]]]
+    names = [result.name for result in results[BATCHES[0]]]
     rates = {
-        (batch, one.name): None if one.rate is None else one.rate.median
+        (batch, result.name): None if result.rate is None else result.rate.median
         for batch, measured in results.items()
-        for one in measured
+        for result in measured
     }
     rows = [
         [name, *(millions(results[batch][i].rate) for batch in BATCHES), _remark(results[4096][i])]
@@ -126,7 +126,7 @@ def measure() -> Section:
         "Millions of vehicle-steps a second, median and quartiles of "
         f"{ROUNDS} runs in turn. For tune and the yardstick a step is one of 1 kHz physics with "
         "rate control at 250 Hz, position control and a log of 13 states at 100 Hz; those of peers "
-        "hold less, as said. The jax peers run with NPROC=1, MuJoCo and the yardstick with a "
+        "hold less, as listed. The jax peers run with NPROC=1, MuJoCo and the yardstick with a "
         "thread a core, tune with a device a core; results stay where they were computed.",
         ["", *(f"batch {batch}" for batch in BATCHES), "settings"],
         rows,

@@ -116,13 +116,13 @@ def compete(contestants: Sequence[Contestant], rounds: int) -> list[Measured]:
             if started[-1].wait_until_ready():
                 ready.append(started[-1])
         for _ in range(rounds):
-            for one in ready:
-                one.run()
-        return [one.measured() for one in started]
+            for contestant in ready:
+                contestant.run()
+        return [contestant.measured() for contestant in started]
     finally:
-        for one in started:
-            one.process.terminate()
-            one.process.communicate()
+        for contestant in started:
+            contestant.process.terminate()
+            contestant.process.communicate()
 
 
 def answer(run: Callable[[], object], amount: float, remark: str = "") -> None:

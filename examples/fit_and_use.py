@@ -29,9 +29,11 @@ print(f"closest so far: {table.best}")
 
 # %% Fit: one circle and one yaw spin, the faster circle held out.
 run = tuner.fit(flights, holdout=["circle_4mps"], out=OUT / "run")
-for name, found in run.result.coefficients.items():
-    if found.fitted:
-        print(f"{name:26} {found.initial:10.4g} -> {found.best:10.4g} {found.unit}")
+for name, coefficient in run.result.coefficients.items():
+    if coefficient.fitted:
+        print(
+            f"{name:26} {coefficient.initial:10.4g} -> {coefficient.best:10.4g} {coefficient.unit}"
+        )
 
 # %% The held-out circle, before and after.
 held_out = next(flight for flight in run.result.flights if flight.split == "holdout")

@@ -55,7 +55,7 @@ CCW, CW = [0, 1], [2, 3]
 
 @dataclass(frozen=True)
 class Flown:
-    """What is said about one flight; rows are 10 ms apart."""
+    """What is reported about one flight; rows are 10 ms apart."""
 
     position: NDArray[np.float64]
     error: NDArray[np.float64]
@@ -92,7 +92,7 @@ def fly(
     scaler: float = 1.0,
     yaw_rate: float = 0.0,
 ) -> Flown:
-    """Fly once, and keep what is said about it."""
+    """Fly once, and return what is reported about it."""
     (flight,) = tuner.simulate(
         name,
         vehicle=vehicle,

@@ -41,8 +41,8 @@ def following(tree: T, causes: PyTree[Array]) -> T:
     """Return a pytree, its values untouched, that derivative rules take to depend on some causes.
 
     To find what in a loop's carry has a derivative, jax traces the loop's body until no more of it
-    joins in. Told from the start it traces once, which halves the time to trace a Jacobian. What
-    is added is zero whatever the causes hold, and gone once compiled.
+    joins in. With all of it there from the start it traces once, which halves the time to trace a
+    Jacobian. What is added is zero whatever the causes hold, and gone once compiled.
     """
     never = jnp.zeros((), bool)
     nothing = sum(

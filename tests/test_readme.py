@@ -1,4 +1,4 @@
-"""What the documents tell a user to type is what the program takes."""
+"""What a user types after the documents is what the program takes."""
 
 import ast
 import inspect
@@ -20,8 +20,8 @@ def commands():
     blocks = re.findall(r"```(?:\w*)\n(.*?)```", README, re.DOTALL)
     lines = [line for block in blocks for line in block.splitlines()]
     lines += (ROOT / "Makefile").read_text(encoding="utf-8").replace("$(BIN)/", "").splitlines()
-    found = [line.strip() for line in lines if re.match(r"\s*(\$ )?tune\b", line)]
-    return [line.removeprefix("$ ") for line in found]
+    commands = [line.strip() for line in lines if re.match(r"\s*(\$ )?tune\b", line)]
+    return [line.removeprefix("$ ") for line in commands]
 
 
 def test_the_documents_show_commands():

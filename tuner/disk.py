@@ -104,7 +104,7 @@ def _check_writable(folder: Path) -> None:
 
 
 def _stands(path: Path) -> bool:
-    """Tell whether something has this path; a refusal to look is raised as it is."""
+    """Return whether something has this path; a refusal to look is raised as it is."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a null byte
@@ -138,7 +138,7 @@ def _refusals(path: Path) -> Iterator[None]:
 
 
 def exists(path: Path) -> bool:
-    """Tell whether there is a file or folder of this path.
+    """Return whether there is a file or folder of this path.
 
     Raises
     ------

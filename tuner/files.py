@@ -102,9 +102,13 @@ def read_json(kind: type[P], path: Path, *, version: int, remedy: str) -> P:
         content = from_json(raw)
     except ValueError as error:
         raise InputError(path, f"is not JSON ({error})", remedy) from None
-    found = content.get("schema_version") if isinstance(content, dict) else None
-    if found != version:
-        what = "has no schema version" if found is None else f"has schema version {found}"
+    file_version = content.get("schema_version") if isinstance(content, dict) else None
+    if file_version != version:
+        what = (
+            "has no schema version"
+            if file_version is None
+            else f"has schema version {file_version}"
+        )
         raise InputError(path, f"{what}, and this tune reads version {version}", remedy)
     try:
         return kind.model_validate(content)

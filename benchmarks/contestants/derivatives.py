@@ -60,12 +60,12 @@ def gradient(factor: Array) -> Array:
 
 
 def main(what: str) -> None:
-    lanes = piece_that_fits(8)
+    piece = piece_that_fits(8)
     function = {
-        FORWARD: in_pieces(flight, lanes),
+        FORWARD: in_pieces(flight, piece),
         JACOBIAN: large_jacobian,
         # a quarter of what fits the cache going forward: reverse mode remembers more
-        GRADIENT: in_pieces(gradient, lanes // 4),
+        GRADIENT: in_pieces(gradient, piece // 4),
     }[what]
     factor = factors(FLIGHTS)
     run = jax.jit(shared_among(function, len(jax.devices()))).lower(factor).compile()

@@ -28,8 +28,8 @@ def main(precision: str, vehicles: int) -> None:
         alone, factor = jax.jit(flight), factors(1)[:, 0]
         answer(lambda: jax.block_until_ready(alone(factor)), samples * STEPS, runtime.describe())
         return
-    lanes = piece_that_fits(np.dtype(precision).itemsize)
-    batch = jax.jit(shared_among(in_pieces(flight, lanes), len(jax.devices())))
+    piece = piece_that_fits(np.dtype(precision).itemsize)
+    batch = jax.jit(shared_among(in_pieces(flight, piece), len(jax.devices())))
     factor = np.asarray(factors(vehicles))
     answer(
         lambda: jax.block_until_ready(batch(factor)), vehicles * samples * STEPS, runtime.describe()

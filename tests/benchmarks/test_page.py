@@ -22,11 +22,11 @@ def test_contestants_run_in_turn_and_rates_are_per_second():
         Contestant("one", (sys.executable, "-c", ANSWERS), {}),
         Contestant("absent", (sys.executable, "-c", "import no_such_peer"), {}),
     ]
-    one, absent = compete(given, rounds=3)
-    assert one.rate is not None
-    assert one.rate.median == pytest.approx(1000 / 0.5)
-    assert one.rate.low < one.rate.median < one.rate.high
-    assert one.remark == "two threads"
+    present, absent = compete(given, rounds=3)
+    assert present.rate is not None
+    assert present.rate.median == pytest.approx(1000 / 0.5)
+    assert present.rate.low < present.rate.median < present.rate.high
+    assert present.remark == "two threads"
     assert absent.rate is None
     assert "no_such_peer" in absent.remark
 

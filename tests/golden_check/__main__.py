@@ -34,11 +34,11 @@ def main(arguments: list[str]) -> int:
             failed += 1
             print(f"{name:32} no check is known for this file                                 NO")
             continue
-        for one in check(read(path)):
-            failed += not one.passed
+        for deviation in check(read(path)):
+            failed += not deviation.passed
             print(
-                f"{name:32} {one.quantity:34} {one.rows:6d} {one.worst:9.1e}"
-                f" {one.tolerance:9.1e}  {'yes' if one.passed else 'NO'}",
+                f"{name:32} {deviation.quantity:34} {deviation.rows:6d} {deviation.worst:9.1e}"
+                f" {deviation.tolerance:9.1e}  {'yes' if deviation.passed else 'NO'}",
                 flush=True,
             )
     print("everything within tolerance" if not failed else f"{failed} out of tolerance")

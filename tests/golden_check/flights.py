@@ -101,5 +101,5 @@ def _inlet(mission: Mission, sent: Publication) -> ReferenceInlet:
     return ReferenceInlet(sent.points, jnp.asarray(True), jnp.asarray(mission.yaw_rate))
 
 
-def _angle(one: Quaternion, other: Quaternion) -> jax.Array:
-    return one.rotation_vector_to(other).norm()
+def _angle(a: Quaternion, b: Quaternion) -> jax.Array:
+    return a.rotation_vector_to(b).norm()

@@ -15,15 +15,15 @@ SINGLE = 1e-6
 
 
 def quaternion_operations(table: Table) -> list[Deviation]:
-    one, other = table.quaternion("q"), table.quaternion("p")
+    q, p = table.quaternion("q"), table.quaternion("p")
     rows = [Vec3(*(table.column(f"R{row}{column}") for column in range(3))) for row in range(3)]
     columns = [Vec3(*(getattr(row, axis) for row in rows)) for axis in "xyz"]
     # Ours is made for unit quaternions; the original's grows with the squared norm of others.
-    square = one.w**2 + one.x**2 + one.y**2 + one.z**2
-    matrix = one.normalized().matrix()
+    square = q.w**2 + q.x**2 + q.y**2 + q.z**2
+    matrix = q.normalized().matrix()
     scaled = [axis * square for axis in (matrix.x_axis, matrix.y_axis, matrix.z_axis)]
     return [
-        deviation("product", one.product(other), table.quaternion("qp"), EXACT),
+        deviation("product", q.product(p), table.quaternion("qp"), EXACT),
         deviation("matrix", scaled, columns, EXACT),
     ]
 
@@ -36,10 +36,10 @@ def attitude_of_acceleration(table: Table) -> list[Deviation]:
     return [deviation("attitude", _signed_as(wanted, got), wanted, EXACT)]
 
 
-def _signed_as(one: Quaternion, other: Quaternion) -> Quaternion:
+def _signed_as(wanted: Quaternion, got: Quaternion) -> Quaternion:
     """Return a rotation with the sign, which means nothing, that another has."""
-    along = one.w * other.w + one.x * other.x + one.y * other.y + one.z * other.z
-    return Quaternion.of(other.stacked() * jnp.where(along < 0, -1.0, 1.0))
+    along = wanted.w * got.w + wanted.x * got.x + wanted.y * got.y + wanted.z * got.z
+    return Quaternion.of(got.stacked() * jnp.where(along < 0, -1.0, 1.0))
 
 
 def attitude_laws(table: Table) -> list[Deviation]:

@@ -85,28 +85,33 @@ def deviation(
     """
     worst, rows = 0.0, 0
     for ours, theirs in zip(_leaves(got), _leaves(wanted), strict=True):
-        one, other = np.broadcast_arrays(np.asarray(ours, float), np.asarray(theirs, float))
-        apart = np.abs(one - other)
+        got_leaf, wanted_leaf = np.broadcast_arrays(
+            np.asarray(ours, float), np.asarray(theirs, float)
+        )
+        apart = np.abs(got_leaf - wanted_leaf)
         if of_largest:
-            apart = apart / np.nanmax(np.abs(other))
+            apart = apart / np.nanmax(np.abs(wanted_leaf))
         elif not absolute:
-            apart = apart / np.maximum(np.abs(other), 1.0)
-        apart = np.where(np.isnan(other), np.where(np.isfinite(one), 0.0, np.inf), apart)
+            apart = apart / np.maximum(np.abs(wanted_leaf), 1.0)
+        apart = np.where(np.isnan(wanted_leaf), np.where(np.isfinite(got_leaf), 0.0, np.inf), apart)
         apart = np.where(np.isnan(apart), np.inf, apart)
-        worst, rows = max(worst, float(apart.max(initial=0.0))), max(rows, one.shape[0])
+        worst, rows = max(worst, float(apart.max(initial=0.0))), max(rows, got_leaf.shape[0])
     return Deviation(quantity, rows, worst, tolerance)
 
 
 def merged(parts: list[list[Deviation]]) -> list[Deviation]:
     """Put the deviations of several parts of one file together, quantity by quantity."""
     together: dict[str, Deviation] = {}
-    for one in (one for part in parts for one in part):
-        old = together.get(one.quantity)
-        together[one.quantity] = (
-            one
+    for row in (row for part in parts for row in part):
+        old = together.get(row.quantity)
+        together[row.quantity] = (
+            row
             if old is None
             else Deviation(
-                one.quantity, old.rows + one.rows, max(old.worst, one.worst), one.tolerance
+                row.quantity,
+                old.rows + row.rows,
+                max(old.worst, row.worst),
+                row.tolerance,
             )
         )
     return list(together.values())

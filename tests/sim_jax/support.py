@@ -85,10 +85,10 @@ def open_loop(craft: Vehicle, inlet: ActuatorInlet, start: Start, **schedule: ob
     )
 
 
-def apart(one: object, other: object) -> float:
+def apart(a: object, b: object) -> float:
     """Return the largest difference between two pytrees of numbers."""
-    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
-    return max(float(np.max(np.abs(np.asarray(a) - np.asarray(b)))) for a, b in pairs)
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return max(float(np.max(np.abs(np.asarray(x) - np.asarray(y)))) for x, y in pairs)
 
 
 def finite(tree: object) -> bool:

@@ -141,9 +141,9 @@ def test_leaving_desaturation_out_changes_nothing(airmode: int) -> None:
     together, tangent = both(torque, thrust)
     inside = 0
     for i in range(0, 500, 10):
-        alone, own = both(torque[:, i], thrust[i])
+        alone, alone_tangent = both(torque[:, i], thrust[i])
         np.testing.assert_allclose(alone, together[:, i], atol=1e-15)
-        np.testing.assert_allclose(own, tangent[:, i], atol=1e-15)
+        np.testing.assert_allclose(alone_tangent, tangent[:, i], atol=1e-15)
         inside += bool(jnp.all((alone > 0) & (alone < 1)))
     assert 2 < inside < 48
     mapped = jax.jit(jax.vmap(mix, in_axes=(1, 0), out_axes=1))(torque, thrust)

@@ -23,7 +23,7 @@ def test_block_agrees_with_the_original(name: str) -> None:
     assert check is not None
     outcome = check(read(FILES[name]))
     assert outcome
-    assert not [one for one in outcome if not one.passed]
+    assert not [row for row in outcome if not row.passed]
 
 
 def test_every_golden_file_has_a_fixture() -> None:
@@ -36,7 +36,7 @@ def test_a_wrong_number_is_noticed(column: str) -> None:
     frame.loc[3, column] += 1e-9
     check = check_of("geo_attcontrollers")
     assert check is not None
-    assert any(not one.passed for one in check(Table(frame)))
+    assert any(not row.passed for row in check(Table(frame)))
 
 
 def test_a_wrong_saturation_flag_is_noticed() -> None:
@@ -44,7 +44,7 @@ def test_a_wrong_saturation_flag_is_noticed() -> None:
     frame.loc[0, "roll_pos"] = 1 - frame.loc[0, "roll_pos"]
     check = check_of("px4_mixer_quad_x")
     assert check is not None
-    assert any(not one.passed for one in check(Table(frame)))
+    assert any(not row.passed for row in check(Table(frame)))
 
 
 def test_not_a_number_never_passes() -> None:

@@ -27,10 +27,10 @@ def nothing(motion: Motion) -> Wrench:
 
 
 def fly(advance: Step, count: int, duration: float = 1.0, wrench: Callable = nothing) -> Motion:
-    def one(motion: Motion, _: None) -> tuple[Motion, None]:
+    def step(motion: Motion, _: None) -> tuple[Motion, None]:
         return advance(BODY, motion, wrench, duration / count), None
 
-    motion: Motion = jax.lax.scan(one, TUMBLING, length=count)[0]
+    motion: Motion = jax.lax.scan(step, TUMBLING, length=count)[0]
     return motion
 
 
@@ -85,10 +85,10 @@ def test_attitude_follows_a_constant_rate() -> None:
     """Spin about a principal axis: an exact answer."""
     spinning = Motion(vec(0, 0, 0), vec(0, 0, 0), quaternion(1, 0, 0, 0), vec(0.0, 0.0, 3.0))
 
-    def one(motion: Motion, _: None) -> tuple[Motion, None]:
+    def step(motion: Motion, _: None) -> tuple[Motion, None]:
         return step_midpoint(BODY, motion, nothing, 1e-3), None
 
-    after: Motion = jax.lax.scan(one, spinning, length=1000)[0]
+    after: Motion = jax.lax.scan(step, spinning, length=1000)[0]
     yaw = after.attitude.roll_pitch_yaw().z
     assert float(yaw) == pytest.approx(3.0, abs=3e-6)
     assert float(after.body_rate.z) == 3.0
@@ -105,10 +105,10 @@ def test_order_of_each_step_under_a_moment(advance: Step, order: int) -> None:
         return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
 
     def at(step: Step, count: int) -> Motion:
-        def one(motion: Motion, _: None) -> tuple[Motion, None]:
+        def step(motion: Motion, _: None) -> tuple[Motion, None]:
             return step(BODY, motion, push, 1.0 / count), None
 
-        motion: Motion = jax.lax.scan(one, still, length=count)[0]
+        motion: Motion = jax.lax.scan(step, still, length=count)[0]
         return motion
 
     exact = at(step_rk4, 2000)

@@ -28,8 +28,8 @@ def vectors(draw: st.DrawFn) -> Vec3:
     return Vec3.of(jnp.asarray([10.0 * draw(component) for _ in range(3)]))
 
 
-def apart(one: Quaternion | Vec3, other: Quaternion | Vec3) -> float:
-    return float(jnp.abs(one.stacked() - other.stacked()).max())
+def apart(a: Quaternion | Vec3, b: Quaternion | Vec3) -> float:
+    return float(jnp.abs(a.stacked() - b.stacked()).max())
 
 
 @given(rotations(), rotations(), rotations())
@@ -42,9 +42,9 @@ def test_product_is_associative_and_keeps_the_norm(
 
 @given(rotations())
 def test_identity_and_inverse(a: Quaternion) -> None:
-    one = Quaternion.identity(a.w)
-    assert apart(a.product(one), a) == 0.0
-    assert apart(a.product(a.conjugate()), one) < 1e-15
+    identity = Quaternion.identity(a.w)
+    assert apart(a.product(identity), a) == 0.0
+    assert apart(a.product(a.conjugate()), identity) < 1e-15
 
 
 @given(rotations(), rotations(), vectors())

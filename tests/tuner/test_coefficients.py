@@ -112,10 +112,10 @@ def test_the_search_for_the_gyro_cutoff_starts_at_the_one_that_flies(vehicle):
     (parameter,) = space_of(vehicle, slower, job).parameters
     assert parameter.initial == 30.0
     assert initial_values(vehicle, slower)["gyro_cutoff"] == 30.0
-    own = with_values(vehicle, {"gyro_cutoff": 25.0})
-    (parameter,) = space_of(own, slower, job).parameters
+    quicker = with_values(vehicle, {"gyro_cutoff": 25.0})
+    (parameter,) = space_of(quicker, slower, job).parameters
     assert parameter.initial == 25.0
-    assert float(model_of(own, slower).controller.filters.gyro_cutoff) == 25.0
+    assert float(model_of(quicker, slower).controller.filters.gyro_cutoff) == 25.0
 
 
 def test_a_filter_that_is_left_out_cannot_be_fitted(vehicle):

@@ -11,9 +11,9 @@ from tuner.padding import FINE, padded_size
 
 @given(st.integers(1, 10**7), st.sampled_from([4, FINE]))
 def test_room_suffices_and_is_little_more(count: int, steps: int) -> None:
-    room = padded_size(count, steps)
-    assert count <= room < count * (1 + 1 / steps) + 1
-    assert padded_size(room, steps) == room
+    size = padded_size(count, steps)
+    assert count <= size < count * (1 + 1 / steps) + 1
+    assert padded_size(size, steps) == size
 
 
 @pytest.mark.parametrize("steps", [4, FINE])

@@ -48,11 +48,11 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     screen.print(f"written to {path}", markup=False)
 
 
-def print_inspections(found: Sequence[Inspection]) -> None:
+def print_inspections(inspections: Sequence[Inspection]) -> None:
     """Print what recordings hold."""
     from tuner.flights.inspection_table import render
 
-    console().print(render(found))
+    console().print(render(inspections))
 
 
 def print_export(done: Exported) -> None:

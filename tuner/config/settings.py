@@ -246,7 +246,7 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
 
 
 def _is_among(name: str, recordings: Collection[str]) -> bool:
-    """Tell whether a flight is of one of some recordings: the only mission, or its ``NAME-2``."""
+    """Return whether a flight is of one of these recordings: the only mission, or ``NAME-2``."""
     return name in recordings or re.sub(r"-\d+$", "", name) in recordings
 
 

@@ -164,5 +164,5 @@ class Flight:
         return self.yaw_rate_setpoint is not None and not self.level_held
 
     def has(self, signal: str) -> bool:
-        """Tell whether any sample of a signal was recorded."""
+        """Return whether any sample of a signal was recorded."""
         return signal in self.signals and bool(np.isfinite(self.signals[signal]).any())

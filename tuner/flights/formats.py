@@ -40,7 +40,7 @@ class Reader:
     files
         Its files, as the message that refuses an unknown format lists them.
     matches
-        Tells whether a recording is of this format.
+        Says whether a recording is of this format.
     open
         Opens a recording, given ``.msg`` files for types that it does not define. It imports what
         the format needs: together the formats' libraries take half a second.
@@ -74,7 +74,7 @@ def _open_ulog(path: Path, _: tuple[Path, ...]) -> Recording:
 
 
 def _is_table(head: Head) -> bool:
-    """Tell whether a file is Parquet, or text with a separator in its first line."""
+    """Return whether a file is Parquet, or text with a separator in its first line."""
     line, _, _ = head.start.partition(b"\n")
     printable = all(byte >= 32 or byte in b"\r\n\t" for byte in head.start)
     text = printable and any(separator in line for separator in b",;\t")
@@ -96,7 +96,7 @@ READERS: tuple[Reader, ...] = (
 
 
 def is_tabular(name: object) -> bool:
-    """Tell whether recordings of a format are tables; an unknown format's are not."""
+    """Return whether recordings of a format are tables; an unknown format's are not."""
     return any(reader.format == name and reader.tabular for reader in READERS)
 
 

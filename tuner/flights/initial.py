@@ -47,7 +47,7 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
 
 
 def in_hover(series: Mapping[str, Series]) -> bool:
-    """Tell whether the vehicle hovers through the last second before time 0."""
+    """Return whether the vehicle hovers through the last second before time 0."""
     position = _window(series["position"], -HOVER, 0.0)
     if len(position.time) < 5 or position.time[0] > -0.8 * HOVER:
         return False

@@ -134,7 +134,7 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
 
 
 def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell at which times the motors idle, and at which times that was recorded."""
+    """Return at which times the motors idle, and at which times that was recorded."""
     for name, limit in (
         ("command", IDLE), ("rotor_speed", IDLE_SPEED), ("thrust_setpoint", IDLE),
     ):  # fmt: skip
@@ -151,7 +151,7 @@ def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_],
 
 
 def _resting(time: Array, height: Array) -> NDArray[np.bool_]:
-    """Tell when the vehicle lies on the ground from which, or to which, it flies."""
+    """Return when the vehicle lies on the ground from which, or to which, it flies."""
     resting = np.zeros(len(time), dtype=np.bool_)
     for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
         level = float(np.median(height[near]))

@@ -1,4 +1,4 @@
-"""Samples that cannot be true, told from fast motion by what surrounds them."""
+"""Samples that cannot be true, distinguished from fast motion by what surrounds them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ AWAY = 1.0
 
 
 def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
-    """Tell which samples of a signal stick out on one side of all that surrounds them.
+    """Return which samples of a signal stick out on one side of all that surrounds them.
 
     A sample is compared with the medians of the three samples before and the three after it. Ramps
     and steps lie between the two, so that fast motion and a motor's jump are kept; one or two
@@ -83,7 +83,7 @@ def _middle(a: Array, b: Array, c: Array) -> Array:
 
 
 def frozen(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
-    """Tell which samples of (n, k) values repeat the one before although the vehicle moved on.
+    """Return which samples of (n, k) values repeat the one before although the vehicle moved on.
 
     Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
     simulator repeats itself too, but does not leap when it starts to move.
@@ -103,7 +103,7 @@ def frozen(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
 
 
 def excursions(time: Array, values: Array, honest: Honest) -> tuple[NDArray[np.bool_], int]:
-    """Tell which samples of (n, k) values lie between a leap away and the leap back.
+    """Return which samples of (n, k) values lie between a leap away and the leap back.
 
     Returns
     -------

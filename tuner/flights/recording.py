@@ -56,7 +56,7 @@ class Request:
     fields
         Paths of numbers.
     clocks
-        Fields that may tell the time, the preferred one first; none means the usual header.
+        Fields that may hold the time, the preferred one first; none means the usual header.
     """
 
     fields: tuple[str, ...]
@@ -187,7 +187,7 @@ class TabularRecording:
         return tuple(name for name in fields if name not in self.columns)
 
     def clock(self, request: Request) -> Clock:
-        """Return the column that tells the time.
+        """Return the column that holds the time.
 
         Raises
         ------

@@ -40,7 +40,7 @@ def _longest_gap(time: Array) -> float:
 
 
 def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
-    """Tell for which instants samples lie on both sides, not too far apart."""
+    """Return for which instants samples lie on both sides, not too far apart."""
     after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
     before = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(time) - 1)
     inside = (clock >= time[0]) & (clock <= time[-1])

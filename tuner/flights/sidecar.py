@@ -9,7 +9,7 @@ from tuner.yaml_files.section import Number, Section, read_model
 
 
 class Sidecar(Section):
-    """What is said about a recording.
+    """What the file beside a recording states about it.
 
     Attributes
     ----------

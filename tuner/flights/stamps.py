@@ -28,7 +28,7 @@ def believe(
     Header stamps are when something was measured; the time of recording is later by a varying
     delay. So stamps are used, once single wrong ones and jumps of a clock that was set while it
     ran are repaired by the times of recording. A topic stamped by a clock that is not the others'
-    is moved onto theirs, as far as the times of recording tell.
+    is moved onto theirs, as far as the times of recording show.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def believe(
 
 
 def _unset(stamp: Nanoseconds, receive: Nanoseconds) -> bool:
-    """Tell whether stamps do not go on as their arrivals do."""
+    """Return whether stamps do not go on as their arrivals do."""
     passed = np.quantile(receive, 0.9) - np.quantile(receive, 0.1)
     went_on = np.quantile(stamp, 0.9) - np.quantile(stamp, 0.1)
     return bool(passed > SECOND and went_on < passed / 2)

@@ -15,7 +15,7 @@ WORTH_MOVING = 0.02
 REACH = 0.6
 #: How much less unlike the signals must be at the offset than without it.
 SHARPER = 0.8
-#: Turning below this, in rad/s, or a correlation below that tells nothing.
+#: Turning below this, in rad/s, or a correlation below that is no evidence.
 ENOUGH_TURNING = 0.1
 ALIKE = 0.6
 #: Seconds over which both are averaged against noise.
@@ -25,7 +25,7 @@ WINDOW = 0.1
 def pose_offset(series: Mapping[str, Series]) -> float | None:
     """Return by how many seconds the attitude's stamps are late against the gyro's.
 
-    None where one is missing or the vehicle turns too little to tell.
+    None where one is missing or the vehicle turns too little.
     """
     if "attitude" not in series or "body_rate" not in series:
         return None

@@ -38,7 +38,7 @@ class Source(Section):
         Paths into the message (``pose.position.x``, ``channels[0]``) or column names, in the
         order of the signal's columns; None takes those that the message type usually has.
     rotor
-        Field that tells which rotor, from 0, a message speaks of; `fields` then names one field.
+        Field that names the rotor, from 0, of a message; `fields` then names one field.
     unit
         Unit of the recorded numbers, a key of `UNITS`; None is the usual one of the message type.
     frame
@@ -73,7 +73,7 @@ class Source(Section):
 
 
 class ClockField(Section):
-    """A field that tells the time; a bare name means seconds."""
+    """A field that holds the time; a bare name means seconds."""
 
     field: str
     unit: Literal["s", "ms", "us", "ns"] = "s"
@@ -98,7 +98,7 @@ class TopicMap(Section):
     priority
         Among maps that find equally many signals in a recording, the highest is taken.
     time
-        Fields that tell the time, the preferred one first; none means the message's header.
+        Fields that hold the time, the preferred one first; none means the message's header.
     messages
         ``.msg`` files, or folders of them, for ROS types that a recording does not define.
     signals
@@ -149,7 +149,7 @@ class TopicMap(Section):
 
     @property
     def clocks(self) -> tuple[Clock, ...]:
-        """The fields that tell the time."""
+        """The fields that hold the time."""
         return tuple(Clock(clock.field, clock.unit) for clock in self.time)
 
     def under(self, namespace: str) -> TopicMap:

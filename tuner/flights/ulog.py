@@ -2,7 +2,7 @@
 
 pyulog reads the messages. What comes before is a check and a count without it: pyulog multiplies
 out a log's formats, and 77 bytes whose formats nest kept it busy for over 25 s, where this refuses
-them in 0.14 s; it also tells nothing of the bytes behind the last whole message of a cut log.
+them in 0.14 s; it also reports nothing of the bytes behind the last whole message of a cut log.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
 
 
 def _has(formats: Mapping[str, list[tuple[str, int, str]]], kind: str, path: list[str]) -> bool:
-    """Tell whether a format has a field such as ``esc[0].esc_rpm``, in its parts."""
+    """Return whether a format has a field such as ``esc[0].esc_rpm``, in its parts."""
     name, _, index = path[0].partition("[")
     for what, count, field in formats.get(kind, []):
         if field == name:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-#: Told apart with every common kind of colour blindness (Okabe and Ito, "Color universal design").
+#: Distinct with every common kind of colour blindness (Okabe and Ito, "Color universal design").
 #: The first stands out against light and dark alike.
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY = "#8a8a8a"
@@ -19,7 +19,7 @@ Scale = Literal["linear", "log"]
 
 @dataclass(frozen=True)
 class Look:
-    """How a line looks; colour alone never tells two apart."""
+    """How a line looks; colour alone never distinguishes two."""
 
     colour: str
     dash: Literal["solid", "dot", "dash"] = "solid"

@@ -30,8 +30,8 @@ def figure_of(chart: Chart) -> Json:
     count = len(chart.panels)
     for number, panel in enumerate(chart.panels, start=1):
         suffix = "" if number == 1 else str(number)
-        own, axes = _panel(panel, suffix, shown)
-        traces += own
+        panel_traces, axes = _panel(panel, suffix, shown)
+        traces += panel_traces
         height = (1.0 - GAP * (count - 1)) / count
         top = 1.0 - (number - 1) * (height + GAP)
         axes[f"yaxis{suffix}"]["domain"] = [max(top - height, 0.0), top]

@@ -75,11 +75,11 @@ def _svg(chart: Chart) -> str:
 
 
 def _legend(axes: Sequence[Any]) -> tuple[list[str], list[Any]]:
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for place in axes:
         for handle, name in zip(*place.get_legend_handles_labels(), strict=True):
-            found.setdefault(name, handle)
-    return list(found), list(found.values())
+            entries.setdefault(name, handle)
+    return list(entries), list(entries.values())
 
 
 def _draw(panel: Panel, place: Axes) -> None:

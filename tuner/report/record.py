@@ -72,7 +72,7 @@ class LapTable(Part):
 
 
 class Recording(Part):
-    """A flight that something was told from."""
+    """A flight that an examination read."""
 
     name: str
     path: str
@@ -107,23 +107,23 @@ def write_search(folder: Path, fitted: Fitted) -> None:
     record = SearchRecord(
         iterations=[
             Move(
-                stage=one.stage,
-                number=one.number,
-                loss=one.loss,
-                position_rmse=one.position_rmse if one.position_rmse >= 0 else None,
-                accepted=one.accepted,
-                horizon=one.horizon,
+                stage=iteration.stage,
+                number=iteration.number,
+                loss=iteration.loss,
+                position_rmse=iteration.position_rmse if iteration.position_rmse >= 0 else None,
+                accepted=iteration.accepted,
+                horizon=iteration.horizon,
             )
-            for one in fitted.iterations
+            for iteration in fitted.iterations
         ],
         starts=[
             Start(
-                origin=one.origin,
-                loss=one.loss if abs(one.loss) < float("inf") else None,
-                start=_values(fitted, one.start),
-                end=_values(fitted, one.vector),
+                origin=outcome.origin,
+                loss=outcome.loss if abs(outcome.loss) < float("inf") else None,
+                start=_values(fitted, outcome.start),
+                end=_values(fitted, outcome.vector),
             )
-            for one in fitted.outcomes
+            for outcome in fitted.outcomes
         ],
     )
     record.write(folder)

@@ -63,8 +63,8 @@ def test_saturation_names_the_directions_that_a_clipped_rotor_cannot_give() -> N
     commands = tuple(jnp.asarray(x) for x in (0.0, 0.5, 0.5, 0.5))
 
     def flags(airmode: int) -> tuple[list[bool], list[bool]]:
-        found = mixer.saturation(MixerSettings(airmode=airmode), commands)  # type: ignore[arg-type]
-        return [bool(f) for f in found.positive], [bool(f) for f in found.negative]
+        flags = mixer.saturation(MixerSettings(airmode=airmode), commands)  # type: ignore[arg-type]
+        return [bool(f) for f in flags.positive], [bool(f) for f in flags.negative]
 
     assert flags(0) == ([True, False, False], [False, True, True])
     assert flags(1) == ([False, False, False], [False, False, True])

@@ -30,7 +30,7 @@ from tuner.result import (
 
 @pytest.fixture
 def run(bag, flight, updated, tmp_path):
-    """A result folder that tells the truth about one recording."""
+    """A result folder that is true of one recording."""
     start = with_values(updated, {"rotor_drag_coefficient": 4e-4})
     comparison = Comparison([Recording(flight)], ControllerFile())
     coefficients = {

@@ -1,7 +1,7 @@
 """Broken recordings by the hundred: ``python -m tests.tuner.flights.fuzz FORMAT --cases 1000``.
 
 Each case is a whole recording with something wrong in it. It must be read, or refused with one
-line, within seconds and without much memory. Prints the counts as JSON; the exit status tells
+line, within seconds and without much memory. Prints the counts as JSON; the exit status says
 whether every case did.
 """
 

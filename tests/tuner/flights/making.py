@@ -85,13 +85,15 @@ def rewrite(
             for c in reader.connections
         }
         for connection, time, raw in reader.messages():
-            own = connections[connection.id]
+            connection_out = connections[connection.id]
             if change is None:
-                writer.write(own, time, raw)
+                writer.write(connection_out, time, raw)
                 continue
             message = store.deserialize_ros1(raw, connection.msgtype)
             for when, changed in change(connection.topic, time, message):
-                writer.write(own, when, store.serialize_ros1(changed, connection.msgtype))
+                writer.write(
+                    connection_out, when, store.serialize_ros1(changed, connection.msgtype)
+                )
     return target
 
 
@@ -126,8 +128,8 @@ def columns_of(bag: Path, paths: Mapping[str, Sequence[str]]) -> dict[str, Colum
             values = [_value(message, path) for path in paths[connection.topic]]
             rows[connection.topic].append((when, values))
     return {
-        topic: Column(np.array([r[0] for r in own]), np.array([r[1] for r in own]))
-        for topic, own in rows.items()
+        topic: Column(np.array([r[0] for r in samples]), np.array([r[1] for r in samples]))
+        for topic, samples in rows.items()
     }
 
 
@@ -248,15 +250,15 @@ def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 def px4_messages(bag: Path) -> dict[str, Column]:
     """Return a shipped bag's signals as PX4's messages in its frames; one rotor turns."""
-    own = columns_of(bag, {t: list(f) for t, f in LAB.items()})
-    pose, velocity = own["/optitrack/pose"], own["/mavros/local_position/velocity_local"]
-    imu, setpoint = own["/mavros/imu/data"], own["/mavros/setpoint_raw/attitude"]
-    reference = own["/reference/flatsetpoint"]
+    columns = columns_of(bag, {t: list(f) for t, f in LAB.items()})
+    pose, velocity = columns["/optitrack/pose"], columns["/mavros/local_position/velocity_local"]
+    imu, setpoint = columns["/mavros/imu/data"], columns["/mavros/setpoint_raw/attitude"]
+    reference = columns["/reference/flatsetpoint"]
     moving = np.column_stack(
         [np.interp(pose.time, velocity.time, column) for column in velocity.values.T]
     )
-    rpm = np.full((len(own["/mavros/rpm"].time), 4), np.nan)
-    rpm[:, 0] = own["/mavros/rpm"].values[:, 0]
+    rpm = np.full((len(columns["/mavros/rpm"].time), 4), np.nan)
+    rpm[:, 0] = columns["/mavros/rpm"].values[:, 0]
     thrust = np.zeros((len(setpoint.time), 3))
     thrust[:, 2] = -setpoint.values[:, 3]
     flat = [ned(reference.values[:, i : i + 3]) for i in (0, 3, 6)]
@@ -267,13 +269,13 @@ def px4_messages(bag: Path) -> dict[str, Column]:
         "vehicle_attitude": Column(pose.time, ned_frd(pose.values[:, 3:])),
         "vehicle_angular_velocity": Column(imu.time, frd(imu.values[:, :3])),
         "vehicle_acceleration": Column(imu.time, frd(imu.values[:, 3:])),
-        "actuator_outputs": own["/mavros/rc/out"],
-        "esc_status": Column(own["/mavros/rpm"].time, rpm),
+        "actuator_outputs": columns["/mavros/rc/out"],
+        "esc_status": Column(columns["/mavros/rpm"].time, rpm),
         "vehicle_rates_setpoint": Column(
             setpoint.time, np.hstack([frd(setpoint.values[:, :3]), thrust])
         ),
         "trajectory_setpoint": Column(reference.time, np.hstack(flat)),
-        "battery_status": own["/mavros/battery"],
+        "battery_status": columns["/mavros/battery"],
     }
 
 
@@ -333,13 +335,13 @@ def to_px4_ros2(messages: Mapping[str, Column], folder: Path, *, boot: int = 0) 
         for name, column in messages.items():
             kind = "px4_msgs/msg/" + "".join(part.title() for part in name.split("_"))
             side = "in" if name == "trajectory_setpoint" else "out"
-            own = writer.add_connection(f"/fmu/{side}/{name}", kind, typestore=store)
+            connection = writer.add_connection(f"/fmu/{side}/{name}", kind, typestore=store)
             make = _px4_maker(store, kind)
             for when, row in zip(column.time, column.values, strict=True):
-                rows.append((int(when), own, make, kind, row))
-        for when, own, make, kind, row in sorted(rows, key=lambda item: item[0]):
+                rows.append((int(when), connection, make, kind, row))
+        for when, connection, make, kind, row in sorted(rows, key=lambda item: item[0]):
             message = make((when - boot) // 1000, row)
-            writer.write(own, when + 700_000, store.serialize_cdr(message, kind))
+            writer.write(connection, when + 700_000, store.serialize_cdr(message, kind))
     return folder
 
 

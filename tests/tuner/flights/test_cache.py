@@ -104,9 +104,9 @@ def test_concurrent_runs_agree(bag: Path) -> None:
         subprocess.Popen([sys.executable, "-c", code, str(bag)], stdout=subprocess.PIPE, text=True)
         for _ in range(4)
     ]
-    said = {run.communicate()[0] for run in runs}
+    outputs = {run.communicate()[0] for run in runs}
     assert [run.returncode for run in runs] == [0, 0, 0, 0]
-    assert len(said) == 1
+    assert len(outputs) == 1
     names = [file.name for file in (cache_folder() / "flights").iterdir()]
     assert len(names) == 1
     assert not names[0].startswith(".")

@@ -55,7 +55,7 @@ def test_slow_motion_capture_of_a_fast_flight_loses_no_sample() -> None:
     lost = (np.arange(1000) % 50) > 41  # a third of a second without markers, time and again
     _, kept, notes = _cleaned("position", time[~lost], position[~lost])
     assert len(kept) == (~lost).sum()
-    assert [note.count for note in notes] == [lost[:-8].sum()]  # told as missing, none dropped
+    assert [note.count for note in notes] == [lost[:-8].sum()]  # reported as missing, none dropped
 
 
 def test_pose_jumps_are_dropped() -> None:

@@ -1,4 +1,4 @@
-"""What goes wrong in real recordings: each defect is survived, and told."""
+"""What goes wrong in real recordings: each defect is survived, and reported."""
 
 from __future__ import annotations
 

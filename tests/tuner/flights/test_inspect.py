@@ -1,4 +1,4 @@
-"""What `tune inspect` tells of a recording, and how soon."""
+"""What `tune inspect` reports of a recording, and how soon."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from tests.tuner.flights import making
 
 pytestmark = pytest.mark.skipif(
-    not Path("/proc/self/io").exists(), reason="counts bytes and memory as Linux tells them"
+    not Path("/proc/self/io").exists(), reason="counts bytes and memory as Linux reports them"
 )
 IMAGE = "sensor_msgs/msg/Image"
 #: Reads a recording in a process of its own; prints seconds, bytes read and the peak of memory.
@@ -55,13 +55,13 @@ def test_a_camera_beside_the_flight_is_not_read(tmp_path: Path) -> None:
     pixels = np.random.default_rng(0).integers(0, 255, 1 << 20, dtype=np.uint8)
     path = tmp_path / "camera.bag"
     with Reader(making.CIRCLE) as reader, Writer(path) as writer:
-        own = {
+        connections = {
             c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
             for c in reader.connections
         }
         camera = writer.add_connection("/camera/image_raw", IMAGE, msgdef=text, md5sum=md5)
         for i, (connection, time, raw) in enumerate(reader.messages()):
-            writer.write(own[connection.id], time, raw)
+            writer.write(connections[connection.id], time, raw)
             if i % 117 == 0:
                 stamp = time_of(*divmod(time, 1_000_000_000))
                 image = store.types[IMAGE](
@@ -81,7 +81,7 @@ def test_fifty_megabytes_within_two_seconds(tmp_path: Path) -> None:
     path = tmp_path / "long.bag"
     shift = 41_000_000_000
     with Reader(making.CIRCLE) as reader, Writer(path) as writer:
-        own = {
+        connections = {
             c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
             for c in reader.connections
         }
@@ -91,7 +91,7 @@ def test_fifty_megabytes_within_two_seconds(tmp_path: Path) -> None:
                 if connection.msgtype != "std_msgs/msg/Int32":
                     seconds = int.from_bytes(raw[4:8], "little") + 41 * again
                     raw = raw[:4] + seconds.to_bytes(4, "little") + raw[8:]  # noqa: PLW2901
-                writer.write(own[connection.id], time + again * shift, raw)
+                writer.write(connections[connection.id], time + again * shift, raw)
     assert path.stat().st_size > 50e6
     got = measure(path)
     assert got["count"] == 44_000

@@ -1,4 +1,4 @@
-"""Sources are found by name or pattern, and what is missing is told with its nearest miss."""
+"""Sources are found by name or pattern, and what is missing is named with its nearest miss."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Topic maps: what a user may write, and what a wrong one is told."""
+"""Topic maps: what a user may write, and how a wrong one is refused."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ def test_a_map_in_ten_lines_extends_a_shipped_one(tmp_path: Path) -> None:
 
 
 def test_maps_that_extend_each_other_are_refused(tmp_path: Path) -> None:
-    for one, other in (("a", "b"), ("b", "a")):
-        text = f"name: {one}\nformat: ros\nextends: {other}.yaml\nsignals: {{}}\n"
-        (tmp_path / f"{one}.yaml").write_text(text)
+    for first, second in (("a", "b"), ("b", "a")):
+        text = f"name: {first}\nformat: ros\nextends: {second}.yaml\nsignals: {{}}\n"
+        (tmp_path / f"{first}.yaml").write_text(text)
     with pytest.raises(ConfigError, match="in a circle"):
         load_topic_map(tmp_path / "a.yaml")
 

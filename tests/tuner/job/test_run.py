@@ -55,8 +55,8 @@ def test_time_constants_within_four_percent(finished, truth, name):
 
 @pytest.mark.slow
 def test_estimate_latency_within_half_a_millisecond(finished, truth):
-    found = finished[1].coefficients["estimate_latency"].best
-    assert found == pytest.approx(truth["estimate_latency"], abs=5e-4)
+    latency = finished[1].coefficients["estimate_latency"].best
+    assert latency == pytest.approx(truth["estimate_latency"], abs=5e-4)
 
 
 @pytest.mark.slow
@@ -72,9 +72,9 @@ def test_the_held_out_flight_is_met_to_its_measurement_noise(finished):
 @pytest.mark.slow
 def test_mass_and_rolling_moment_stay_as_given(finished):
     for name in ("mass", "rolling_moment_coefficient"):
-        one = finished[1].coefficients[name]
-        assert not one.fitted
-        assert one.best == one.initial
+        coefficient = finished[1].coefficients[name]
+        assert not coefficient.fitted
+        assert coefficient.best == coefficient.initial
 
 
 @pytest.mark.slow
@@ -152,8 +152,8 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
     assert (tmp_path / "cut" / "best_fit.yaml").exists()
     assert not (tmp_path / "cut" / "result.json").exists()
     _, resumed = run(short_job(), out=tmp_path / "cut", resume=True)
-    for name, one in whole.coefficients.items():
-        assert resumed.coefficients[name].best == one.best
+    for name, coefficient in whole.coefficients.items():
+        assert resumed.coefficients[name].best == coefficient.best
     assert resumed.search.evaluations == whole.search.evaluations
 
 

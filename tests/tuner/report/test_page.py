@@ -44,7 +44,7 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
         "Where the knowledge comes from",
         "Residuals",
         "How the search went",
-        "How it was made",
+        "Provenance",
     ):
         assert heading in text
     assert "swing, lap 2" in text

@@ -152,6 +152,8 @@ def test_a_grid_in_single_precision_is_the_grid(vehicle):
     exact, quick = (
         fly(vehicle, grid=grid, precision=precision) for precision in ("float64", "float32")
     )
-    for one, other in zip(exact, quick, strict=True):
-        assert one.coefficients == other.coefficients
-        np.testing.assert_allclose(other.signals["position"], one.signals["position"], atol=1e-4)
+    for exact_flight, quick_flight in zip(exact, quick, strict=True):
+        assert exact_flight.coefficients == quick_flight.coefficients
+        np.testing.assert_allclose(
+            quick_flight.signals["position"], exact_flight.signals["position"], atol=1e-4
+        )

@@ -139,7 +139,7 @@ def test_a_grid_goes_into_one_table(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("said", "expected"),
+    ("options", "expected"),
     [
         ({"trajectory": {"name": "circle", "radius": -1.0}}, "trajectory.radius is -1.0"),
         ({"duration": 0.0}, "duration is 0.0"),
@@ -148,14 +148,14 @@ def test_a_grid_goes_into_one_table(tmp_path):
         ({"controller": "nope.yaml"}, "does not exist"),
     ],
 )
-def test_what_cannot_be_flown_is_refused_in_one_line(tmp_path, said, expected):
+def test_what_cannot_be_flown_is_refused_in_one_line(tmp_path, options, expected):
     usual = {
         "vehicle": "hovergames",
         "controller": "hovergames",
         "trajectory": {"name": "hover"},
     }
     with pytest.raises(InputError) as error:
-        simulate_to_file(tmp_path / "c.csv", **usual | said)
+        simulate_to_file(tmp_path / "c.csv", **usual | options)
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
     assert not list(Path(tmp_path).iterdir())

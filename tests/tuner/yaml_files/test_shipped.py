@@ -53,7 +53,7 @@ def test_an_installed_wheel_carries_the_configuration(tmp_path):
         "from tuner.flights.topics import load_topic_map;"
         "print(load_topic_map('thesis_lab').name)"
     )
-    found = subprocess.run(
+    outcome = subprocess.run(
         [sys.executable, "-c", show],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
@@ -61,6 +61,6 @@ def test_an_installed_wheel_carries_the_configuration(tmp_path):
         capture_output=True,
         text=True,
     )
-    where, vehicle, mass, topics = found.stdout.splitlines()
+    where, vehicle, mass, topics = outcome.stdout.splitlines()
     assert where == str(tmp_path / "site" / "tuner" / "__init__.py")
     assert (vehicle, mass, topics) == ("hovergames", "2.243", "thesis_lab")

@@ -352,20 +352,20 @@ def _index(stream: BinaryIO) -> tuple[int, Index, Index]:
 
 def _block(content: Bytes, connection: int, time: Index, offset: Index) -> Block:
     """Find the payloads of a connection's messages, whose records begin at offsets of a chunk."""
-    room = len(content)
-    inside = (offset >= 0) & (offset + 4 <= room)
+    length = len(content)
+    inside = (offset >= 0) & (offset + 4 <= length)
     offset, time = offset[inside], time[inside]
     size = u32(content, offset)
-    inside = (offset + 8 + size <= room) & (size < LONGEST_HEADER)
+    inside = (offset + 8 + size <= length) & (size < LONGEST_HEADER)
     offset, time, size = offset[inside], time[inside], size[inside]
     start = offset + 8 + size
     end = start + u32(content, start - 4)
-    inside = (end <= room) & _belongs(content, connection, offset + 4, size)
+    inside = (end <= length) & _belongs(content, connection, offset + 4, size)
     return Block(content, start[inside], end[inside], time[inside])
 
 
 def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
-    """Tell which record headers name a connection; those of one length are laid out alike."""
+    """Return which record headers name a connection; those of one length are laid out alike."""
     belongs = np.zeros(len(header), dtype=np.bool_)
     if len(header) == 0:
         return belongs

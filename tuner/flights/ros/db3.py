@@ -176,7 +176,7 @@ class _opened:  # noqa: N801 (used like a function)
 
 
 def _is_cut(path: Path) -> bool:
-    """Tell whether a database is shorter than its header says."""
+    """Return whether a database is shorter than its header says."""
     with path.open("rb") as stream:
         header = stream.read(32)
     if len(header) < 32:

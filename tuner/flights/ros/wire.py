@@ -234,7 +234,7 @@ def decode(walk: Walk, block: Block) -> tuple[dict[str, NDArray[Any]], NDArray[n
     if not walk.aligned:
         _Walker(block.buffer, "<", False, columns, whole).run(walk.steps, block.start, block.end)
         return _complete(walk, columns, count), whole
-    # CDR: four bytes before the payload tell the byte order; offsets count from behind them.
+    # CDR: four bytes before the payload give the byte order; offsets count from behind them.
     headed = (block.end - block.start >= 4) & (block.start >= 0) & (block.end <= len(block.buffer))
     little = np.zeros(count, dtype=np.uint8)
     little[headed] = block.buffer[block.start[headed] + 1]

@@ -18,7 +18,7 @@ from tuner.report.sections.flights import flights
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
 from tuner.report.sections.profiles import profiles
-from tuner.report.sections.provenance import made
+from tuner.report.sections.provenance import provenance
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 from tuner.report.sections.whole_range import whole_range
@@ -35,7 +35,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     whole_range,
     residuals,
     search,
-    made,
+    provenance,
 )
 
 

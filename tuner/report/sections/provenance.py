@@ -12,7 +12,7 @@ from tuner.report.section import Section
 SHOWN = ("command", "origin", "starts")
 
 
-def made(contents: Contents) -> Section:
+def provenance(contents: Contents) -> Section:
     """Return everything that decides the numbers."""
     about = contents.about
     settings = {name: value for name, value in about.settings.items() if name not in SHOWN}
@@ -28,7 +28,7 @@ def made(contents: Contents) -> Section:
         },
         "seed": contents.run.result.seed if contents.run else None,
     }
-    return Section("made", "How it was made", values)
+    return Section("provenance", "Provenance", values)
 
 
 def _digest(value: object) -> str:
