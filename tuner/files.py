@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
 from zipfile import BadZipFile
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import from_json
 
+from tuner.disk import write_text
 from tuner.errors import ConfigError, InputError
 from tuner.validation import config_error
 
@@ -75,52 +77,66 @@ class Part(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore")
 
 
-P = TypeVar("P", bound=Part)
+FiniteOrNone = Annotated[
+    float | None, AfterValidator(lambda v: v if v is not None and math.isfinite(v) else None)
+]
+"""A number for a JSON file, which has none for infinity and not-a-number: those are None."""
 
 
-def read_json(kind: type[P], path: Path, *, version: int, remedy: str) -> P:
-    """Read a JSON file whose ``schema_version`` is the one that this program writes.
+class ResultFile(Part):
+    """The whole of a JSON file of a result folder.
 
-    Parameters
-    ----------
-    kind
-        The model of the file's content.
-    path
-        The file.
-    version
-        The only version that is read; a file without ``schema_version`` is refused.
-    remedy
-        What to do about a file that is missing, cannot be read or is of another version.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is too large, is of another version, or lacks a key.
+    The default of ``schema_version`` is the version that this program writes, and the only one that
+    it reads.
     """
-    raw = read_bytes(path, most=MAX_BYTES, remedy=remedy)
-    try:
-        content = from_json(raw)
-    except ValueError as error:
-        raise InputError(path, f"is not JSON ({error})", remedy) from None
-    file_version = content.get("schema_version") if isinstance(content, dict) else None
-    if file_version != version:
-        what = (
-            "has no schema version"
-            if file_version is None
-            else f"has schema version {file_version}"
-        )
-        raise InputError(path, f"{what}, and this tune reads version {version}", remedy)
-    try:
-        return kind.model_validate(content)
-    except ValidationError as error:
-        wrong = config_error(error, path)
-        raise InputError(path, wrong.what, wrong.remedy) from None
 
+    FILE: ClassVar[str]
+    INDENT: ClassVar[int | None] = 1
 
-def read_optional(kind: type[P], path: Path, *, version: int = 1) -> P | None:
-    """Read a JSON file of a result folder as `read_json` does; None where there is none."""
-    if not path.exists():
-        return None
-    return read_json(
-        kind, path, version=version, remedy="run tune again, or use the tune that wrote this folder"
-    )
+    schema_version: int = 1
+
+    def write(self, folder: Path) -> None:
+        """Write the file, which appears whole, into a result folder.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written there.
+        """
+        write_text(folder / self.FILE, self.model_dump_json(indent=self.INDENT) + "\n")
+
+    @classmethod
+    def read_if_any(cls, folder: Path) -> Self | None:
+        """Read the file of a result folder as `read` does; None where there is none."""
+        return cls.read(folder) if (folder / cls.FILE).exists() else None
+
+    @classmethod
+    def read(
+        cls,
+        folder: Path,
+        remedy: str = "run tune again, or use the tune that wrote this folder",
+    ) -> Self:
+        """Read the file of a result folder.
+
+        Raises
+        ------
+        InputError
+            The file is missing, cannot be read, is too large, is of another schema version or of
+            none, or lacks a key; ``remedy`` says what to do.
+        """
+        path = folder / cls.FILE
+        raw = read_bytes(path, most=MAX_BYTES, remedy=remedy)
+        try:
+            content = from_json(raw)
+        except ValueError as error:
+            raise InputError(path, f"is not JSON ({error})", remedy) from None
+        version = cls.model_fields["schema_version"].default
+        of_file = content.get("schema_version") if isinstance(content, dict) else None
+        if of_file != version:
+            what = "has no schema version" if of_file is None else f"has schema version {of_file}"
+            raise InputError(path, f"{what}, and this tune reads version {version}", remedy)
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            wrong = config_error(error, path)
+            raise InputError(path, wrong.what, wrong.remedy) from None

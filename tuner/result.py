@@ -10,15 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import VehicleFile, read_vehicle
-from tuner.disk import exists, write_text
+from tuner.disk import exists
 from tuner.errors import InputError
-from tuner.files import Part, read_json
+from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.findings import Finding
 from tuner.uncertainty.verdict import Reason, Verdict
 
-SCHEMA_VERSION = 2
-
-RESULT_FILE = "result.json"
 BEST_FIT_FILE = "best_fit.yaml"
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
@@ -66,7 +63,7 @@ class CoefficientResult(Part):
     fitted: bool
     lower: float | None = None
     upper: float | None = None
-    std_error: float | None = None
+    std_error: FiniteOrNone = None
     ci95: tuple[float, float] | None = None
     identifiable: bool | None = None
     verdict: Verdict
@@ -78,18 +75,22 @@ class CoefficientResult(Part):
         return reason.model_dump(mode="json", exclude_none=True)
 
 
+RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+"""Axis -> unit of its RMSE."""
+
+
 class AxesRmse(Part):
     """The thesis's six: position along world x, y, z in m; roll, pitch, yaw in degrees.
 
     None stands for a flight that crashed or an axis that was not recorded.
     """
 
-    x: float | None
-    y: float | None
-    z: float | None
-    roll: float | None
-    pitch: float | None
-    yaw: float | None
+    x: FiniteOrNone
+    y: FiniteOrNone
+    z: FiniteOrNone
+    roll: FiniteOrNone
+    pitch: FiniteOrNone
+    yaw: FiniteOrNone
 
 
 class FlightResult(Part):
@@ -116,16 +117,19 @@ class SearchResult(Part):
     evaluations: int
     iterations: int
     wall_time: float
-    cost_initial: float | None
-    cost_best: float | None
+    cost_initial: FiniteOrNone
+    cost_best: FiniteOrNone
     converged: bool
     message: Ending
 
 
-class RunResult(Part):
+class RunResult(ResultFile):
     """The content of ``result.json``."""
 
-    schema_version: int
+    FILE = "result.json"
+    INDENT = 2
+
+    schema_version: int = 2
     status: Status
     seed: int
     versions: dict[str, str]
@@ -146,17 +150,6 @@ class Run(BaseModel):
     vehicle: VehicleFile = Field(description="best_fit.yaml")
 
 
-def write_result(result: RunResult, folder: Path) -> None:
-    """Write ``result.json``; it appears whole.
-
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written to.
-    """
-    write_text(folder / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
-
-
 def read_run(folder: str | Path) -> Run:
     """Read a result folder.
 
@@ -168,9 +161,10 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
-    path = folder / RESULT_FILE
-    result = read_json(RunResult, path, version=SCHEMA_VERSION, remedy=REMEDY)
+    result = RunResult.read(folder, REMEDY)
     for name in result.coefficients:
         if name not in COEFFICIENTS:
-            raise InputError(path, f"unknown coefficient '{name}'", "was it edited?")
+            raise InputError(
+                folder / RunResult.FILE, f"unknown coefficient '{name}'", "was it edited?"
+            )
     return Run(folder=folder, result=result, vehicle=read_vehicle(folder / BEST_FIT_FILE))

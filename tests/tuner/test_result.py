@@ -5,12 +5,12 @@ import pytest
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.errors import InputError
 from tuner.findings import Code, Finding
-from tuner.result import read_run, write_result
+from tuner.result import read_run
 
 
 def test_a_result_comes_back_from_its_file_as_it_was(make_run):  # noqa: F811
     run = make_run()
-    write_result(run.result, run.folder)
+    run.result.write(run.folder)
     again = read_run(run.folder)
     assert again == run
     assert again.vehicle.name == "hovergames_updated"
@@ -36,7 +36,7 @@ def test_a_verdict_is_a_code_with_the_numbers_of_its_reason(make_run):  # noqa: 
 def test_findings_come_back_as_they_were(make_run):  # noqa: F811
     run = make_run()
     finding = Finding(Code.SALVAGED, "warning", "circle", {"lost": 7, "start": 1.5}, ("x", ""))
-    write_result(run.result.model_copy(update={"findings": (finding,)}), run.folder)
+    run.result.model_copy(update={"findings": (finding,)}).write(run.folder)
     (again,) = read_run(run.folder).result.findings
     assert again == finding
     assert repr(again.numbers["lost"]) == "7"

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from tuner.job.listener import Listener
-    from tuner.search.fitted import Iteration
+    from tuner.search.iteration import Iteration
 
 
 @contextmanager
@@ -84,8 +84,9 @@ class _StageLines:
 
 
 def _line(iteration: Iteration, seconds: float) -> str:
+    rmse = iteration.position_rmse
+    position = "" if rmse is None else f"position RMSE {1000 * rmse:.2f} mm, "
     return (
         f"{iteration.stage}: iteration {iteration.number}, horizon {iteration.horizon:.3g} s, "
-        f"position RMSE {1000 * iteration.position_rmse:.2f} mm, loss {iteration.loss:.4g}, "
-        f"{seconds:.0f} s so far"
+        f"{position}loss {iteration.loss:.4g}, {seconds:.0f} s so far"
     )

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 from collections.abc import Callable
 from pathlib import Path
 
-from tuner.comparison.table import UNITS, Row, Table
+from tuner.comparison.table import Table
 from tuner.disk import check_file, write_text
 from tuner.errors import InputError
+from tuner.files import csv_text
+from tuner.result import RMSE_UNITS
 
-SCHEMA_VERSION = 1
 TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
 
 
@@ -43,47 +41,19 @@ def _writer(path: Path) -> Callable[[Table], str]:
 
 
 def _csv(table: Table) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["flight", "lap", "vehicle", "axis", "unit", "rmse", "best", "crash_time"])
+    header = ("flight", "lap", "vehicle", "axis", "unit", "rmse", "best", "crash_time")
+    rows = []
     for row in table.rows:
         winners = table.winners(row.flight, row.lap)
-        for axis, unit in UNITS.items():
-            value = getattr(row.rmse, axis)
-            writer.writerow(
-                [
-                    row.flight,
-                    "" if row.lap is None else row.lap,
-                    row.vehicle,
-                    axis,
-                    unit,
-                    "" if value is None else repr(value),
-                    int(winners.get(axis) == row.vehicle),
-                    "" if row.crash_time is None else row.crash_time,
-                ]
-            )
-    return text.getvalue()
+        for axis, unit in RMSE_UNITS.items():
+            first, rmse = int(winners.get(axis) == row.vehicle), getattr(row.rmse, axis)
+            place = (row.flight, row.lap, row.vehicle, axis, unit)
+            rows.append((*place, rmse, first, row.crash_time))
+    return csv_text(header, rows)
 
 
 def _json(table: Table) -> str:
-    content = {
-        "schema_version": SCHEMA_VERSION,
-        "units": UNITS,
-        "vehicles": list(table.vehicles),
-        "best": table.best,
-        "rows": [_row(row) for row in table.rows],
-    }
-    return json.dumps(content, indent=2, allow_nan=False) + "\n"
-
-
-def _row(row: Row) -> dict[str, object]:
-    return {
-        "flight": row.flight,
-        "lap": row.lap,
-        "vehicle": row.vehicle,
-        "rmse": row.rmse.model_dump(),
-        "crash_time": row.crash_time,
-    }
+    return table.model_dump_json(indent=2) + "\n"
 
 
 def _html(table: Table) -> str:
@@ -93,7 +63,7 @@ def _html(table: Table) -> str:
     stretches = dict.fromkeys((row.flight, row.lap) for row in table.rows)
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         table=table,
-        units=UNITS,
+        units=RMSE_UNITS,
         stretches=[
             {
                 "flight": flight,

@@ -8,10 +8,8 @@ import numpy as np
 from pydantic import JsonValue
 
 from tuner.disk import write_text
-from tuner.files import Part, csv_text, read_optional
+from tuner.files import Part, ResultFile, csv_text
 
-SCHEMA_VERSION = 2
-NEXT_FLIGHT_FILE = "next_flight.json"
 NEXT_FLIGHT_TABLE = "next_flight.csv"
 
 
@@ -42,7 +40,7 @@ class Proposal(Part):
         return float(np.sqrt(np.mean(np.square(list(self.shrinks.values())))))
 
 
-class Proposals(Part):
+class Proposals(ResultFile):
     """The content of ``next_flight.json``.
 
     Attributes
@@ -60,7 +58,9 @@ class Proposals(Part):
         Best first.
     """
 
-    schema_version: int = SCHEMA_VERSION
+    FILE = "next_flight.json"
+
+    schema_version: int = 2
     arena: tuple[float, float, float]
     seconds: float
     targets: list[str]
@@ -68,18 +68,12 @@ class Proposals(Part):
     all_known: bool
     flights: list[Proposal]
 
-
-def write_proposals(proposals: Proposals, folder: Path) -> None:
-    """Write ``next_flight.json`` and, for other programs, ``next_flight.csv``."""
-    write_text(folder / NEXT_FLIGHT_FILE, proposals.model_dump_json(indent=1) + "\n")
-    header = ("flight", "mean_shrink", "volume_shrink", *proposals.targets)
-    rows = [
-        [flight.name, flight.mean, flight.volume, *map(flight.shrinks.get, proposals.targets)]
-        for flight in proposals.flights
-    ]
-    write_text(folder / NEXT_FLIGHT_TABLE, csv_text(header, rows))
-
-
-def read_proposals(folder: Path) -> Proposals | None:
-    """Read ``next_flight.json``; None where there is none."""
-    return read_optional(Proposals, folder / NEXT_FLIGHT_FILE, version=SCHEMA_VERSION)
+    def write(self, folder: Path) -> None:
+        """Write ``next_flight.json`` and, for other programs, ``next_flight.csv``."""
+        super().write(folder)
+        header = ("flight", "mean_shrink", "volume_shrink", *self.targets)
+        rows = [
+            [flight.name, flight.mean, flight.volume, *map(flight.shrinks.get, self.targets)]
+            for flight in self.flights
+        ]
+        write_text(folder / NEXT_FLIGHT_TABLE, csv_text(header, rows))

@@ -17,7 +17,6 @@ from tuner.examination.sensitivity_json import (
     Knowledge,
     OutputSensitivity,
     ResidualWhiteness,
-    numbers,
 )
 from tuner.objective.criterion import Point
 from tuner.uncertainty.estimates import Uncertainty
@@ -44,7 +43,7 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         flights=list(uncertainty.flights),
         channels=list(uncertainty.channels),
         outputs=_outputs(examination),
-        acting=_effects_over_time(examination),
+        effects_over_time=_effects_over_time(examination),
         residuals=[
             ResidualWhiteness(
                 flight=residual.flight,
@@ -103,13 +102,12 @@ def _coefficient(
     bias: Mapping[str, float],
 ) -> CoefficientKnowledge:
     estimate = uncertainty.estimates[name]
-    error, low, high = numbers(np.array([estimate.std_error, *estimate.ci95]))
     return CoefficientKnowledge(
         unit=COEFFICIENTS[name].unit,
         fitted=fitted,
         value=estimate.value,
-        std_error=error,
-        ci95=(low, high),
+        std_error=estimate.std_error,
+        ci95=estimate.ci95,
         verdict=estimate.verdict,
         reason=estimate.reason,
         step=step,
@@ -133,8 +131,8 @@ def _outputs(examination: Examination) -> list[OutputSensitivity]:
             unit=output.unit,
             rmse=output.rmse,
             change=dict(zip(names, sensitivity.change[:, row].tolist(), strict=True)),
-            rmse_up=dict(zip(names, numbers(sensitivity.rmse_up[:, row]), strict=True)),
-            rmse_down=dict(zip(names, numbers(sensitivity.rmse_down[:, row]), strict=True)),
+            rmse_up=dict(zip(names, sensitivity.rmse_up[:, row].tolist(), strict=True)),
+            rmse_down=dict(zip(names, sensitivity.rmse_down[:, row].tolist(), strict=True)),
         )
         for row, output in enumerate(sensitivity.outputs)
     ]

@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
-
-from tuner.disk import write_text
-from tuner.files import Part, read_optional
+from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import Reason, Verdict
-
-SCHEMA_VERSION = 2
-KNOWLEDGE_FILE = "sensitivity.json"
-
-Number = float | None
-"""None stands for a simulation that crashed, or an interval without end."""
 
 
 class CoefficientKnowledge(Part):
@@ -46,8 +34,8 @@ class CoefficientKnowledge(Part):
     unit: str
     fitted: bool
     value: float
-    std_error: Number
-    ci95: tuple[Number, Number]
+    std_error: FiniteOrNone
+    ci95: tuple[FiniteOrNone, FiniteOrNone]
     verdict: Verdict
     reason: Reason
     step: float
@@ -77,8 +65,8 @@ class OutputSensitivity(Part):
     unit: str
     rmse: float
     change: dict[str, float]
-    rmse_up: dict[str, Number]
-    rmse_down: dict[str, Number]
+    rmse_up: dict[str, FiniteOrNone]
+    rmse_down: dict[str, FiniteOrNone]
 
 
 class EffectOverTime(Part):
@@ -119,7 +107,7 @@ class ResidualWhiteness(Part):
     white: bool
 
 
-class Knowledge(Part):
+class Knowledge(ResultFile):
     """The content of ``sensitivity.json``.
 
     Attributes
@@ -128,7 +116,7 @@ class Knowledge(Part):
         Name -> what is known of it; the fitted ones first.
     flights, channels
         Names.
-    outputs, acting, residuals
+    outputs, effects_over_time, residuals
         Of every recorded signal, of every flight, of every channel of a flight.
     directions
         The worst-determined combinations of the fitted coefficients, worst first.
@@ -141,42 +129,18 @@ class Knowledge(Part):
         flights alone; in the coefficients' units.
     """
 
-    schema_version: int = SCHEMA_VERSION
+    FILE = "sensitivity.json"
+    INDENT = None
+
+    schema_version: int = 2
     coefficients: dict[str, CoefficientKnowledge]
     flights: list[str]
     channels: list[str]
     outputs: list[OutputSensitivity]
-    acting: list[EffectOverTime]
+    effects_over_time: list[EffectOverTime]
     residuals: list[ResidualWhiteness]
     directions: list[Direction]
     names: list[str]
     correlation: list[list[float]]
     covariance: list[list[float]]
     information: list[list[float]]
-
-
-def numbers(values: NDArray[np.float64]) -> list[Number]:
-    """Return a row with None for what is not finite."""
-    return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def write_knowledge(knowledge: Knowledge, folder: Path) -> None:
-    """Write ``sensitivity.json``; it appears whole.
-
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written to.
-    """
-    write_text(folder / KNOWLEDGE_FILE, knowledge.model_dump_json() + "\n")
-
-
-def read_knowledge(folder: Path) -> Knowledge | None:
-    """Read ``sensitivity.json`` of a folder; None where there is none.
-
-    Raises
-    ------
-    InputError
-        It cannot be read, or is of another schema version.
-    """
-    return read_optional(Knowledge, folder / KNOWLEDGE_FILE, version=SCHEMA_VERSION)

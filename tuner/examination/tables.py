@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from tuner.disk import write_text
-from tuner.examination.sensitivity_json import Knowledge, write_knowledge
+from tuner.examination.sensitivity_json import Knowledge
 from tuner.files import csv_text
 
 SENSITIVITY_FILE = "sensitivity.csv"
@@ -24,8 +24,8 @@ COLUMNS = (
     "rmse",
     "rmse_plus_10pct",
     "rmse_minus_10pct",
-    "acts_from",
-    "acts_to",
+    "half_effect_from",
+    "half_effect_to",
     "information_share",
 )
 
@@ -34,15 +34,17 @@ def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
     """Write everything into a folder, and return the paths.
 
     ``sensitivity.csv`` has one row for each coefficient and axis of a channel of a flight;
-    ``information_share`` is the whole channel's on that flight. The matrices are square, their
-    first column and first row the names; covariance and information in the coefficients' units.
+    ``information_share`` is the whole channel's on that flight; half of the coefficient's squared
+    effect on the flight falls between ``half_effect_from`` and ``half_effect_to``, in s. The
+    matrices are square, their first column and first row the names; covariance and information in
+    the coefficients' units.
 
     Raises
     ------
-    ConfigError
+    OutputError
         The folder cannot be written to.
     """
-    write_knowledge(knowledge, folder)
+    knowledge.write(folder)
     texts = {
         SENSITIVITY_FILE: csv_text(COLUMNS, _sensitivity(knowledge)),
         SHARES_FILE: csv_text(("coefficient", "flight", "channel", "share"), _shares(knowledge)),
@@ -57,7 +59,7 @@ def write_files(knowledge: Knowledge, folder: Path) -> tuple[Path, ...]:
 
 
 def _sensitivity(knowledge: Knowledge) -> Iterable[Sequence[object]]:
-    spans = {flight.flight: flight.span for flight in knowledge.acting}
+    spans = {flight.flight: flight.span for flight in knowledge.effects_over_time}
     for name, known in knowledge.coefficients.items():
         for output in knowledge.outputs:
             if name not in output.change:

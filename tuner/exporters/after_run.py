@@ -8,20 +8,18 @@ from pathlib import Path
 
 from tuner.config.job import ExportSettings
 from tuner.errors import InputError
-from tuner.exporters.export import export
+from tuner.exporters.export import FOLDER, export
 from tuner.exporters.gates import Refly
 from tuner.exporters.target import target_of
 from tuner.result import read_run
 
-FOLDER = "export"
-
 
 def exports_of_job(
     folder: Path, wanted: ExportSettings, *, refly: Refly, today: date
-) -> Iterator[str]:
+) -> Iterator[tuple[str, Path | InputError]]:
     """Write every format that a job asks for into its result folder.
 
-    A format that is refused is no failure of the run: the line gives the reason.
+    A format that is refused is no failure of the run.
 
     Parameters
     ----------
@@ -34,17 +32,14 @@ def exports_of_job(
 
     Yields
     ------
-    str
-        One line a format.
+    tuple
+        Each format with the file that was written, or with the reason why it was not.
     """
     run = read_run(folder)
     for kind in wanted.formats:
-        target = target_of(kind)
-        into = wanted.into if target.patches else None
-        name = into.name if into else f"{run.vehicle.name}{target.suffix}"
-        out = folder / FOLDER / name
+        into = wanted.into if target_of(kind).patches else None
+        out = folder / FOLDER / into.name if into else None
         try:
-            done = export(run, kind, refly=refly, today=today, into=into, out=out)
-            yield f"exported {done.path}"
+            yield kind, export(run, kind, refly=refly, today=today, into=into, out=out).path
         except InputError as error:
-            yield f"not exported as {kind}: {error}"
+            yield kind, error

@@ -20,6 +20,9 @@ from tuner.exporters.target import (
 )
 from tuner.result import Run
 
+FOLDER = "export"
+"""Of a result folder, for its exports."""
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -80,7 +83,7 @@ def export(
         The file cannot be written.
     """
     target = target_of(kind)
-    path = out or into or run.folder / "export" / f"{run.vehicle.name}{target.suffix}"
+    path = out or into or run.folder / FOLDER / f"{run.vehicle.name}{target.suffix}"
     check_file(path, folder_is_made=True)
     if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")

@@ -11,7 +11,7 @@ from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
 from tuner.recordings import read_recordings, with_offsets
-from tuner.result import RESULT_FILE, AxesRmse, Run
+from tuner.result import AxesRmse, Run, RunResult
 
 
 def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
@@ -48,7 +48,7 @@ def _settings(run: Run, vehicle: VehicleFile) -> Settings:
         job = JobFile.model_validate(settings["job"])
     except (KeyError, ValidationError):
         raise InputError(
-            run.folder / RESULT_FILE, "does not hold the controller that flew", "fit again"
+            run.folder / RunResult.FILE, "does not hold the controller that flew", "fit again"
         ) from None
     paths = tuple(dict.fromkeys(Path(flight.path) for flight in run.result.flights))
     for path in paths:

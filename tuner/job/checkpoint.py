@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from tuner.errors import InputError
 from tuner.files import read_arrays
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
-from tuner.search.fitted import Iteration
+from tuner.search.iteration import Iteration
 from tuner.search.progress import Progress
 
 
@@ -40,7 +40,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
         "evaluations": progress.evaluations - progress.steps,
         "feedback": progress.feedback,
         "seconds": seconds,
-        "iterations": [asdict(iteration) for iteration in progress.iterations[:done]],
+        "iterations": [iteration.model_dump() for iteration in progress.iterations[:done]],
         "channels": list(progress.scales),
     }
     with whole_file(path) as unfinished, unfinished.open("wb") as file:

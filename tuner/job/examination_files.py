@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
-from tuner.design.next_flight_json import Proposals, write_proposals
+from tuner.design.next_flight_json import Proposals
 from tuner.design.ranking import rank_next_flights
 from tuner.examination.examination import Examination
 from tuner.examination.knowledge import knowledge_of
@@ -60,7 +60,7 @@ def write_next_flight(
         seconds=round(SHORTEST * 2**doublings),
         spin_channels=SPIN_CHANNELS,
     )
-    write_proposals(proposals, folder)
+    proposals.write(folder)
     return proposals
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.job.cross_validation import Fold
-    from tuner.search.fitted import Iteration
+    from tuner.search.iteration import Iteration
 
 
 @dataclass(frozen=True)

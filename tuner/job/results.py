@@ -27,7 +27,7 @@ from tuner.objective.initial_conditions import STATES
 from tuner.objective.segments import OFFSETS
 from tuner.result import (
     BEST_FIT_FILE,
-    SCHEMA_VERSION,
+    RMSE_UNITS,
     AxesRmse,
     CoefficientResult,
     Ending,
@@ -35,7 +35,6 @@ from tuner.result import (
     RunResult,
     SearchResult,
     Status,
-    write_result,
 )
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
@@ -50,7 +49,6 @@ from tuner.versions import PROGRAM, versions
 from tuner.wording.verdicts import judgement_in_words
 
 METRICS_FILE = "metrics.csv"
-UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 
 
 def result_of(
@@ -65,7 +63,6 @@ def result_of(
     initial, best = errors
     settings = job.settings
     return RunResult(
-        schema_version=SCHEMA_VERSION,
         status=Status.CONVERGED if fitted.converged else Status.STOPPED,
         seed=settings.job.search.seed,
         versions=versions(),
@@ -151,7 +148,7 @@ def _coefficients(
             fitted=True,
             lower=lower,
             upper=upper,
-            std_error=_finite(estimate.std_error),
+            std_error=estimate.std_error,
             ci95=_interval(estimate.ci95),
             identifiable=reason.identifiable,
             verdict=verdict,
@@ -193,10 +190,6 @@ def _fixed(name: str, value: float) -> CoefficientResult:
     )
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _interval(pair: tuple[float, float]) -> tuple[float, float] | None:
     low, high = pair
     return (low, high) if np.isfinite(low) and np.isfinite(high) else None
@@ -224,7 +217,7 @@ def write_folder(folder: Path, result: RunResult, vehicle: VehicleFile, job: Job
     named = vehicle.replace(name=f"{job.settings.vehicle.name}_fitted", source=source)
     write_vehicle(named, folder / BEST_FIT_FILE, header=f"Fitted by tune to {fitted}.")
     write_text(folder / METRICS_FILE, metrics(result))
-    write_result(result, folder)
+    result.write(folder)
 
 
 def metrics(result: RunResult) -> str:
@@ -241,6 +234,6 @@ def metrics(result: RunResult) -> str:
                 getattr(flight.rmse_best, axis),
             )
             for flight in result.flights
-            for axis, unit in UNITS.items()
+            for axis, unit in RMSE_UNITS.items()
         ),
     )

@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from tuner.comparison.tabulate import table_of
 from tuner.config import Options, settle, with_values, write_vehicle
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, InputError, OutputError
@@ -28,10 +29,11 @@ from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, prepare
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
-from tuner.report import render, write_laps, write_search, write_traces
+from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.search.progress import Progress
+from tuner.wording.exports import export_sentence
 from tuner.wording.findings import one_line, remedy, sentence
 from tuner.wording.phrases import clause
 
@@ -106,7 +108,7 @@ def run(
     result = result_of(job, fitted, uncertainty, (initial, best), command=command)
     write_folder(folder, result, vehicle, job)
     write_traces(folder, initial, best)
-    write_laps(folder, initial, best)
+    table_of({"initial": initial, "best": best}).write(folder)
     write_search(folder, fitted)
     if cross_validated:
         listener.on_folds(cross_validate(job, fitted, folder, _reporting(listener)))
@@ -117,8 +119,8 @@ def run(
     write_next_flight(folder, job, examination, fitted)
     render(folder, wait_for_plots=drawing.wait)
     today = datetime.date.today()
-    for line in exports_of_job(folder, settings.job.export, refly=refly, today=today):
-        listener.on_message(line)
+    for kind, outcome in exports_of_job(folder, settings.job.export, refly=refly, today=today):
+        listener.on_message(export_sentence(kind, outcome))
     return folder, result
 
 

@@ -20,14 +20,14 @@ from tuner.job.prepare import Job, job_of
 from tuner.job.unfitted import unfitted
 from tuner.recordings import read_recordings
 from tuner.report import render
-from tuner.report.record import About, Recording, write_about
+from tuner.report.record import About, Recording
 from tuner.report.traces import write_simulated
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.global_indices import global_sensitivity
-from tuner.sensitivity_analysis.global_sensitivity_json import Method, write_global
+from tuner.sensitivity_analysis.global_sensitivity_json import Method
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.profile_likelihood import profile_likelihood
-from tuner.uncertainty.profiles_json import write_profiles
+from tuner.uncertainty.profiles_json import Profiles
 from tuner.versions import versions
 
 
@@ -116,7 +116,7 @@ def examine_vehicle(
     proposals = write_next_flight(out, job, examination, fitted, arena)
     _write_requested(request, job, fitted, examination, folder=out, on_message=on_message)
     write_simulated(out, comparison_of(job, fitted).fly(settings.vehicle))
-    write_about(out, _about(settings, job, fitted, command))
+    _about(settings, job, fitted, command).write(out)
     render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)
 
@@ -145,7 +145,7 @@ def _write_requested(
             samples=request.samples,
             seed=job.settings.job.search.seed,
         )
-        write_global(indices, folder)
+        indices.write(folder)
     profiles = []
     for name in request.profiles:
         on_message(f"fitting the others again for each value of {name}")
@@ -154,7 +154,7 @@ def _write_requested(
             profile_likelihood(examination.full_problem, uncertainty, fitted.criterion, name)
         )
     if profiles:
-        write_profiles(profiles, folder)
+        Profiles(profiles=profiles).write(folder)
 
 
 def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:

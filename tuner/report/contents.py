@@ -6,24 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.design.next_flight_json import Proposals, read_proposals
+from tuner.comparison.table import Table
+from tuner.design.next_flight_json import Proposals
 from tuner.disk import exists
 from tuner.errors import InputError
-from tuner.examination.sensitivity_json import Knowledge, read_knowledge
+from tuner.examination.sensitivity_json import Knowledge
 from tuner.flights.flight import Array
-from tuner.report.record import (
-    About,
-    LapTable,
-    Recording,
-    SearchRecord,
-    read_about,
-    read_laps,
-    read_search,
-)
+from tuner.report.record import About, Recording, SearchRecord
 from tuner.report.traces import read_traces
-from tuner.result import RESULT_FILE, Run, read_run
-from tuner.sensitivity_analysis.global_sensitivity_json import GlobalSensitivity, read_global
-from tuner.uncertainty.profiles_json import Profiles, read_profiles
+from tuner.result import Run, RunResult, read_run
+from tuner.sensitivity_analysis.global_sensitivity_json import GlobalSensitivity
+from tuner.uncertainty.profiles_json import Profiles
 
 
 @dataclass(frozen=True)
@@ -42,7 +35,7 @@ class Contents:
         What is known about each coefficient.
     proposals
         What to fly next.
-    whole_range, profiles
+    global_sensitivity, profiles
         Indices between the bounds, and profiles of the likelihood.
     search, laps
         How the fit went, and how closely laps are met.
@@ -55,10 +48,10 @@ class Contents:
     run: Run | None
     knowledge: Knowledge | None
     proposals: Proposals | None
-    whole_range: GlobalSensitivity | None
+    global_sensitivity: GlobalSensitivity | None
     profiles: Profiles | None
     search: SearchRecord | None
-    laps: LapTable | None
+    laps: Table | None
     traces: Mapping[str, Mapping[str, Array]]
 
 
@@ -73,20 +66,20 @@ def read_contents(folder: str | Path) -> Contents:
     folder = Path(folder)
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
-    run, about = None, read_about(folder)
-    if about is None or (folder / RESULT_FILE).exists():
+    run, about = None, About.read_if_any(folder)
+    if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)
         about = _about_run(run)
     return Contents(
         folder=folder,
         about=about,
         run=run,
-        knowledge=read_knowledge(folder),
-        proposals=read_proposals(folder),
-        whole_range=read_global(folder),
-        profiles=read_profiles(folder),
-        search=read_search(folder),
-        laps=read_laps(folder),
+        knowledge=Knowledge.read_if_any(folder),
+        proposals=Proposals.read_if_any(folder),
+        global_sensitivity=GlobalSensitivity.read_if_any(folder),
+        profiles=Profiles.read_if_any(folder),
+        search=SearchRecord.read_if_any(folder),
+        laps=Table.read_if_any(folder),
         traces=read_traces(folder),
     )
 

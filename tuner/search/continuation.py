@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.normal import Objective
 from tuner.search.evolution import CmaEs
-from tuner.search.fitted import Iteration
+from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
 from tuner.search.progress import Progress, criterion_of, with_feedback

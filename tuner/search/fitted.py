@@ -11,38 +11,7 @@ from numpy.typing import NDArray
 from tuner.findings import Finding
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-
-
-@dataclass(frozen=True)
-class Iteration:
-    """One step of a search.
-
-    Attributes
-    ----------
-    stage
-        Name of the stage of the continuation.
-    number
-        Counts all iterations of the search.
-    loss
-        Half the mean squared residual after the step, in (scaled) standard deviations.
-    position_rmse
-        m, over all fitted flights up to the horizon, at the point tried.
-    accepted
-        Whether the step was kept.
-    horizon
-        s.
-    damping
-        λ of the Levenberg-Marquardt step that follows, relative to the Hessian per compared value;
-        NaN for CMA-ES.
-    """
-
-    stage: str
-    number: int
-    loss: float
-    position_rmse: float
-    accepted: bool
-    horizon: float
-    damping: float = float("nan")
+from tuner.search.iteration import Iteration
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.search.fitted import Iteration
+from tuner.search.iteration import Iteration
 from tuner.search.levenberg_marquardt import on_host
 from tuner.search.optimiser import Iterate
 from tuner.search.stages import Stage

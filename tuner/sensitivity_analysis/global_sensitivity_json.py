@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from tuner.disk import write_text
-from tuner.files import Part, csv_text, read_optional
+from tuner.files import Part, ResultFile, csv_text
 
 Method = Literal["morris", "sobol"]
-GLOBAL_FILE = "global_sensitivity.json"
 GLOBAL_TABLE = "global_sensitivity.csv"
 
 #: Method -> what the attributes `main`, `total` and `spread` of a `SensitivityIndex` are.
@@ -33,7 +32,7 @@ class SensitivityIndex(Part):
     spread: float
 
 
-class GlobalSensitivity(Part):
+class GlobalSensitivity(ResultFile):
     """The content of ``global_sensitivity.json``.
 
     Attributes
@@ -48,32 +47,20 @@ class GlobalSensitivity(Part):
         Coefficient by coefficient, output by output.
     """
 
-    schema_version: int = 1
+    FILE = "global_sensitivity.json"
+
     method: Method
     bounds: dict[str, tuple[float, float]]
     simulations: int
     crashed: int
     indices: list[SensitivityIndex]
 
-
-def write_global(indices: GlobalSensitivity, folder: Path) -> None:
-    """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
-    write_text(folder / GLOBAL_FILE, indices.model_dump_json(indent=1) + "\n")
-    header = ("coefficient", "flight", "channel", *MEANING[indices.method])
-    rows = [
-        [
-            index.coefficient,
-            index.flight or "all",
-            index.channel or "all",
-            index.main,
-            index.total,
-            index.spread,
+    def write(self, folder: Path) -> None:
+        """Write ``global_sensitivity.json`` and, for other programs, ``.csv``."""
+        super().write(folder)
+        header = ("coefficient", "flight", "channel", *MEANING[self.method])
+        rows = [
+            [i.coefficient, i.flight or "all", i.channel or "all", i.main, i.total, i.spread]
+            for i in self.indices
         ]
-        for index in indices.indices
-    ]
-    write_text(folder / GLOBAL_TABLE, csv_text(header, rows))
-
-
-def read_global(folder: Path) -> GlobalSensitivity | None:
-    """Read ``global_sensitivity.json``; None where there is none."""
-    return read_optional(GlobalSensitivity, folder / GLOBAL_FILE)
+        write_text(folder / GLOBAL_TABLE, csv_text(header, rows))

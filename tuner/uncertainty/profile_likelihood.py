@@ -74,7 +74,7 @@ def profile_likelihood(
         name=name,
         unit=COEFFICIENTS[name].unit,
         values=values,
-        rise=[float(value) if np.isfinite(value) else None for value in rise],
+        rise=rise.tolist(),
         quadratic=quadratic.tolist(),
         interval=_crossings(np.array(values), rise),
     )

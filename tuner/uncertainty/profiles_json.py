@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from tuner.disk import write_text
-from tuner.files import Part, csv_text, read_optional
+from tuner.files import FiniteOrNone, Part, ResultFile, csv_text
 
-PROFILES_FILE = "profiles.json"
 PROFILES_TABLE = "profiles.csv"
 THRESHOLD = 3.841459
 """Rise of χ² (one degree of freedom) at the true value that 95 % of experiments stay below."""
@@ -35,31 +33,25 @@ class Profile(Part):
     name: str
     unit: str
     values: list[float]
-    rise: list[float | None]
+    rise: list[FiniteOrNone]
     quadratic: list[float]
     interval: tuple[float | None, float | None]
 
 
-class Profiles(Part):
+class Profiles(ResultFile):
     """The content of ``profiles.json``."""
 
-    schema_version: int = 1
+    FILE = "profiles.json"
+
     profiles: list[Profile]
 
-
-def write_profiles(profiles: Sequence[Profile], folder: Path) -> None:
-    """Write ``profiles.json`` and, for other programs, ``profiles.csv``."""
-    text = Profiles(profiles=list(profiles)).model_dump_json(indent=1) + "\n"
-    write_text(folder / PROFILES_FILE, text)
-    rows = [
-        [profile.name, *row]
-        for profile in profiles
-        for row in zip(profile.values, profile.rise, profile.quadratic, strict=True)
-    ]
-    header = ("coefficient", "value", "chi_square_rise", "quadratic")
-    write_text(folder / PROFILES_TABLE, csv_text(header, rows))
-
-
-def read_profiles(folder: Path) -> Profiles | None:
-    """Read ``profiles.json``; None where there is none."""
-    return read_optional(Profiles, folder / PROFILES_FILE)
+    def write(self, folder: Path) -> None:
+        """Write ``profiles.json`` and, for other programs, ``profiles.csv``."""
+        super().write(folder)
+        rows = [
+            [profile.name, *row]
+            for profile in self.profiles
+            for row in zip(profile.values, profile.rise, profile.quadratic, strict=True)
+        ]
+        header = ("coefficient", "value", "chi_square_rise", "quadratic")
+        write_text(folder / PROFILES_TABLE, csv_text(header, rows))

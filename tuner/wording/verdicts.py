@@ -16,6 +16,8 @@ def verdict_in_words(verdict: Verdict) -> str:
 def judgement_in_words(verdict: Verdict, reason: Reason) -> str:
     """Return a verdict and its reason, as a phrase."""
     because = reason_in_words(reason)
+    if verdict is Verdict.TIED and because:  # which names what it is tied to
+        return because
     return f"{verdict_in_words(verdict)}: {because}" if because else verdict_in_words(verdict)
 
 

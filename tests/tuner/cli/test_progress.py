@@ -3,12 +3,20 @@
 from types import SimpleNamespace
 
 from tuner.cli.progress import listening
-from tuner.search.fitted import Iteration
+from tuner.search.iteration import Iteration
 
 
 def iterations(stage, count, first=1):
     return [
-        Iteration(stage, number, 1.0 / number, 0.1 / number, accepted=True, horizon=2.0)
+        Iteration(
+            stage=stage,
+            number=number,
+            loss=1.0 / number,
+            position_rmse=0.1 / number,
+            accepted=True,
+            horizon=2.0,
+            damping=None if stage == "2 s" else 0.5,
+        )
         for number in range(first, first + count)
     ]
 

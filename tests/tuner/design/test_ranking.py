@@ -15,8 +15,6 @@ from tuner.design import candidate_problem
 from tuner.design.candidates import CLEARANCE, Arena, candidates
 from tuner.design.next_flight_json import (
     Proposals,
-    read_proposals,
-    write_proposals,
 )
 from tuner.design.ranking import rank_next_flights
 from tuner.errors import InputError
@@ -125,8 +123,8 @@ def test_an_arena_that_nothing_fits_is_refused(numbers: tuple[float, ...]) -> No
 
 
 def test_proposals_can_be_read_back(proposals: Proposals, tmp_path: Path) -> None:
-    write_proposals(proposals, tmp_path)
-    assert read_proposals(tmp_path) == proposals
+    proposals.write(tmp_path)
+    assert Proposals.read(tmp_path) == proposals
     lines = (tmp_path / "next_flight.csv").read_text().splitlines()
     assert len(lines) == 1 + len(proposals.flights)
     assert lines[0].startswith("flight,mean_shrink,volume_shrink,")

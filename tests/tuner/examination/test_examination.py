@@ -14,7 +14,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.examination.examination import Examination, examine
 from tuner.examination.knowledge import knowledge_of, shortest_half
-from tuner.examination.sensitivity_json import Knowledge, read_knowledge
+from tuner.examination.sensitivity_json import Knowledge
 from tuner.examination.tables import write_files
 from tuner.objective.flight_batches import portions
 from tuner.objective.normal import Objective
@@ -144,7 +144,7 @@ def test_half_of_an_effect_is_where_it_is() -> None:
 
 def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
     write_files(knowledge, tmp_path)
-    assert read_knowledge(tmp_path) == knowledge
+    assert Knowledge.read(tmp_path) == knowledge
     rows = list(csv.DictReader(io.StringIO((tmp_path / "sensitivity.csv").read_text())))
     assert {row["coefficient"] for row in rows} == set(knowledge.coefficients)
     assert len(rows) == len(knowledge.coefficients) * 26

@@ -11,7 +11,6 @@ from tuner.result import (
     RunResult,
     SearchResult,
     read_run,
-    write_result,
 )
 
 MODELS = Path(__file__).resolve().parents[3] / "examples" / "models"
@@ -92,7 +91,7 @@ def make_run(tmp_path):
                 message="no_further_gain",
             ),
         )
-        write_result(result, folder)
+        result.write(folder)
         return read_run(folder)
 
     return make

@@ -11,6 +11,7 @@ from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export
 from tuner.exporters.gates import check
+from tuner.wording.exports import export_sentence
 
 TODAY = date(2024, 5, 6)
 
@@ -164,14 +165,17 @@ def test_a_job_exports_what_it_asks_for_and_says_what_is_refused(make_run):
     run = make_run()
     model = MODELS / "quad_x.sdf"
     asked = ExportSettings(formats=("yaml", "sdf", "px4"), into=model)
-    lines = list(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
+    written = dict(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
     folder = run.folder / "export"
     names = ["hovergames_updated.yaml", "quad_x.sdf", "hovergames_updated.params"]
-    assert lines == [f"exported {folder / name}" for name in names]
+    assert list(written.values()) == [folder / name for name in names]
+    sentence = export_sentence("sdf", written["sdf"])
+    assert sentence == f"The sdf export was written to {folder / 'quad_x.sdf'}."
     assert (folder / "quad_x.sdf").read_text() != model.read_text()
     make_run(**BAD[0][0])
-    lines = list(exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY))
-    assert all(line.startswith("not exported as ") and "held position" in line for line in lines)
+    for kind, refusal in exports_of_job(run.folder, asked, refly=as_the_run_says, today=TODAY):
+        assert export_sentence(kind, refusal).startswith(f"The {kind} export was refused: ")
+        assert "held position" in str(refusal)
 
 
 def test_a_file_that_would_not_read_back_is_not_written(tmp_path, make_run):

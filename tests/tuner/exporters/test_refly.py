@@ -24,7 +24,6 @@ from tuner.result import (
     RunResult,
     SearchResult,
     read_run,
-    write_result,
 )
 
 
@@ -79,7 +78,7 @@ def run(bag, flight, updated, tmp_path):
             message="no_further_gain",
         ),
     )
-    write_result(result, tmp_path)
+    result.write(tmp_path)
     write_vehicle(updated, tmp_path / "best_fit.yaml")
     return read_run(tmp_path)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, SignalErrors
+from tuner.comparison.tabulate import table_of
 from tuner.config import VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.examination.sensitivity_json import (
     CoefficientKnowledge,
@@ -18,8 +19,8 @@ from tuner.examination.sensitivity_json import (
     ResidualWhiteness,
 )
 from tuner.examination.tables import write_files
-from tuner.report import write_laps, write_traces
-from tuner.report.record import Move, SearchRecord, Start
+from tuner.report import write_traces
+from tuner.report.record import SearchRecord, Start
 from tuner.result import (
     CoefficientResult,
     Ending,
@@ -27,8 +28,8 @@ from tuner.result import (
     RunResult,
     SearchResult,
     Status,
-    write_result,
 )
+from tuner.search.iteration import Iteration
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
 from tuner.wording.verdicts import judgement_in_words
@@ -46,18 +47,19 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
     initial = {name: _errors(name, 0.2) for name in FLIGHTS}
     best = {name: _errors(name, 0.002) for name in FLIGHTS}
-    write_laps(folder, initial, best)
+    table_of({"initial": initial, "best": best}).write(folder)
     write_traces(folder, initial, best)
     values = values_of(vehicle)
     SearchRecord(
         iterations=[
-            Move(
+            Iteration(
                 stage="whole flights",
                 number=n,
                 loss=10.0**-n,
                 position_rmse=0.1**n,
                 accepted=True,
                 horizon=6.0,
+                damping=10.0**-n,
             )
             for n in range(4)
         ],
@@ -69,7 +71,7 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     ).write(folder)
     knowledge = _knowledge(vehicle, free, undetermined)
     write_files(knowledge, folder)
-    write_result(_result(vehicle, knowledge, initial, best), folder)
+    _result(vehicle, knowledge, initial, best).write(folder)
 
 
 def _errors(name: str, size: float) -> FlightErrors:
@@ -110,7 +112,7 @@ def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Directio
             for channel, (unit, axes) in CHANNELS.items()
             for axis in axes
         ],
-        acting=[
+        effects_over_time=[
             EffectOverTime(
                 flight=flight,
                 time=time.tolist(),

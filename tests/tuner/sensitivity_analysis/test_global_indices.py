@@ -13,8 +13,6 @@ from tuner.sensitivity_analysis.global_indices import _outputs, global_sensitivi
 from tuner.sensitivity_analysis.global_sensitivity_json import (
     GlobalSensitivity,
     Method,
-    read_global,
-    write_global,
 )
 
 FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
@@ -56,8 +54,8 @@ def test_indices_put_first_what_matters_most(
     }
     assert spin["moment_constant"] > spin["rolling_moment_coefficient"]
     assert indices(objective, method, samples) == result
-    write_global(result, tmp_path)
-    assert read_global(tmp_path) == result
+    result.write(tmp_path)
+    assert GlobalSensitivity.read(tmp_path) == result
     lines = (tmp_path / "global_sensitivity.csv").read_text().splitlines()
     assert len(lines) == 1 + len(FREE) * (1 + 8)
 

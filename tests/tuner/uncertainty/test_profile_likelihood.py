@@ -15,7 +15,7 @@ from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.profile_likelihood import profile_likelihood
-from tuner.uncertainty.profiles_json import Profile, read_profiles, write_profiles
+from tuner.uncertainty.profiles_json import Profile, Profiles
 
 FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
 
@@ -64,8 +64,8 @@ def test_what_is_not_identifiable_has_an_open_profile(
         examination.full_problem, examination.uncertainty, criterion, "rolling_moment_coefficient"
     )
     assert rolling.interval == (None, None)
-    write_profiles([known, rolling], tmp_path)
-    read = read_profiles(tmp_path)
+    Profiles(profiles=[known, rolling]).write(tmp_path)
+    read = Profiles.read_if_any(tmp_path)
     assert read is not None
     assert read.profiles == [known, rolling]
 

@@ -69,7 +69,7 @@ def test_held_tied_and_fixed_coefficients() -> None:
         "; fitted with input_scaling held at its initial value"
     )
     tied = Reason(code=ReasonCode.INTERVAL, half_width=0.01, tied_to="inertia_xx")
-    assert judgement_in_words(Verdict.TIED, tied) == "tied: tied to inertia_xx: ±1 % (95 %)"
+    assert judgement_in_words(Verdict.TIED, tied) == "tied to inertia_xx: ±1 % (95 %)"
     assert judgement_in_words(Verdict.FIXED, NOT_FITTED) == "fixed"
 
 

@@ -15,13 +15,13 @@ from tuner.report.sections.effects import effects
 from tuner.report.sections.errors import errors
 from tuner.report.sections.findings import findings
 from tuner.report.sections.flights import flights
+from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
 from tuner.report.sections.profiles import profiles
 from tuner.report.sections.provenance import provenance
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
-from tuner.report.sections.whole_range import whole_range
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
@@ -32,7 +32,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     information,
     next_flight,
     profiles,
-    whole_range,
+    global_sensitivity,
     residuals,
     search,
     provenance,

@@ -48,7 +48,7 @@ def effects(contents: Contents) -> Section | None:
         "table": table,
     }
     charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
-    return Section("effects", "What each coefficient does", values, charts)
+    return Section("effects", "Local sensitivity", values, charts)
 
 
 def _of(knowledge: Knowledge, channel: str) -> list[OutputSensitivity]:
@@ -99,23 +99,23 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
 
 def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
     charts = []
-    for acting in knowledge.acting:
-        start_of = "a window" if acting.windowed else "the mission"
+    for over_time in knowledge.effects_over_time:
+        start_of = "a window" if over_time.windowed else "the mission"
         rows, texts = [], []
         for name in names:
-            change = np.array(acting.change[name])
+            change = np.array(over_time.change[name])
             largest = max(float(change.max()), 1e-300)
-            start, end = acting.span[name]
+            start, end = over_time.span[name]
             rows.append((change / largest).round(3).tolist())
             texts.append(
                 [
                     f"{name}: {c:.3g} σ at {t:.1f} s<br>half of its effect from {start:.1f} "
                     f"to {end:.1f} s"
-                    for t, c in zip(acting.time, change, strict=True)
+                    for t, c in zip(over_time.time, change, strict=True)
                 ]
             )
         heat = Heat(
-            columns=acting.time,
+            columns=over_time.time,
             rows=_labels(knowledge, names),
             values=rows,
             text=texts,
@@ -123,8 +123,8 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
         )
         charts.append(
             Chart(
-                key=f"{acting.flight}_acts",
-                title=f"{acting.flight}: when each coefficient acts",
+                key=f"{over_time.flight}_effects",
+                title=f"{over_time.flight}: when each coefficient acts",
                 panels=(Panel((heat,)),),
                 x_title=f"time since {start_of}'s start [s]",
                 height=130 + 20 * len(names),

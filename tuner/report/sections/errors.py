@@ -31,7 +31,7 @@ def errors(contents: Contents) -> Section | None:
         for flight in contents.run.result.flights
     ]
     values = {"axes": AXES, "rows": rows, "laps": _laps(contents)}
-    return Section("errors", "How closely the flights are met", values)
+    return Section("errors", "RMSE of each flight", values)
 
 
 def _pairs(before: AxesRmse, after: AxesRmse) -> list[tuple[float | None, float | None]]:

@@ -36,7 +36,7 @@ def information(contents: Contents) -> Section | None:
     charts = [_by_channel(knowledge), _by_flight(knowledge)]
     if len(knowledge.names) > 1:
         charts.append(_correlation(knowledge))
-    return Section("information", "Where the knowledge comes from", values, charts)
+    return Section("information", "Information and correlation", values, charts)
 
 
 def _biases(knowledge: Knowledge) -> list[Bias]:

@@ -18,7 +18,7 @@ def search(contents: Contents) -> Section | None:
         charts = [*_waterfall(contents.search), *_trace(contents.search)]
     result = contents.run.result.search
     values = {"search": result, "ending": ending_sentence(result.message)}
-    return Section("search", "How the search went", values, charts)
+    return Section("search", "Search", values, charts)
 
 
 def _waterfall(record: SearchRecord) -> list[Chart]:
@@ -48,7 +48,7 @@ def _waterfall(record: SearchRecord) -> list[Chart]:
     return [
         Chart(
             key="waterfall",
-            title="Where each start ended",
+            title="Loss at the end of each start",
             caption=several + (f" {failed} starts failed." if failed else ""),
             panels=(Panel(marks, y_title="loss", y_scale="log"),),
             x_title="starts, best first",
@@ -58,20 +58,21 @@ def _waterfall(record: SearchRecord) -> list[Chart]:
 
 
 def _trace(record: SearchRecord) -> list[Chart]:
-    moves = record.iterations
-    if not moves:
+    iterations = record.iterations
+    if not iterations:
         return []
-    steps = [float(number) for number in range(1, len(moves) + 1)]
-    texts = [f"{m.stage}, {'better' if m.accepted else 'tried, not kept'}" for m in moves]
+    steps = [float(number) for number in range(1, len(iterations) + 1)]
+    texts = [f"{m.stage}, {'better' if m.accepted else 'tried, not kept'}" for m in iterations]
     rows = (
-        ("loss", [m.loss for m in moves], Look(FITTED.colour, marks=True), "log"),
+        ("loss", [m.loss for m in iterations], Look(FITTED.colour, marks=True), "log"),
         (
             "position RMSE [m]",
-            [m.position_rmse for m in moves],
+            [m.position_rmse for m in iterations],
             Look(INITIAL.colour, marks=True),
             "log",
         ),
-        ("horizon [s]", [m.horizon for m in moves], Look(PALETTE[2], marks=True), "linear"),
+        ("damping λ", [m.damping for m in iterations], Look(PALETTE[3], marks=True), "log"),
+        ("horizon [s]", [m.horizon for m in iterations], Look(PALETTE[2], marks=True), "linear"),
     )
     panels = [
         Panel(
@@ -85,11 +86,12 @@ def _trace(record: SearchRecord) -> list[Chart]:
     return [
         Chart(
             key="trace",
-            title="The way there",
+            title="Iterations",
             caption="Each stage weighs and compares more of the flights than the one before, so "
-            "that losses of different stages do not compare.",
+            "that losses of different stages do not compare. Damping is the λ of the "
+            "Levenberg-Marquardt step that follows.",
             panels=panels,
             x_title="iteration",
-            height=480,
+            height=160 * len(panels),
         )
     ]

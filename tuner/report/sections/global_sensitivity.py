@@ -8,15 +8,13 @@ from tuner.report.section import Section
 from tuner.sensitivity_analysis.global_sensitivity_json import MEANING, GlobalSensitivity
 
 
-def whole_range(contents: Contents) -> Section | None:
+def global_sensitivity(contents: Contents) -> Section | None:
     """Return the indices over all and for each channel of each flight."""
-    indices = contents.whole_range
+    indices = contents.global_sensitivity
     if indices is None:
         return None
-    values = {"found": indices, "meaning": MEANING[indices.method]}
-    return Section(
-        "whole_range", "Over the whole range", values, (_over_all(indices), _each(indices))
-    )
+    charts = (_over_all(indices), _each(indices))
+    return Section("global_sensitivity", "Global sensitivity", {"indices": indices}, charts)
 
 
 def _over_all(indices: GlobalSensitivity) -> Chart:

@@ -1,0 +1,37 @@
+"""One step of a search, as the terminal shows it and as checkpoint and ``search.json`` keep it."""
+
+from __future__ import annotations
+
+from tuner.files import FiniteOrNone, Part
+
+
+class Iteration(Part):
+    """One step of a search.
+
+    Attributes
+    ----------
+    stage
+        Name of the stage of the continuation.
+    number
+        Counts all iterations of the search.
+    loss
+        Half the mean squared residual after the step, in (scaled) standard deviations.
+    position_rmse
+        m, over all fitted flights up to the horizon, at the point tried; None where no position
+        is compared.
+    accepted
+        Whether the step was kept.
+    horizon
+        s.
+    damping
+        λ of the Levenberg-Marquardt step that follows, relative to the Hessian per compared value;
+        None for CMA-ES.
+    """
+
+    stage: str
+    number: int
+    loss: float
+    position_rmse: FiniteOrNone
+    accepted: bool
+    horizon: float
+    damping: FiniteOrNone = None
