@@ -20,7 +20,7 @@ from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
-from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_rk4, step_semi_implicit
+from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switched, unpacked
@@ -46,10 +46,9 @@ class Sample(eqx.Module):
     setpoints: Setpoints
 
 
-_INTEGRATORS = {
+_INTEGRATORS: dict[str, Integrator] = {
     "midpoint": step_midpoint,
     "semi_implicit": step_semi_implicit,
-    "rk4": step_rk4,
 }
 
 
@@ -176,7 +175,8 @@ class Plant(eqx.Module):
             air = Air.around(self.vehicle, motion, self.environment)
             return total_wrench(self.vehicle, motion, acting, air)
 
-        advance = _INTEGRATORS[self.schedule.integrator]
+        integrator = self.schedule.integrator
+        advance = _INTEGRATORS[integrator] if isinstance(integrator, str) else integrator
         motion = advance(
             self.vehicle.body, state.motion, wrench_at, self.schedule.step, gravity=self.gravity
         )

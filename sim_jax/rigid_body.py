@@ -6,10 +6,8 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.numeric import GRAVITY
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
@@ -60,6 +58,9 @@ class Wrench(eqx.Module):
 
 WrenchAt: TypeAlias = Callable[[Motion], Wrench]
 """Motion -> what acts in it on the centre of mass."""
+
+Integrator: TypeAlias = Callable[..., Motion]
+"""(body, motion, wrench_at, step in s, gravity in m/s²) -> the motion a step later."""
 
 
 def acceleration(
@@ -138,37 +139,3 @@ def step_midpoint(
         attitude=motion.attitude.advanced(middle.attitude, middle.body_rate, step),
         body_rate=motion.body_rate + turn * step,
     )
-
-
-def step_rk4(
-    body: Body, motion: Motion, wrench_at: WrenchAt, step: float, *, gravity: float = GRAVITY
-) -> Motion:
-    """Advance by the classical Runge-Kutta step: four evaluations, fourth order.
-
-    What the others are measured against. ``step`` in s, ``gravity`` in m/s².
-    """
-
-    def slope(at: Motion) -> Motion:
-        wrench = wrench_at(at)
-        return Motion(
-            position=at.velocity,
-            velocity=acceleration(body, at.attitude, wrench.force, gravity=gravity),
-            attitude=at.attitude.times_vector(at.body_rate * 0.5),
-            body_rate=angular_acceleration(body, at.body_rate, wrench.moment),
-        )
-
-    def stage(
-        so_far: tuple[Motion, Motion], numbers: tuple[Scalar, Scalar]
-    ) -> tuple[tuple[Motion, Motion], None]:
-        last, change = so_far
-        reach, weight = numbers
-        here = slope(jax.tree.map(lambda at, rate: at + rate * reach, motion, last))
-        return (here, jax.tree.map(lambda sum_, rate: sum_ + rate * weight, change, here)), None
-
-    still = jax.tree.map(jnp.zeros_like, motion)
-    dtype = motion.position.x.dtype
-    reaches = jnp.asarray([0.0, 0.5, 0.5, 1.0], dtype) * step
-    weights = jnp.asarray([1.0, 2.0, 2.0, 1.0], dtype) * (step / 6.0)
-    (_, change), _ = jax.lax.scan(stage, (still, still), (reaches, weights))
-    after: Motion = jax.tree.map(jnp.add, motion, change)
-    return Motion(after.position, after.velocity, after.attitude.normalized(), after.body_rate)

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Bool, Int
 
+from sim_jax.rigid_body import Integrator
+
 
 class Schedule(eqx.Module):
     """The rates of a simulated flight; all static, each combination compiles once."""
@@ -22,11 +24,12 @@ class Schedule(eqx.Module):
     """Hz of position and attitude control, and of the reference."""
     log_rate: int = eqx.field(static=True, default=100)
     """Hz of the logged samples; divides physics_rate."""
-    integrator: Literal["midpoint", "semi_implicit", "rk4"] = eqx.field(
+    integrator: Literal["midpoint", "semi_implicit"] | Integrator = eqx.field(
         static=True, default="midpoint"
     )
-    """Second order with the rotors' mean speed over the step; first order as Gazebo's engine; or
-    fourth order. The last two hold the rotor speed of before the step, as Gazebo does."""
+    """Second order with the rotors' mean speed over the step; first order as Gazebo's engine; or a
+    function that takes the step. The last two hold the rotor speed of before the step, as Gazebo
+    does."""
     pose_rate: float | None = eqx.field(static=True, default=None)
     """Hz at which poses reach the controller, which keeps the last in between; None: every tick."""
     longest_estimate_latency: float = eqx.field(static=True, default=0.0)

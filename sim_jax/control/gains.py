@@ -67,9 +67,6 @@ class MixerSettings(eqx.Module):
     """THR_MDL_FAC: 0 linear, 1 thrust proportional to the squared command."""
     pwm_quantisation: bool = eqx.field(static=True, default=False)
     """Truncate commands to whole PWM microseconds, as PX4's output does."""
-    single_precision: bool = eqx.field(static=True, default=False)
-    """Round after every operation as PX4's arithmetic does. Matters to the last PWM microsecond
-    only; needs a rollout in double precision to be exact."""
 
 
 class Controller(eqx.Module):

@@ -3,7 +3,6 @@
 PX4 shifts the outputs along thrust, roll, pitch and yaw in turn until what overshoots is balanced.
 For a quad X the end of each such shift is known: the amount along the direction comes to lie within
 the interval that saturates nothing or, where there is none, in the middle of the two limits.
-`desaturation` holds the steps themselves.
 """
 
 from __future__ import annotations
@@ -11,22 +10,28 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sim_jax.control.desaturation import (
-    HALF_SQRT2,
-    YAW_HEADROOM,
-    desaturated,
-    exact,
-    linearised,
-    single,
-)
 from sim_jax.control.gains import MixerSettings
 from sim_jax.control.rate import Saturation
-from sim_jax.numeric import Flag, Scalar, anyone, larger, magnitude, saturate, smaller
+from sim_jax.numeric import (
+    Flag,
+    Scalar,
+    anyone,
+    larger,
+    magnitude,
+    safe_sqrt,
+    saturate,
+    smaller,
+)
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
 
 ROTORS = 4
 """How many rotors a quad X has."""
+HALF_SQRT2 = 0.7071070075035095
+"""PX4's own rounding in its generated mixer table: 0.707107 in single precision."""
+YAW_HEADROOM = 1.149999976158142
+"""Upper limit while yaw is mixed in, 1.15 in single precision: some yaw response is left at full
+thrust."""
 LOW_CLIP = 0.00499998
 """A command below this counts as clipped low. PX4 asks for output < -0.99 on its -1..1 scale in
 single precision, where a command of exactly 0.005 comes out as -0.99 and does not count."""
@@ -87,10 +92,24 @@ def _outputs(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
     return _sum(roll, pitch, yaw, thrust)
 
 
-def _quantised(command: Scalar) -> Scalar:
+def single(value: Scalar) -> Scalar:
+    """Round to single precision, whatever precision the rollout runs in."""
+    return jax.lax.reduce_precision(value, exponent_bits=8, mantissa_bits=23)
+
+
+def quantised(command: Scalar) -> Scalar:
     """Truncate to whole microseconds of a 1000..2000 pulse; the derivative passes straight."""
     pulse = jnp.floor(single(1500.0 + single(500.0 * single(2.0 * command - 1.0))))
     return command + jax.lax.stop_gradient((pulse - 1000.0) * 1e-3 - command)
+
+
+def _linearised(output: Scalar, thrust_factor: float) -> Scalar:
+    """Invert thrust = (1 - f)·u + f·u², PX4's model of the command's curve."""
+    factor = jnp.asarray(thrust_factor, output.dtype)
+    linear = 1.0 - factor
+    square = (linear * linear) / (4.0 * factor * factor)
+    positive = jnp.where(output < 0, 0.0, output)
+    return safe_sqrt(square + positive / factor) - linear / (2.0 * factor)
 
 
 def _outside(middle: Scalar, reach: Scalar) -> Flag:
@@ -132,17 +151,13 @@ def mix(
     """
     within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
     thrust = saturate(thrust, 0.0, 1.0)
-    rounded = single if settings.single_precision else exact
-    if settings.single_precision:
-        outputs = desaturated(rounded, settings.airmode, within, thrust)
-    else:
-        outputs = _desaturated_where_needed(settings.airmode, within, thrust, counts)
+    outputs = _desaturated_where_needed(settings.airmode, within, thrust, counts)
     if settings.thrust_factor > 0:
-        a, b, c, d = (linearised(rounded, out, settings.thrust_factor) for out in outputs)
+        a, b, c, d = (_linearised(out, settings.thrust_factor) for out in outputs)
         outputs = (a, b, c, d)
     a, b, c, d = (saturate(out, 0.0, 1.0) for out in outputs)
     if settings.pwm_quantisation:
-        a, b, c, d = (_quantised(out) for out in (a, b, c, d))
+        a, b, c, d = (quantised(out) for out in (a, b, c, d))
     return a, b, c, d
 
 

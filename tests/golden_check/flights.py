@@ -21,6 +21,7 @@ from sim_jax.state import hover
 from sim_jax.trajectory import Publication, publish
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
 from tests.golden_check.controllers import golden_controller
+from tests.golden_check.runge_kutta import step_rk4
 from tests.golden_check.table import Deviation, Table, deviation
 from tests.golden_check.trajectories import SHAPES
 
@@ -78,7 +79,7 @@ def fly(mission: Mission, table: Table) -> list[Deviation]:
     flown = _rollout(
         vehicle,
         golden_controller(Filters(None, None), MixerSettings(pwm_quantisation=True)),
-        Schedule(physics_rate=PHYSICS_RATE, rate_control_rate=RATE_LOOP, integrator="rk4"),
+        Schedule(physics_rate=PHYSICS_RATE, rate_control_rate=RATE_LOOP, integrator=step_rk4),
         _inlet(mission, sent),
         hover(vehicle, place, gravity=GOLDEN_GRAVITY),
         samples=samples,

@@ -19,6 +19,7 @@ from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tests.golden_check.coefficients import GOLDEN_GRAVITY, golden_vehicle
 from tests.golden_check.controllers import golden_controller
+from tests.golden_check.runge_kutta import step_rk4
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
 WRENCH = 1e-9
@@ -86,7 +87,7 @@ def _open_loop(table: Table) -> list[Deviation]:
     flown = _rollout(
         vehicle,
         golden_controller(Filters(None, None), MixerSettings()),
-        Schedule(physics_rate=RATE, rate_control_rate=RATE, log_rate=RATE, integrator="rk4"),
+        Schedule(physics_rate=RATE, rate_control_rate=RATE, log_rate=RATE, integrator=step_rk4),
         ActuatorInlet((a, b, c, d)),
         Start(motion, speeds, (a[0], b[0], c[0], d[0]), Vec3.zeros(a[0])),
         samples=len(held),

@@ -11,6 +11,7 @@ from sim_jax.control.gains import Filters, MixerSettings, RateGains
 from sim_jax.sensing import GyroFilter, GyroMemory, filtered
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
+from tests.golden_check import stepwise_mixer
 from tests.golden_check.controllers import hovergames_rates
 from tests.golden_check.table import Deviation, Table, deviation, merged
 
@@ -97,23 +98,19 @@ def mixer_quad_x(table: Table) -> list[Deviation]:
 
 
 def _mixer_part(table: Table) -> list[Deviation]:
-    def settings(*, quantised: bool = False, single_precision: bool = True) -> MixerSettings:
-        return MixerSettings(
-            airmode=int(table.only("airmode")),  # type: ignore[arg-type]
-            thrust_factor=table.only("thrust_factor"),
-            pwm_quantisation=quantised,
-            single_precision=single_precision,
-        )
-
+    settings = MixerSettings(
+        airmode=int(table.only("airmode")),  # type: ignore[arg-type]
+        thrust_factor=table.only("thrust_factor"),
+    )
     torque, thrust = _torque(table), table.column("thrust")
-    commands = mixer.mix(settings(), torque, thrust)
-    pulses = mixer.mix(settings(quantised=True), torque, thrust)
-    saturation = mixer.saturation(settings(), commands)
+    commands = stepwise_mixer.mix(mixer.single, settings, torque, thrust)
+    pulses = tuple(mixer.quantised(command) for command in commands)
+    saturation = mixer.saturation(settings, commands)
     wanted = [
         [table.column(f"{axis}_{sign}") for axis in ("roll", "pitch", "yaw")]
         for sign in ("pos", "neg")
     ]
-    closed = mixer.mix(settings(single_precision=False), torque, thrust)
+    closed = mixer.mix(settings, torque, thrust)
     return [
         deviation("outputs", _outputs(commands), table.four("out"), MIXER),
         # The root in the thrust curve magnifies the rounding of an output near zero.

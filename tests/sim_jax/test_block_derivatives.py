@@ -11,8 +11,8 @@ import pytest
 from jax import Array
 
 from sim_jax.control import attitude, mixer, position, rate
-from sim_jax.control.desaturation import HALF_SQRT2
 from sim_jax.control.gains import Filters, MixerSettings, PositionGains
+from sim_jax.control.mixer import HALF_SQRT2
 from sim_jax.control.position import ReferencePoint
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit

@@ -8,9 +8,10 @@ import jax
 import pytest
 
 from sim_jax.numeric import GRAVITY
-from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_rk4, step_semi_implicit
+from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body
+from tests.golden_check.runge_kutta import step_rk4
 from tests.sim_jax.support import apart, quaternion, vec
 
 Step = Callable[..., Motion]

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from sim_jax.control import mixer
-from sim_jax.control.desaturation import HALF_SQRT2, PITCH, ROLL, YAW, desaturated, exact
 from sim_jax.control.gains import MixerSettings
+from sim_jax.control.mixer import HALF_SQRT2
 from sim_jax.vector import Vec3
+from tests.golden_check import stepwise_mixer
+from tests.golden_check.stepwise_mixer import PITCH, ROLL, YAW, exact
 
 COUNT = 20_000
 AIRMODES = [0, 1, 2]
@@ -27,12 +29,16 @@ def asked(request: pytest.FixtureRequest) -> tuple[Vec3, jax.Array]:
     return Vec3.of(jnp.asarray(torque)), jnp.asarray(thrust)
 
 
+@pytest.mark.parametrize("thrust_factor", [0.0, 0.3])
 @pytest.mark.parametrize("airmode", AIRMODES)
-def test_closed_form_ends_where_px4s_steps_end(airmode: int, asked: tuple[Vec3, jax.Array]) -> None:
-    closed = mixer.mix(MixerSettings(airmode=airmode), *asked)  # type: ignore[arg-type]
-    steps = desaturated(exact, airmode, *asked)
+def test_closed_form_ends_where_px4s_steps_end(
+    airmode: int, thrust_factor: float, asked: tuple[Vec3, jax.Array]
+) -> None:
+    settings = MixerSettings(airmode=airmode, thrust_factor=thrust_factor)  # type: ignore[arg-type]
+    closed = mixer.mix(settings, *asked)
+    steps = stepwise_mixer.mix(exact, settings, *asked)
     for ours, theirs in zip(closed, steps, strict=True):
-        np.testing.assert_allclose(ours, np.clip(theirs, 0.0, 1.0), atol=1e-14)
+        np.testing.assert_allclose(ours, theirs, atol=1e-14)
 
 
 @pytest.mark.parametrize("airmode", AIRMODES)

@@ -1,4 +1,4 @@
-"""PX4's desaturation step by step, to the rounding: what `mixer` says in closed form.
+"""PX4's mixer step by step, to the rounding: what `sim_jax.control.mixer` has in closed form.
 
 Four outputs are shifted along one direction after the other until what overshoots on either side is
 balanced. It gives the same commands as the closed form, but for the rounding of single precision,
@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
-import jax
 import jax.numpy as jnp
 
+from sim_jax.control.gains import MixerSettings
+from sim_jax.control.mixer import HALF_SQRT2, YAW_HEADROOM
 from sim_jax.numeric import Scalar, safe_sqrt, saturate
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor
@@ -20,21 +21,10 @@ from sim_jax.vehicle import PerRotor
 Scales: TypeAlias = tuple[float, float, float, float]
 Rounding: TypeAlias = Callable[[Scalar], Scalar]
 
-HALF_SQRT2 = 0.7071070075035095
-"""PX4's own rounding in its generated mixer table: 0.707107 in single precision."""
 ROLL: Scales = (-HALF_SQRT2, HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
 PITCH: Scales = (HALF_SQRT2, -HALF_SQRT2, HALF_SQRT2, -HALF_SQRT2)
 YAW: Scales = (1.0, 1.0, -1.0, -1.0)
 THRUST: Scales = (1.0, 1.0, 1.0, 1.0)
-
-YAW_HEADROOM = 1.149999976158142
-"""Upper limit while yaw is mixed in, 1.15 in single precision: some yaw response is left at full
-thrust."""
-
-
-def single(value: Scalar) -> Scalar:
-    """Round to single precision, whatever precision the rollout runs in."""
-    return jax.lax.reduce_precision(value, exponent_bits=8, mantissa_bits=23)
 
 
 def exact(value: Scalar) -> Scalar:
@@ -42,18 +32,27 @@ def exact(value: Scalar) -> Scalar:
     return value
 
 
-def desaturated(rounded: Rounding, airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
-    """Return four outputs, which may still overshoot 0..1 where nothing can give way any more.
+def mix(rounded: Rounding, settings: MixerSettings, torque: Vec3, thrust: Scalar) -> PerRotor:
+    """Return four motor commands in 0..1, not in PWM steps.
 
     Parameters
     ----------
     rounded
-        What is done after every operation: `single` or `exact`.
-    airmode
-        0, 1 or 2.
+        What is done after every operation: `sim_jax.control.mixer.single` or `exact`.
+    settings
+        Airmode and thrust factor.
     torque, thrust
-        Normalised, within -1..1 and 0..1; FRD.
+        Normalised set-points, FRD.
     """
+    within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
+    outputs = _desaturated(rounded, settings.airmode, within, saturate(thrust, 0.0, 1.0))
+    if settings.thrust_factor > 0:
+        outputs = tuple(_linearised(rounded, out, settings.thrust_factor) for out in outputs)
+    return tuple(saturate(out, 0.0, 1.0) for out in outputs)
+
+
+def _desaturated(rounded: Rounding, airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
+    """Return four outputs, which may still overshoot 0..1 where nothing can give way any more."""
     still = jnp.zeros_like(torque.x)
     tilting = _add(rounded, (still, still, still, still), torque.x, ROLL)
     tilting = _add(rounded, tilting, torque.y, PITCH)
@@ -69,7 +68,7 @@ def desaturated(rounded: Rounding, airmode: int, torque: Vec3, thrust: Scalar) -
     return _mix_yaw(rounded, outputs, torque.z)
 
 
-def linearised(rounded: Rounding, output: Scalar, thrust_factor: float) -> Scalar:
+def _linearised(rounded: Rounding, output: Scalar, thrust_factor: float) -> Scalar:
     """Invert thrust = (1 - f)·u + f·u², PX4's model of the command's curve."""
     factor = jnp.asarray(thrust_factor, output.dtype)
     linear = rounded(1.0 - factor)
