@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tuner.errors import InputError, OutputError
+from tuner.errors import InputError, OutputError, RecordingError
 
 
 def write_text(path: Path, text: str) -> None:
@@ -151,3 +151,23 @@ def exists(path: Path) -> bool:
         raise InputError(
             path, f"cannot be read ({error.strerror})", "check the path and its rights"
         ) from None
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to read a recording, at its start or midway, into one line.
+
+    Midway it comes of a disk that fails or of a network drive that goes away.
+
+    Raises
+    ------
+    RecordingError
+        The system refused.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise RecordingError(path, "no such file", "check the path") from None
+    except OSError as error:
+        what = f"cannot be read ({error.strerror or error})"
+        raise RecordingError(path, what, "check its rights and the disk") from None

@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from tuner.errors import RecordingError
+from tuner.disk import readable
 
 logger = logging.getLogger(__name__)
 
@@ -47,12 +47,8 @@ def digest(path: Path) -> str:
     RecordingError
         A file cannot be read.
     """
-    try:
+    with readable(path):
         return _digest_of(path)
-    except OSError as error:
-        raise RecordingError(
-            path, f"cannot be read ({error.strerror})", "check its rights"
-        ) from None
 
 
 def _digest_of(path: Path) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.clock import fit_grid
 from tuner.flights.content import Content, Settings, given_map, read_content
@@ -48,12 +49,13 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
     settings = Settings(topics, namespace)
     sidecar = read_sidecar(path)
     given = given_map(path, settings, sidecar)
-    try:
-        content = read_content(path, settings, sidecar, given)
-    except RecordingError as err:
-        # Its topics are listed nevertheless, so that the user sees what to map.
-        recording = open_recording(path, given.messages if given else ())
-        return _without_flight(recording, err)
+    with readable(path):
+        try:
+            content = read_content(path, settings, sidecar, given)
+        except RecordingError as err:
+            # Its topics are listed nevertheless, so that the user sees what to map.
+            recording = open_recording(path, given.messages if given else ())
+            return _without_flight(recording, err)
     return _with_flight(content, sidecar)
 
 

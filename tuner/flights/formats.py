@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.recording import Recording
 
@@ -115,8 +116,8 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
     RecordingError
         It is missing, unreadable or of no known format.
     """
-    try:
-        start = b""
+    start = b""
+    with readable(path):
         if not path.is_dir():
             with path.open("rb") as stream:
                 start = stream.read(4096)
@@ -124,10 +125,6 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         for reader in READERS:
             if reader.matches(head):
                 return reader.open(path, messages)
-    except OSError as err:
-        missing = isinstance(err, FileNotFoundError)
-        what = "no such file" if missing else err.strerror or str(err)
-        raise RecordingError(path, what, "check the path") from None
     if start.startswith((b"\x1f\x8b", b"PK\x03\x04", b"BZh", b"\xfd7zXZ")):
         raise RecordingError(path, "is packed", "unpack it first")
     known = "; ".join(reader.files for reader in READERS)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.disk import exists
+from tuner.disk import exists, readable
 from tuner.errors import RecordingError
 from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.clock import Grid, fit_grid
@@ -169,7 +169,8 @@ def load_flights(
 def _read_flights(
     path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
 ) -> tuple[Flight, ...]:
-    content = read_content(path, settings, sidecar, given)
+    with readable(path):
+        content = read_content(path, settings, sidecar, given)
     if not content.missions:
         raise RecordingError(
             path,

@@ -1,5 +1,6 @@
 """Places that cannot be written to or read: one line, exit status 2, and nothing is touched."""
 
+import errno
 import hashlib
 import os
 from contextlib import suppress
@@ -107,6 +108,16 @@ def test_a_place_that_cannot_be_written_to(command, place, expected, lab, capsys
 @pytest.mark.parametrize(("command", "expected"), IN)
 def test_a_place_that_cannot_be_read(command, expected, lab, capsys):
     refused(command, expected, lab, capsys)
+
+
+@pytest.mark.parametrize("command", [COMPARE, ("inspect", "{bag}")])
+def test_a_disk_that_fails_midway_through_a_recording(command, lab, capsys, monkeypatch):
+    def fails(*_):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setenv("TUNE_CACHE_DIR", str(lab.parent / f"{lab.name}_cache"))
+    monkeypatch.setattr("tuner.flights.ros.bag1.Bag1._locate", fails)
+    refused(command, "spin.bag: cannot be read (Input/output error); check", lab, capsys)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
