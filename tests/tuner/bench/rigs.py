@@ -1,0 +1,155 @@
+"""Simulated rigs with known truth: noise, drift, tachometer outliers, a spring's offset, geometry read off a ruler."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+GRAVITY = 9.81
+TRUTH = {
+    "inertia_xx": 0.028,
+    "motor_constant": 1.45e-5,
+    "moment_constant": 0.033,
+    "input_scaling": 950.0,
+    "zero_position_armed": 100.0,
+    "battery_exponent": 0.9,
+    "time_constant_up": 0.03,
+    "time_constant_down": 0.05,
+    "actuator_latency": 0.004,
+    "rotor_drag_coefficient": 1.45e-4,
+}
+
+
+def outliers(random: np.random.Generator, speed: np.ndarray, share: float = 0.01) -> np.ndarray:
+    """Return a tachometer's series in which some samples are doubled or halved."""
+    wrong = random.random(len(speed)) < share
+    return np.where(wrong, speed * random.choice([0.5, 2.0], len(speed)), speed)
+
+
+def swing(random: np.random.Generator, *, amplitude: float = 0.15, seconds: float = 40.0):
+    """Return the samples of a bifilar pendulum and what a ruler reads of it."""
+    mass, distance, length = 2.243, 0.34, 1.14
+    inertia, damping = TRUTH["inertia_xx"], 0.03
+    stiffness = mass * GRAVITY * distance**2 / (4 * length)
+    step, rate = 1e-3, 100.0
+    angle, speed = amplitude, 0.0
+    states = []
+    for _ in range(
+        int(seconds / step)
+    ):  # exact law of a pendulum's restoring moment, midpoint steps
+        middle = angle + 0.5 * step * speed
+        pull = -stiffness / inertia * math.sin(middle) - 2 * damping * speed
+        speed += step * pull
+        angle = middle + 0.5 * step * speed
+        states.append(angle)
+    every = int(1 / rate / step)
+    series = np.array(states)[::every]
+    time = np.arange(len(series)) / rate
+    drift = random.normal(0, 0.01) + random.normal(0, 2e-4) * time
+    measured = series + drift + random.normal(0, 0.003, len(series))
+    ruler = {
+        "mass": mass + random.normal(0, 0.002),
+        "wire_distance": distance + random.normal(0, 0.0005),
+        "wire_length": length + random.normal(0, 0.002),
+    }
+    return {"time": time, "angle": measured}, ruler
+
+
+def stepped(levels, seconds: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and what was asked for, each level held for some s."""
+    count = int(seconds * rate)
+    return np.arange(count * len(levels)) / rate, np.repeat(np.asarray(levels, float), count)
+
+
+def lagged(asked: np.ndarray, constant: float, rate: float) -> np.ndarray:
+    """Return what follows with a first-order lag."""
+    series, level = np.empty_like(asked), asked[0]
+    decay = math.exp(-1 / (rate * constant))
+    for index, goal in enumerate(asked):
+        level = decay * level + (1 - decay) * goal
+        series[index] = level
+    return series
+
+
+def stand(random: np.random.Generator, *, slope: float, lever: float, noise: float = 0.05):
+    """Return the samples of a stand whose sensor reads slope·Ω²/lever, a spring's offset and drift."""
+    rate = 50.0
+    time, asked = stepped([300, 400, 480, 550, 610, 670, 600, 500, 380], 6.0, rate)
+    speed = lagged(asked, 0.15, rate)
+    force = slope * speed**2 / lever + random.normal(0, 0.3) + random.normal(0, 5e-4) * time
+    measured = outliers(random, speed + random.normal(0, 2.0, len(time)))
+    return {
+        "time": time,
+        "rotor_speed": measured,
+        "force": force + random.normal(0, noise, len(time)),
+    }
+
+
+def steps_of_command(random: np.random.Generator, *, voltage: bool = True):
+    """Return the samples of a bench run with command steps on a sagging battery."""
+    rate = 50.0
+    time, command = stepped([0.1, 0.25, 0.4, 0.55, 0.7, 0.6, 0.45, 0.3, 0.2, 0.65], 3.0, rate)
+    volts = 16.4 - 0.02 * time - 0.8 * command**2
+    gamma = TRUTH["battery_exponent"] if voltage else 0.0
+    asked = (TRUTH["input_scaling"] * command + TRUTH["zero_position_armed"]) * (
+        volts / 16.4
+    ) ** gamma
+    speed = lagged(asked, 0.05, rate) + random.normal(0, 3.0, len(time))
+    samples = {"time": time, "command": command, "rotor_speed": outliers(random, speed)}
+    if voltage:
+        samples["voltage"] = volts + random.normal(0, 0.02, len(time))
+    return samples
+
+
+def motor_steps(random: np.random.Generator, *, rate: float = 500.0, second: float = 0.0):
+    """Return the samples of step responses, the lag exact between the samples."""
+    time, command = stepped([0.4, 0.6, 0.4, 0.7, 0.45, 0.65, 0.4, 0.6, 0.45], 1.0, rate)
+    fine = 20
+    dense = np.repeat(command, fine)
+    delay = round(TRUTH["actuator_latency"] * rate * fine)
+    goal = np.full_like(dense, dense[0])
+    for edge in np.flatnonzero(np.diff(dense)) + 1:  # a step happens between two samples of the log
+        goal[edge - random.integers(0, fine) + delay :] = dense[edge]
+    level, slow = goal[0], goal[0]
+    series = np.empty_like(goal)
+    step = 1 / (rate * fine)
+    for index, asked in enumerate(goal):
+        series[index] = slow  # the value at the sample, before the command acts on the next piece
+        constant = TRUTH["time_constant_up"] if asked > level else TRUTH["time_constant_down"]
+        level += (1 - math.exp(-step / constant)) * (asked - level)
+        slow = level if second == 0 else slow + (1 - math.exp(-step / second)) * (level - slow)
+    speed = series[::fine] + random.normal(0, 4.0, len(time))
+    return {"time": time, "command": command, "rotor_speed": outliers(random, speed, 0.005)}
+
+
+def hovers(random: np.random.Generator, masses=(2.243, 2.343, 2.443, 2.543)):
+    """Return (mass, rotor speed) of hovers with weights."""
+    return [
+        (
+            m + random.normal(0, 0.002),
+            math.sqrt(m * GRAVITY / (4 * TRUTH["motor_constant"])) + random.normal(0, 3.0),
+        )
+        for m in masses
+    ]
+
+
+def spins(random: np.random.Generator, rates=(2.0, 3.0, 4.0), *, fast: bool = False):
+    """Return (yaw rate, slow pair, fast pair or None) of steady spins."""
+    points = []
+    for rate in rates:
+        ratio = TRUTH["rotor_drag_coefficient"] / (
+            TRUTH["moment_constant"] * TRUTH["motor_constant"]
+        )
+        difference = ratio * rate * 0.0625
+        total = 2.243 * GRAVITY / (2 * TRUTH["motor_constant"])
+        # slow² + (slow + difference)² = total
+        slow = (-difference + math.sqrt(2 * total - difference**2)) / 2
+        points.append(
+            (
+                rate,
+                slow + random.normal(0, 1.0),
+                slow + difference + random.normal(0, 1.0) if fast else None,
+            )
+        )
+    return points
