@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
+from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
@@ -54,64 +57,75 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
         if count < FEWEST:
             what = f"holds {count} steps {direction} of the command"
             raise RecordingError(path, what, f"record {FEWEST} or more in each direction")
-    bounds = np.concatenate([[0], edges, [len(time)]])
-    solution = _fit(time, speed, bounds, np.ones(len(time), bool), second=False)
-    spread = ROBUST * float(np.median(np.abs(solution.fun)))
-    kept = np.abs(_residual(solution.x, time, speed, bounds, second=False)) <= 2 * OUTLIER * spread
-    solution = _fit(time, speed, bounds, kept, second=False)
-    up, down, delay = solution.x[:3]
+    steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
+    kept = _near_neighbours(speed)
+    first = _fit(steps, speed, kept, second=False)
+    residual = steps.simulated(first, speed, kept) - speed
+    spread = ROBUST * float(np.median(np.abs(residual[kept])))
+    kept &= np.abs(residual) <= 2 * OUTLIER * spread
+    lags = _fit(steps, speed, kept, second=False)
+    up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
     shortest = float(np.diff(time[edges]).min(initial=np.inf))
     if shortest < SETTLED * max(up, down):
-        what = (
-            f"has steps of {shortest:.2g} s, too short for a time constant of {max(up, down):.2g} s"
-        )
+        longest = max(up, down)
+        what = f"has steps of {shortest:.2g} s, too short for a time constant of {longest:.2g} s"
         raise RecordingError(path, what, "hold each command longer")
-    covariance = _covariance(solution, time[kept], bounds, kept)
-    interval = float(np.median(np.diff(time)))
+    covariance = _covariance(steps, lags, speed, kept)
     # a step shows at the first sample after it: half an interval late on average, spread evenly
-    delay += 0.5 * interval
-    covariance[2, 2] += interval**2 / 12 / (len(bounds) - 2)
-    remarks = [Remark("steps", {"up": int(rises.sum()), "down": int((~rises).sum()),
-                                "outliers": int((~kept).sum())})]  # fmt: skip
-    richer = _fit(time, speed, bounds, kept, second=True)
-    explained = 1.0 - richer.cost / max(solution.cost, 1e-300)
+    interval = float(np.median(np.diff(time)))
+    covariance[2, 2] += interval**2 / 12 / len(edges)
+    outliers = int((~kept).sum())
+    numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
+    remarks = [Remark("steps", numbers)]
+    richer = _fit(steps, speed, kept, second=True)
+    plain = steps.simulated(lags, speed, kept)
+    misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
+              (plain, steps.simulated(richer, speed, kept))]  # fmt: skip
+    explained = 1.0 - misfit[1] / max(misfit[0], 1e-300)
     if explained > NOT_FIRST_ORDER:
-        remarks.append(
-            Remark("not_first_order", {"explained": explained, "lag": float(richer.x[3])})
-        )
-    values = np.array([math.log(up), math.log(down), delay])
-    slope = np.array([1 / up, 1 / down, 1.0])
-    curve = Curve("Step response", "time, s", "rotor speed, rad/s", time, speed, kept, time,
-                  speed + _residual(solution.x, time, speed, bounds, second=False))  # fmt: skip
+        lag = float(np.exp(richer[3]))
+        remarks.append(Remark("not_first_order", {"explained": explained, "lag": lag}))
     return Measurement(
         name,
         ({"time_constant_up": 1.0}, {"time_constant_down": 1.0}, {"actuator_latency": 1.0}),
-        values,
-        covariance * np.outer(slope, slope),
+        np.array([lags[0], lags[1], delay + 0.5 * interval]),
+        covariance,
         tuple(remarks),
-        (curve,),
+        (Curve("Step response", "time, s", "rotor speed, rad/s", time, speed, kept, time, plain),),
     )
 
 
-def _response(parameters: Array, time: Array, bounds: Array, *, second: bool) -> Array:
-    up, down, delay = parameters[:3]
-    lag = parameters[3] if second else 0.0
-    levels = parameters[4 if second else 3 :]
-    response = np.full(len(time), levels[0])
-    speed = levels[0]
-    begin = time[0]
-    for number in range(1, len(levels)):
-        begin = time[bounds[number]] + delay
-        end = time[bounds[number + 1]] + delay if number + 2 < len(bounds) else time[-1] + 1.0
-        after = time >= begin
-        constant = up if levels[number] > speed else down
-        response[after] = levels[number] + (speed - levels[number]) * _decay(
-            time[after] - begin, constant, lag
-        )
-        speed = levels[number] + (speed - levels[number]) * float(
-            _decay(np.array([end - begin]), constant, lag)[0]
-        )
-    return response
+@dataclass(frozen=True)
+class _Steps:
+    """The steps of a recording: sample times (n,) in s, where each level begins, which ones rise."""
+
+    time: Array
+    bounds: NDArray[np.intp]
+    rises: NDArray[np.bool_]
+
+    def design(self, lags: Array) -> Array:
+        """Return (n, levels): the speed is linear in the levels once the lags are given."""
+        levels = len(self.bounds) - 1
+        design = np.zeros((len(self.time), levels))
+        state = np.eye(levels)[0]
+        design[:] = state
+        for number in range(1, levels):
+            begin = self.time[self.bounds[number]] + lags[2]
+            after = int(np.searchsorted(self.time, begin))
+            constant = math.exp(lags[0] if self.rises[number - 1] else lags[1])
+            lag = math.exp(lags[3]) if len(lags) > 3 else 0.0
+            decay = _decay(self.time[after:] - begin, constant, lag)[:, None]
+            goal = np.eye(levels)[number]
+            design[after:] = goal + (state - goal) * decay
+            if number + 1 < levels:
+                end = self.time[self.bounds[number + 1]] - self.time[self.bounds[number]]
+                state = goal + (state - goal) * float(_decay(np.array([end]), constant, lag)[0])
+        return design
+
+    def simulated(self, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
+        """Return the speed (n,) of the best levels for some lags."""
+        design = self.design(lags)
+        return np.asarray(design @ np.linalg.lstsq(design[kept], speed[kept], rcond=None)[0])
 
 
 def _decay(time: Array, constant: float, lag: float) -> Array:
@@ -123,57 +137,63 @@ def _decay(time: Array, constant: float, lag: float) -> Array:
     return np.asarray((constant * slow - lag * quick) / (constant - lag))
 
 
-def _residual(
-    parameters: Array, time: Array, speed: Array, bounds: Array, *, second: bool
-) -> Array:
-    return _response(parameters, time, bounds, second=second) - speed
+def _near_neighbours(speed: Array) -> NDArray[np.bool_]:
+    """Return (n,) which samples are no spikes of the tachometer."""
+    difference = np.abs(speed - median_filter(speed, size=5, mode="nearest"))
+    spread = max(ROBUST * float(np.median(difference)), 1e-9)
+    return np.asarray(difference <= 6 * OUTLIER * spread)
 
 
-def _fit(time: Array, speed: Array, bounds: Array, kept: Array, *, second: bool):  # type: ignore[no-untyped-def]  # noqa: ANN202
-    levels = [
-        float(np.median(speed[a + (b - a) // 2 : b]))
-        for a, b in zip(bounds[:-1], bounds[1:], strict=True)
-    ]
-    guess = _rise_time(time, speed, bounds, levels)
-    start = np.array([guess, guess, 1e-3, *([0.2 * guess] if second else []), *levels])
-    lower = np.array([1e-4, 1e-4, 0.0, *([0.0] if second else []), *([-np.inf] * len(levels))])
-    scale = np.array([guess, guess, guess, *([guess] if second else []), *([50.0] * len(levels))])
-    return least_squares(
-        lambda p: _residual(p, time, speed, bounds, second=second)[kept],
-        start, x_scale=scale, bounds=(lower, np.inf), loss="soft_l1",
-        f_scale=max(3 * _noise(time, speed, bounds), 1e-6),
-    )  # fmt: skip
+def _fit(steps: _Steps, speed: Array, kept: NDArray[np.bool_], *, second: bool) -> Array:
+    """Return logarithms of both time constants, the delay in s, and the logarithm of a second lag."""
+    shortest = float(np.diff(steps.time[steps.bounds[1:-1]]).min(initial=1.0))
+    solutions = []
+    for guess in (0.01, 0.04, 0.15):
+        guess = min(guess, 0.3 * shortest)
+        start = [
+            math.log(guess),
+            math.log(guess),
+            0.002,
+            *([math.log(0.3 * guess)] if second else []),
+        ]
+        low = [math.log(1e-4), math.log(1e-4), 0.0, *([math.log(1e-5)] if second else [])]
+        high = [
+            math.log(10.0),
+            math.log(10.0),
+            0.5 * shortest,
+            *([math.log(1.0)] if second else []),
+        ]
+        solutions.append(
+            least_squares(
+                lambda lags: (steps.simulated(lags, speed, kept) - speed)[kept],
+                start, bounds=(low, high), x_scale=[1.0, 1.0, guess, 1.0][: len(start)],
+            )
+        )  # fmt: skip
+    return np.asarray(min(solutions, key=lambda solution: float(solution.cost)).x)
 
 
-def _noise(time: Array, speed: Array, bounds: Array) -> float:
-    tails = [speed[a + 2 * (b - a) // 3 : b] for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    return float(np.median([ROBUST * np.median(np.abs(t - np.median(t))) for t in tails if len(t)]))
-
-
-def _rise_time(time: Array, speed: Array, bounds: Array, levels: list[float]) -> float:
-    """Return the median time, s, after which a step has gone 63 % of its way."""
-    times = []
-    for number, (a, b) in enumerate(zip(bounds[1:-1], bounds[2:], strict=True), start=1):
-        before, after = levels[number - 1], levels[number]
-        share = (speed[a:b] - before) / (after - before)
-        there = np.flatnonzero(share > 1 - math.exp(-1))
-        if len(there):
-            times.append(float(time[a + there[0]] - time[a]))
-    return max(float(np.median(times)) if times else 0.02, 2e-3)
-
-
-def _covariance(solution, time: Array, bounds: Array, kept: Array) -> Array:  # type: ignore[no-untyped-def]  # noqa: ANN001
+def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
     """Return the covariance (3, 3), from white noise or from steps that differ, the larger."""
-    jacobian, residual = solution.jac, solution.fun
+    design = steps.design(lags)
+    levels = np.linalg.lstsq(design[kept], speed[kept], rcond=None)[0]
+    columns = []
+    for index, step in enumerate((1e-4, 1e-4, 1e-6)):
+        moved = np.eye(3)[index] * step
+        change = steps.design(lags + moved) - steps.design(lags - moved)
+        columns.append(change @ levels / (2 * step))
+    jacobian = np.column_stack([*columns, design])[kept]
+    residual = (design @ levels - speed)[kept]
     inverse = np.linalg.pinv(jacobian.T @ jacobian)
-    freedom = max(len(residual) - len(solution.x), 1)
-    white = inverse * float(residual @ residual) / freedom
-    number = np.cumsum(np.isin(np.arange(len(kept)), bounds[1:-1]))[kept]
+    white = inverse * float(residual @ residual) / (len(residual) - jacobian.shape[1])
+    number = np.searchsorted(steps.bounds[1:-1], np.arange(len(kept)), side="right")[kept]
     scores = np.array([
         (jacobian[number == n] * residual[number == n, None]).sum(axis=0) for n in np.unique(number)
     ])  # fmt: skip
     clusters = len(scores)
     sandwich = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 1, 1)
     student = float(stats.t.ppf(0.975, max(clusters - 1, 1))) / NORMAL
-    grown = np.sqrt(np.maximum(np.diag(sandwich) * student**2 / np.diag(white), 1.0))
+    # few steps make the sandwich erratic: chance alone is taken off before it may widen
+    chance = 1.0 + math.sqrt(2.0 / max(clusters - 1, 1))
+    ratio = np.diag(sandwich) * student**2 / np.diag(white) / chance
+    grown = np.sqrt(np.maximum(ratio, 1.0))
     return np.asarray((white * np.outer(grown, grown))[:3, :3])

@@ -111,6 +111,7 @@ def motor_steps(random: np.random.Generator, *, rate: float = 500.0, second: flo
     goal = np.full_like(dense, dense[0])
     for edge in np.flatnonzero(np.diff(dense)) + 1:  # a step happens between two samples of the log
         goal[edge - random.integers(0, fine) + delay :] = dense[edge]
+    goal = TRUTH["input_scaling"] * goal + TRUTH["zero_position_armed"]
     level, slow = goal[0], goal[0]
     series = np.empty_like(goal)
     step = 1 / (rate * fine)
