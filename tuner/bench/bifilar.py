@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -34,8 +35,8 @@ def bifilar(
 ) -> Measurement:
     """Return the moment of inertia of one axis.
 
-    A damped sine with offset and drift is fitted to the angle; its phase runs slower while the swing
-    is wide (by amplitude²/16, as a pendulum's), and its frequency is corrected for damping.
+    A damped sine with offset and drift is fitted to the angle; its phase runs slower while the
+    swing is wide (by amplitude²/16, as a pendulum's), and its frequency is corrected for damping.
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def _spectral_guess(time: Array, angle: Array) -> float:
     return float(frequencies[int(np.argmax(power))])
 
 
-def _fit(time: Array, angle: Array, guess: float):  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _fit(time: Array, angle: Array, guess: float) -> Any:
     turns = 2 * math.pi * guess * time
     waves = np.column_stack([np.cos(turns), -np.sin(turns), np.ones_like(time)])
     cosine, sine, offset = np.linalg.lstsq(waves, angle, rcond=None)[0]
@@ -144,7 +145,7 @@ def _fit(time: Array, angle: Array, guess: float):  # type: ignore[no-untyped-de
     )
 
 
-def _frequency_error(solution, residual: Array) -> float:  # type: ignore[no-untyped-def]  # noqa: ANN001
+def _frequency_error(solution: Any, residual: Array) -> float:
     """Return the frequency's standard error, Hz, correlated residuals included."""
     jacobian = solution.jac
     covariance = np.linalg.pinv(jacobian.T @ jacobian)

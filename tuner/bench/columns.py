@@ -7,22 +7,26 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from tuner.bench.measurement import Array
 from tuner.errors import RecordingError
+from tuner.flights.recording import ROWS, Clock, Request
+from tuner.flights.table import Table
 
 MAX_BYTES = 200_000_000
+MOST = 60_000
+"""Samples beyond which a recording is thinned: steps of seconds need no more."""
+FEWEST = 20
 RPM = 2 * math.pi / 60
 """rad/s per revolution a minute."""
 FASTEST = 4000.0
 """rad/s that no rotor of a multirotor turns: a column beyond it holds revolutions a minute."""
 SLOWEST = 30.0
 """rad/s below which a rotor that is measured at all does not turn: such rpm are rad/s, or Hz."""
+FULL_COMMAND = 1.5
 
 #: Quantity -> column name -> factor to SI units.
 COLUMNS: Mapping[str, Mapping[str, float]] = {
-    "time": {"time": 1.0, "t": 1.0},
     "angle": {
         "angle": 1.0,
         "angle_rad": 1.0,
@@ -33,71 +37,103 @@ COLUMNS: Mapping[str, Mapping[str, float]] = {
     "force": {"force": 1.0},
     "command": {"command": 1.0},
     "voltage": {"voltage": 1.0},
+    "qw": {"qw": 1.0},
+    "qx": {"qx": 1.0},
+    "qy": {"qy": 1.0},
+    "qz": {"qz": 1.0},
 }
+TIMES = ("time", "t")
+
+
+def open_table(path: Path) -> Table:
+    """Open a CSV or Parquet file.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, is too large, or is no table.
+    """
+    try:
+        if path.is_dir() or path.stat().st_size > MAX_BYTES:
+            raise RecordingError(path, "is a folder or larger than 200 MB", "cut it to the rig's")
+        return Table(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no valid path"
+        raise RecordingError(path, f"cannot be read ({reason})", "check the path") from None
 
 
 def read_columns(
     path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = ()
 ) -> dict[str, Array]:
-    """Return quantity -> (n,) samples in SI units, rows without a finite time left out.
+    """Return quantity -> (n,) samples in SI units, NaN where a cell holds no number.
+
+    Parameters
+    ----------
+    path
+        A CSV or Parquet file.
+    wanted, optional
+        Quantities of `COLUMNS`; those that are optional may lack.
+
+    Returns
+    -------
+    dict
+        ``time`` in s from the first sample, and the quantities; no more than `MOST` samples.
 
     Raises
     ------
     RecordingError
         The file cannot be read, a column is missing, times do not rise, or a unit is implausible.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise RecordingError(path, "is larger than 200 MB", "cut it to the experiment")
-        table = pd.read_csv(path, comment="#", skipinitialspace=True, encoding_errors="replace")
-    except OSError as error:
-        raise RecordingError(path, f"cannot be read ({error.strerror})", "check the path") from None
-    except (ValueError, pd.errors.ParserError) as error:
-        reason = " ".join(str(error).split())[:80]
-        raise RecordingError(path, f"is no table of numbers ({reason})", "write CSV") from None
-    table.columns = [str(name).strip().lower() for name in table.columns]
-    samples = {}
+    table = open_table(path)
+    chosen = {}
     for quantity in (*wanted, *optional):
         column = next((name for name in COLUMNS[quantity] if name in table.columns), None)
-        if column is None:
-            if quantity in optional:
-                continue
+        if column is not None:
+            chosen[quantity] = column
+        elif quantity in wanted:
             names = " or ".join(COLUMNS[quantity])
-            raise RecordingError(path, f"has no column {names}", f"it needs {', '.join(wanted)}")
-        numbers = pd.to_numeric(table[column], errors="coerce").to_numpy(float)
-        samples[quantity] = numbers * COLUMNS[quantity][column]
-        _check_unit(path, quantity, column, samples[quantity])
-    complete = np.isfinite(samples["time"])
-    samples = {quantity: values[complete] for quantity, values in samples.items()}
-    if len(samples["time"]) < 20:
-        raise RecordingError(path, "holds fewer than 20 samples", "record the whole experiment")
-    if (np.diff(samples["time"]) <= 0).any():
+            needed = ", ".join(("time", *wanted))
+            raise RecordingError(path, f"has no column {names}", f"it needs {needed}")
+    if not any(name in table.columns for name in TIMES):
+        raise RecordingError(path, "has no column time", "add it, in s")
+    clocks = tuple(Clock(name) for name in TIMES)
+    contents = table.read({ROWS: Request(tuple(chosen.values()), clocks)})
+    rows = contents.samples[ROWS]
+    if len(rows.receive) < FEWEST:
+        what = f"holds {len(rows.receive)} samples with a time"
+        raise RecordingError(path, what, "record the whole experiment")
+    time = (rows.receive - rows.receive[0]) * 1e-9
+    if (np.diff(time) <= 0).any():
         raise RecordingError(path, "has times that do not rise", "sort it, one row a sample")
-    return samples
+    samples = {"time": time}
+    for quantity, column in chosen.items():
+        samples[quantity] = rows.fields[column] * COLUMNS[quantity][column]
+        _check_unit(path, quantity, column, samples[quantity])
+    stride = -(-len(time) // MOST)
+    return {quantity: values[::stride] for quantity, values in samples.items()}
 
 
 def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
     known = np.abs(values[np.isfinite(values)])
-    if len(known) == 0:
-        raise RecordingError(path, f"column {column} holds no number", "check the file")
+    if len(known) < FEWEST:
+        raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
     top = float(np.quantile(known, 0.99))
-    if quantity == "rotor_speed" and top > FASTEST:
-        remedy = "name the column rpm if it holds revolutions a minute"
-        raise RecordingError(
-            path, f"column {column} reaches {top:.0f} rad/s, too fast for a rotor", remedy
-        )
-    if quantity == "rotor_speed" and top < SLOWEST:
-        remedy = "name the column rotor_speed if it holds rad/s"
-        raise RecordingError(
-            path, f"column {column} stays below {top:.1f} rad/s, too slow for a rotor", remedy
-        )
-    if quantity == "angle" and top > math.pi:
-        remedy = "name the column angle_deg if it holds degrees"
-        raise RecordingError(
-            path, f"column {column} reaches {top:.1f} rad, more than half a turn", remedy
-        )
-    if quantity == "command" and top > 1.5:
-        remedy = "scale it to 0..1 of full command"
-        raise RecordingError(
-            path, f"column {column} reaches {top:.0f}, commands lie in 0..1", remedy
-        )
+    complaints = {
+        "rotor_speed": (
+            (top > FASTEST, f"reaches {top:.0f} rad/s, too fast for a rotor",
+             "name the column rpm if it holds revolutions a minute"),
+            (top < SLOWEST, f"stays below {top:.1f} rad/s, too slow for a rotor",
+             "name the column rotor_speed if it holds rad/s"),
+        ),
+        "angle": (
+            (top > math.pi, f"reaches {top:.1f} rad, more than half a turn",
+             "name the column angle_deg if it holds degrees"),
+        ),
+        "command": (
+            (top > FULL_COMMAND, f"reaches {top:.0f}, commands lie in 0..1",
+             "scale it to 0..1 of full command"),
+        ),
+    }  # fmt: skip
+    for wrong, what, remedy in complaints.get(quantity, ()):
+        if wrong:
+            raise RecordingError(path, f"column {column} {what}", remedy)

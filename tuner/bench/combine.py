@@ -9,11 +9,14 @@ import numpy as np
 from scipy import stats
 
 from tuner.bench.measurement import Array, Measurement
+from tuner.coefficients import COEFFICIENTS
 
 CONFLICT = 3.0
 """Standard errors apart beyond which two measurements of one number contradict each other."""
-UNKNOWN = 1e-9
+UNKNOWN = 1e-11
 """Share of the best-known direction's information below which a direction is not measured."""
+DISAGREE = 0.01
+"""p-value below which the experiments are said to disagree."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,10 @@ class Combination:
         The N coefficients that some measurement speaks of.
     scaled
         (N,) best scaled coordinates.
+    information
+        (N, N) inverse covariance, singular where a combination of coefficients was not measured.
     covariance
-        (N, N).
+        (N, N) in the directions that were measured, zero in the others.
     determined
         (N,) whether the measurements alone determine it.
     chi_square, degrees_of_freedom, p_value
@@ -61,6 +66,7 @@ class Combination:
 
     names: tuple[str, ...]
     scaled: Array
+    information: Array
     covariance: Array
     determined: np.ndarray[tuple[int], np.dtype[np.bool_]]
     chi_square: float
@@ -72,37 +78,52 @@ class Combination:
 def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
     """Return the generalised least squares estimate (Gauss-Markov) of all coefficients.
 
+    Of what was not measured (a torque stand without a thrust stand) the estimate moves as little
+    from the vehicle file as it can, each coefficient in units of its prior's standard deviation.
+
     Parameters
     ----------
     measurements
         At least one.
     known
-        Coefficient -> scaled coordinate in the vehicle file: where it stays in a direction that no
-        measurement speaks of, as in a torque stand without a thrust stand.
+        Coefficient -> scaled coordinate in the vehicle file.
     """
     names = tuple(dict.fromkeys(n for measurement in measurements for n in measurement.names))
     start = np.array([known[name] for name in names])
     information, pull = _normal_equations(measurements, names, start)
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-    measured = values > UNKNOWN * values.max()
-    inverse = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
-    covariance = inverse * np.outer(unit, unit)
-    lost = (vectors[:, ~measured] ** 2).sum(axis=1) if (~measured).any() else np.zeros(len(names))
+    covariance, unmeasured = _inverse(information, names)
+    lost = (unmeasured**2).sum(axis=1)
     scaled = start + covariance @ pull
     numbers = sum(len(measurement.value) for measurement in measurements)
-    freedom = numbers - int(measured.sum())
+    freedom = numbers - (len(names) - unmeasured.shape[1])
     chi_square = float(sum(_chi_square(m, names, scaled) for m in measurements))
     return Combination(
         names=names,
         scaled=scaled,
+        information=information,
         covariance=covariance,
-        determined=lost < UNKNOWN**0.5,
+        determined=lost < SMALL,
         chi_square=chi_square,
         degrees_of_freedom=freedom,
         p_value=float(stats.chi2.sf(chi_square, freedom)) if freedom > 0 else 1.0,
         conflicts=_conflicts(measurements, names, start),
     )
+
+
+SMALL = 1e-6
+"""Share of a coefficient that may lie in unmeasured directions, for rounding."""
+
+
+def _inverse(information: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the covariance of what was measured, and (N, U) the directions that were not.
+
+    The directions are those of coordinates in units of the default priors' standard deviations.
+    """
+    unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    measured = values > UNKNOWN * values.max(initial=1e-300)
+    inverse = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
+    return inverse * np.outer(unit, unit), vectors[:, ~measured]
 
 
 def _design(measurement: Measurement, names: Sequence[str]) -> Array:
@@ -136,19 +157,14 @@ def _conflicts(
         if not others:
             continue
         information, pull = _normal_equations(others, names, start)
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-        unit[np.diag(information) <= 0] = 1.0
-        values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-        measured = values > UNKNOWN * values.max()
-        unknown = vectors[:, ~measured] / unit[:, None]
-        covariance = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
-        covariance = covariance * np.outer(unit, unit)
+        covariance, unmeasured = _inverse(information, names)
+        unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
         predicted = start + covariance @ pull
         for row, value, variance in zip(
             _design(left_out, names), left_out.value, np.diag(left_out.covariance), strict=True
         ):
-            reach = np.abs(unknown.T @ (row * unit * unit)).max(initial=0.0)
-            if reach > UNKNOWN**0.5 * np.linalg.norm(row * unit):
+            reach = np.abs(unmeasured.T @ (row * unit)).max(initial=0.0)
+            if reach > SMALL * np.linalg.norm(row * unit):
                 continue  # the others say nothing of this number
             expected = float(row @ predicted)
             error = float(np.sqrt(variance + row @ covariance @ row))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner.bench.laws import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
+from tuner.bench.laws import GRAVITY, fast_pair_speed, hover_motor_constant, spin_drag_over_torque
 from tuner.bench.measurement import Curve, Measurement, Remark
 from tuner.errors import ConfigError
 
@@ -47,7 +47,7 @@ def hover_weights(
     weights = np.linspace(0.95 * mass.min(), 1.05 * mass.max(), 50)
     curve = Curve(
         "Hover", "mass, kg", "rotor speed, rad/s", mass, speed, np.ones(len(points), bool), weights,
-        np.sqrt(weights * 9.81 / (rotors * math.exp(mean))),
+        np.sqrt(weights * GRAVITY / (rotors * math.exp(mean))),
     )  # fmt: skip
     return Measurement(
         name, ({"motor_constant": 1.0},), np.array([mean]), np.array([[error2]]),
@@ -66,9 +66,9 @@ def yaw_spin(
 ) -> Measurement:
     """Return the relation of rotor drag to torque from spins of (yaw rate, slow pair, fast pair).
 
-    rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²) (Eq. 8.3,
-    see `spin_drag_over_torque`). Where the fast pair was not measured it follows from the weight and
-    the motor constant, on which the relation then depends.
+    rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²)
+    (Eq. 8.3, see `spin_drag_over_torque`). Where the fast pair was not measured it follows from
+    the weight and the motor constant, on which the relation then depends.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def yaw_spin(
         spread = math.sqrt(2.0)
         if weighed:
             # dΩ_fast/dlog k of the weight's balance, and dΩ_fast/dΩ_slow = -Ω_slow/Ω_fast
-            follows = -(mass * 9.81 / (2 * motor_constant)) / (2 * quick) / (quick - slow)
+            follows = -(mass * GRAVITY / (2 * motor_constant)) / (2 * quick) / (quick - slow)
             spread = 1.0 + slow / quick
         rows.append(
             {
@@ -121,9 +121,10 @@ def yaw_spin(
         math.exp(v + (-1 - r["motor_constant"]) * math.log(motor_constant))
         for v, r in zip(values, rows, strict=True)
     ])  # fmt: skip
+    mean = float(np.exp(np.log(ratios).mean()))
     curve = Curve(
-        "Steady spin", "yaw rate, rad/s", "rotor drag over torque constant, rad s/m²", rates, ratios,
-        np.ones(len(points), bool), rates, np.full(len(points), float(np.exp(np.log(ratios).mean()))),
+        "Steady spin", "yaw rate, rad/s", "rotor drag over torque constant, rad s/m²", rates,
+        ratios, np.ones(len(points), bool), rates, np.full(len(points), mean),
     )  # fmt: skip
     return Measurement(
         name, tuple(rows), np.array(values), np.diag(variances),

@@ -78,7 +78,8 @@ def spin_drag_over_torque(
 
     In a steady level spin at ω the drag of four rotors at a distance r from the axis, each
     c Ω (ω r) r, balances the difference of their drag torques (Eq. 8.3 without its small-angle
-    shortcuts): c ω r² 2(Ω_s + Ω_f) = k_M k_F 2(Ω_f² - Ω_s²), hence c/(k_M k_F) = (Ω_f - Ω_s)/(ω r²).
+    shortcuts): c ω r² 2(Ω_s + Ω_f) = k_M k_F 2(Ω_f² - Ω_s²), so that
+    c/(k_M k_F) = (Ω_f - Ω_s)/(ω r²).
     Speeds in rad/s, radius in m.
     """
     return np.asarray((np.asarray(fast) - np.asarray(slow)) / (np.asarray(yaw_rate) * radius**2))

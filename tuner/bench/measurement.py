@@ -25,6 +25,8 @@ class Curve:
         (n,) which of them the estimate rests on.
     fit_x, fit
         (m,) the fitted law.
+    law
+        Whether they are a law, from which there are residuals; else they are levels, as points.
     """
 
     title: str
@@ -35,6 +37,7 @@ class Curve:
     used: NDArray[np.bool_]
     fit_x: Array
     fit: Array
+    law: bool = True
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Steady parts of a stepwise experiment: where a signal stays at a level, without its transients."""
+"""Steady parts of a stepwise experiment: where a signal keeps a level, transients left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tuner.bench.measurement import Array
 OUTLIER = 3.0
 """Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
 MIDDLE = (0.3, 0.95)
-"""Share of a step, from and to, that is called its middle: transients are over, the next not begun."""
+"""Share of a step, from and to, that is its middle: transients over, the next not begun."""
 FEWEST = 8
 """Samples without which a step has no mean."""
 ROBUST = 1.4826

@@ -42,7 +42,7 @@ def read_static_table(path: Path) -> Array:
             rows.append(numbers[:3])
     table = np.array(rows)
     plausible = len(rows) > 0 and bool(
-        (table[:, 0] > 200).all() and (0 < table[:, 1:]).all() and (table[:, 1:] < 1).all()
+        (table[:, 0] > 200).all() and (table[:, 1:] > 0).all() and (table[:, 1:] < 1).all()
     )
     if not plausible:
         raise RecordingError(path, "holds no rows of RPM, CT and CP", "give a static table")

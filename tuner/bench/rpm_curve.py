@@ -29,9 +29,10 @@ TRUSTED = 4
 def rpm_curve(
     name: str, path: str, samples: Mapping[str, Array], *, reference_voltage: float | None
 ) -> Measurement:
-    """Return input scaling, zero position, and, if the data ask for them, curvature and exponent.
+    """Return input scaling, zero position and, if the data ask for it, curvature.
 
-    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step.
+    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step. The
+    battery's exponent γ has no place in a vehicle file: it is a remark.
 
     Parameters
     ----------
@@ -49,16 +50,16 @@ def rpm_curve(
     """
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
     points, used, dropped = [], np.zeros(len(time), bool), 0
+    steady = np.isfinite(command) & np.isfinite(samples.get("voltage", command))
     for plateau in levels_of(command, time, shortest=SHORTEST, step=STEP):
-        kept = without_outliers(speed[plateau.samples])
+        kept = without_outliers(speed[plateau.samples]) & steady[plateau.samples]
         dropped += int((~kept).sum())
         inside = plateau.samples[kept]
         if len(inside) < 4:
             continue
         used[inside] = True
-        volts = float(np.nanmean(samples["voltage"][inside])) if "voltage" in samples else 1.0
-        mean, error = mean_and_error(speed[inside])
-        points.append((float(np.mean(command[inside])), mean, error, volts))
+        battery = float(np.mean(samples["voltage"][inside])) if "voltage" in samples else 1.0
+        points.append((float(np.mean(command[inside])), *mean_and_error(speed[inside]), battery))
     if len({round(point[0] / STEP) for point in points}) < FEWEST:
         what = f"holds {len(points)} steady steps of the command of {SHORTEST:g} s and more"
         raise RecordingError(path, what, f"record {FEWEST} or more commands, each for seconds")
@@ -79,8 +80,11 @@ def rpm_curve(
         remarks.append(Remark("reference_voltage", {"voltage": reference}))
         if not sags:
             remarks.append(Remark("voltage_constant", {"ratio": float(volts.max() / volts.min())}))
-    names = ["input_scaling", "zero_position_armed", "quadratic", "battery_exponent"]
-    kept_names = [0, 1, *([2] if curved else []), *([3] if sags else [])]
+    if sags:
+        exponent = {"exponent": float(solution[3]), "error": math.sqrt(covariance[3, 3])}
+        remarks.append(Remark("battery_exponent", exponent))
+    names = ["input_scaling", "zero_position_armed", "quadratic"]
+    kept_names = [0, 1, *([2] if curved else [])]
     values = solution[kept_names].copy()
     matrix = covariance[np.ix_(kept_names, kept_names)].copy()
     if values[1] <= 0:
@@ -92,9 +96,10 @@ def rpm_curve(
     dense = np.linspace(u.min(), u.max(), 200)
     curves = (
         Curve("Steps used", "time, s", "rotor speed, rad/s", time, speed, used,
-              np.zeros(0), np.zeros(0)),
-        Curve("Rotor speed against command", "command", "rotor speed at the reference voltage, rad/s",
-              u, omega / ratio ** solution[3], np.ones(len(u), bool), dense,
+              np.zeros(0), np.zeros(0), law=False),
+        Curve("Rotor speed against command", "command",
+              "rotor speed at the reference voltage, rad/s", u, omega / ratio ** solution[3],
+              np.ones(len(u), bool), dense,
               solution[0] * dense + solution[2] * dense**2 + solution[1]),
     )  # fmt: skip
     return Measurement(

@@ -1,4 +1,4 @@
-"""Thrust and torque stands: force against squared rotor speed, plateau by plateau (thesis 6.3, 7.3)."""
+"""Thrust and torque stands: force against squared rotor speed, level by level (6.3, 7.3)."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def thrust_stand(
     lever_ratio: float,
     lever_ratio_error: float,
 ) -> Measurement:
-    """Return the motor constant from F · lever_ratio = n k Ω² (Eq. 6.8), the spring's offset fitted.
+    """Return the motor constant from F · lever_ratio = n k Ω² (Eq. 6.8) and an offset.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _slope(
     order = np.argsort(squares)
     curves = (
         Curve("Rotor speed", "time, s", "rotor speed, rad/s", time, speed, used,
-              np.array([v.time for v in levels]), np.array([v.speed for v in levels])),
+              np.array([v.time for v in levels]), np.array([v.speed for v in levels]), law=False),
         Curve(title, "rotor speed squared, rad²/s²", "force, N", squares, measured,
               np.ones(len(levels), bool), squares[order], fit[order]),
     )  # fmt: skip

@@ -25,6 +25,11 @@ SETTLED = 3.0
 NOT_FIRST_ORDER = 0.1
 """Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
 NORMAL = 1.959964
+GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+"""Time constants, s, from the best of which the fit begins."""
+MOST_STEPS = 200
+MOST = 12_000
+"""Samples beyond which those long after a step are thinned."""
 
 
 def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measurement:
@@ -50,8 +55,12 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
     known = np.isfinite(speed) & np.isfinite(command)
     time, command, speed = time[known], command[known], speed[known]
-    edges = np.flatnonzero(np.abs(np.diff(command)) > STEP) + 1
-    edges = edges[np.diff(edges, prepend=-10) > 1]
+    near = _near_steps(command)
+    time, command, speed = time[near], command[near], speed[near]
+    edges = _edges(command)
+    if len(edges) > MOST_STEPS:
+        what = f"has a command that changes {len(edges)} times"
+        raise RecordingError(path, what, f"record no more than {MOST_STEPS} steps of the command")
     rises = command[np.minimum(edges + 1, len(command) - 1)] > command[edges - 1]
     for direction, count in (("up", int(rises.sum())), ("down", int((~rises).sum()))):
         if count < FEWEST:
@@ -59,11 +68,11 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
             raise RecordingError(path, what, f"record {FEWEST} or more in each direction")
     steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
     kept = _near_neighbours(speed)
-    first = _fit(steps, speed, kept, second=False)
+    first = _fit(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
     residual = steps.simulated(first, speed, kept) - speed
     spread = ROBUST * float(np.median(np.abs(residual[kept])))
     kept &= np.abs(residual) <= 2 * OUTLIER * spread
-    lags = _fit(steps, speed, kept, second=False)
+    lags = _fit(steps, speed, kept, first, second=False)
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
     shortest = float(np.diff(time[edges]).min(initial=np.inf))
     if shortest < SETTLED * max(up, down):
@@ -71,13 +80,14 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
         what = f"has steps of {shortest:.2g} s, too short for a time constant of {longest:.2g} s"
         raise RecordingError(path, what, "hold each command longer")
     covariance = _covariance(steps, lags, speed, kept)
-    # a step shows at the first sample after it: half an interval late on average, spread evenly
+    # a step shows at the first sample after it: half an interval late on average, but by as much
+    # at every step where the log and the commands keep time
     interval = float(np.median(np.diff(time)))
-    covariance[2, 2] += interval**2 / 12 / len(edges)
+    covariance[2, 2] += interval**2 / 12
     outliers = int((~kept).sum())
     numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
     remarks = [Remark("steps", numbers)]
-    richer = _fit(steps, speed, kept, second=True)
+    richer = _fit(steps, speed, kept, lags, second=True)
     plain = steps.simulated(lags, speed, kept)
     misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
               (plain, steps.simulated(richer, speed, kept))]  # fmt: skip
@@ -95,9 +105,26 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     )
 
 
+def _edges(command: Array) -> NDArray[np.intp]:
+    """Return the samples with which a new level of the command begins."""
+    edges = np.flatnonzero(np.abs(np.diff(command)) > STEP) + 1
+    return np.asarray(edges[np.diff(edges, prepend=-10) > 1])
+
+
+def _near_steps(command: Array) -> NDArray[np.bool_]:
+    """Return (n,) which samples to use: all, or of a long recording those after steps and some."""
+    count = len(command)
+    near = np.arange(count) % max(1, 2 * count // MOST) == 0
+    edges = _edges(command)
+    reach = MOST // (2 * max(len(edges), 1))
+    for edge in edges[:MOST_STEPS]:
+        near[max(edge - 2, 0) : edge + reach] = True
+    return np.asarray(near)
+
+
 @dataclass(frozen=True)
 class _Steps:
-    """The steps of a recording: sample times (n,) in s, where each level begins, which ones rise."""
+    """The steps of a recording: sample times (n,) in s, begins of the levels, which ones rise."""
 
     time: Array
     bounds: NDArray[np.intp]
@@ -108,15 +135,16 @@ class _Steps:
         levels = len(self.bounds) - 1
         design = np.zeros((len(self.time), levels))
         state = np.eye(levels)[0]
-        design[:] = state
+        begins = self.time[self.bounds[1:-1]] + lags[2]
+        places = [*np.searchsorted(self.time, begins), len(self.time)]
+        design[: places[0]] = state
+        lag = math.exp(lags[3]) if len(lags) > 3 else 0.0
         for number in range(1, levels):
-            begin = self.time[self.bounds[number]] + lags[2]
-            after = int(np.searchsorted(self.time, begin))
+            after = slice(places[number - 1], places[number])
             constant = math.exp(lags[0] if self.rises[number - 1] else lags[1])
-            lag = math.exp(lags[3]) if len(lags) > 3 else 0.0
-            decay = _decay(self.time[after:] - begin, constant, lag)[:, None]
+            decay = _decay(self.time[after] - begins[number - 1], constant, lag)[:, None]
             goal = np.eye(levels)[number]
-            design[after:] = goal + (state - goal) * decay
+            design[after] = goal + (state - goal) * decay
             if number + 1 < levels:
                 end = self.time[self.bounds[number + 1]] - self.time[self.bounds[number]]
                 state = goal + (state - goal) * float(_decay(np.array([end]), constant, lag)[0])
@@ -125,7 +153,14 @@ class _Steps:
     def simulated(self, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
         """Return the speed (n,) of the best levels for some lags."""
         design = self.design(lags)
-        return np.asarray(design @ np.linalg.lstsq(design[kept], speed[kept], rcond=None)[0])
+        return np.asarray(design @ _levels(design[kept], speed[kept]))
+
+
+def _levels(design: Array, speed: Array) -> Array:
+    """Return the least squares solution; the columns are steps apart, hence never near parallel."""
+    normal = design.T @ design
+    ridge = 1e-12 * np.trace(normal) * np.eye(len(normal))
+    return np.asarray(np.linalg.solve(normal + ridge, design.T @ speed))
 
 
 def _decay(time: Array, constant: float, lag: float) -> Array:
@@ -144,38 +179,48 @@ def _near_neighbours(speed: Array) -> NDArray[np.bool_]:
     return np.asarray(difference <= 6 * OUTLIER * spread)
 
 
-def _fit(steps: _Steps, speed: Array, kept: NDArray[np.bool_], *, second: bool) -> Array:
-    """Return logarithms of both time constants, the delay in s, and the logarithm of a second lag."""
+def _fit(
+    steps: _Steps, speed: Array, kept: NDArray[np.bool_], start: Array, *, second: bool
+) -> Array:
+    """Return the logarithms of both time constants, the delay in s, and of a second lag.
+
+    Parameters
+    ----------
+    start
+        (3,) where to begin with the first three.
+    second
+        Whether there is a second lag; else it is left out.
+    """
     shortest = float(np.diff(steps.time[steps.bounds[1:-1]]).min(initial=1.0))
-    solutions = []
-    for guess in (0.01, 0.04, 0.15):
-        guess = min(guess, 0.3 * shortest)
-        start = [
-            math.log(guess),
-            math.log(guess),
-            0.002,
-            *([math.log(0.3 * guess)] if second else []),
-        ]
-        low = [math.log(1e-4), math.log(1e-4), 0.0, *([math.log(1e-5)] if second else [])]
-        high = [
-            math.log(10.0),
-            math.log(10.0),
-            0.5 * shortest,
-            *([math.log(1.0)] if second else []),
-        ]
-        solutions.append(
-            least_squares(
-                lambda lags: (steps.simulated(lags, speed, kept) - speed)[kept],
-                start, bounds=(low, high), x_scale=[1.0, 1.0, guess, 1.0][: len(start)],
-            )
-        )  # fmt: skip
-    return np.asarray(min(solutions, key=lambda solution: float(solution.cost)).x)
+    more = int(second)
+    low = np.array([math.log(1e-4), math.log(1e-4), 0.0, *[math.log(1e-5)] * more])
+    high = np.array([math.log(10.0), math.log(10.0), 0.5 * shortest, *[0.0] * more])
+    begin = np.array([*start, *[start[:2].min() + math.log(0.3)] * more])
+    solution = least_squares(
+        lambda lags: (steps.simulated(lags, speed, kept) - speed)[kept],
+        np.clip(begin, low + 1e-6, high - 1e-6),
+        bounds=(low, high),
+        x_scale=[1.0, 1.0, math.exp(begin[:2].min()), 1.0][: len(begin)],
+        xtol=1e-6,
+        ftol=1e-9,
+    )
+    return np.asarray(solution.x)
+
+
+def _first_guess(steps: _Steps, speed: Array, kept: NDArray[np.bool_]) -> Array:
+    """Return where to begin: the common time constant, of a few, that meets the speeds best."""
+
+    def misfit(start: Array) -> float:
+        return float(np.sum((steps.simulated(start, speed, kept) - speed)[kept] ** 2))
+
+    starts = [np.array([math.log(c), math.log(c), 0.002]) for c in GUESSES]
+    return min(starts, key=misfit)
 
 
 def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
     """Return the covariance (3, 3), from white noise or from steps that differ, the larger."""
     design = steps.design(lags)
-    levels = np.linalg.lstsq(design[kept], speed[kept], rcond=None)[0]
+    levels = _levels(design[kept], speed[kept])
     columns = []
     for index, step in enumerate((1e-4, 1e-4, 1e-6)):
         moved = np.eye(3)[index] * step

@@ -57,6 +57,10 @@ COMMANDS = {
         "Render the report of a run again.",
         "tune report runs/demo",
     ),
+    "bench": (
+        "Estimate coefficients from ground measurements: pendulum, stands, steps, hovers, spins.",
+        "tune bench bench.yaml --out runs/bench",
+    ),
     "simulate": (
         "Simulate a trajectory and write the flight as CSV or ROS 1 bag.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",

@@ -11,6 +11,7 @@ from rich.table import Table
 from tuner.cli.tables import console
 
 if TYPE_CHECKING:
+    from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
@@ -33,6 +34,26 @@ def print_run(folder: Path, result: RunResult) -> None:
     screen.print(
         f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv, "
         "sensitivity.csv)",
+        markup=False,
+    )
+
+
+def print_bench(bench: BenchResult) -> None:
+    """Print what each experiment and all together say, and where everything lies."""
+    from tuner.bench.bench_json import bench_record
+    from tuner.wording.bench import agreement_in_words, numbers_in_words
+    from tuner.wording.findings import one_line
+
+    screen = console()
+    record = bench_record(bench.combination, bench.measurements)
+    for experiment in record.experiments:
+        screen.print(f"{experiment.name}: {'; '.join(numbers_in_words(experiment))}", markup=False)
+    screen.print(_coefficients(bench.result))
+    screen.print(agreement_in_words(record))
+    for finding in bench.result.findings:
+        screen.print(one_line(finding), markup=False)
+    screen.print(
+        f"written to {bench.folder}/ (report.html, best_fit.yaml, result.json, bench.json)",
         markup=False,
     )
 

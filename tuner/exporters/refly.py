@@ -29,6 +29,8 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     InputError
         A recording is gone or has changed, or the result folder does not hold what flew.
     """
+    if not run.result.flights:  # of ground measurements
+        return {}
     settings = _settings(run, vehicle)
     wanted = {flight.name: flight for flight in run.result.flights}
     recordings = [r for r in read_recordings(settings) if r.flight.name in wanted]

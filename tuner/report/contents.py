@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from tuner.bench.bench_json import BenchRecord
 from tuner.comparison.table import Table
 from tuner.design.next_flight_json import Proposals
 from tuner.disk import exists
@@ -37,6 +38,8 @@ class Contents:
         What to fly next.
     global_sensitivity, profiles
         Indices between the bounds, and profiles of the likelihood.
+    bench
+        Ground measurements.
     search, laps
         How the fit went, and how closely laps are met.
     traces
@@ -50,6 +53,7 @@ class Contents:
     proposals: Proposals | None
     global_sensitivity: GlobalSensitivity | None
     profiles: Profiles | None
+    bench: BenchRecord | None
     search: SearchRecord | None
     laps: Table | None
     traces: Mapping[str, Mapping[str, Array]]
@@ -78,6 +82,7 @@ def read_contents(folder: str | Path) -> Contents:
         proposals=Proposals.read_if_any(folder),
         global_sensitivity=GlobalSensitivity.read_if_any(folder),
         profiles=Profiles.read_if_any(folder),
+        bench=BenchRecord.read_if_any(folder),
         search=SearchRecord.read_if_any(folder),
         laps=Table.read_if_any(folder),
         traces=read_traces(folder),

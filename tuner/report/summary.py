@@ -10,6 +10,7 @@ import numpy as np
 from tuner.report.contents import Contents
 from tuner.result import RunResult
 from tuner.uncertainty.verdict import Verdict
+from tuner.wording.bench import bench_in_words
 from tuner.wording.phrases import listed
 from tuner.wording.proposals import proposals_in_words
 from tuner.wording.verdicts import verdict_in_words
@@ -21,7 +22,8 @@ def summary(contents: Contents) -> list[str]:
     if contents.run is not None:
         results = contents.run.result.coefficients
         verdicts = [result.verdict for result in results.values() if result.fitted]
-        sentences.append(of_run(contents.run.result))
+        bench = contents.bench
+        sentences.append(of_run(contents.run.result) if bench is None else bench_in_words(bench))
         if verdicts:
             sentences.append(f"Of the coefficients, {_counted(verdicts)}.")
     elif contents.knowledge is not None:

@@ -60,6 +60,10 @@ class ReasonCode(StrEnum):
     """Not identifiable before others were held, although it would be now."""
     IMPOSSIBLE_INERTIA = "impossible_inertia"
     """``fitted_value`` and the other moments of inertia are those of no rigid body."""
+    COMBINATION_MEASURED = "combination_measured"
+    """Ground measurements determine it together with ``correlated_with`` only."""
+    MEASURED_ROUGHLY = "measured_roughly"
+    """Ground measurements determine it no better than ``half_width``."""
     NOT_FITTED = "not_fitted"
     """It is fixed."""
 

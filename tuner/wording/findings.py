@@ -100,6 +100,13 @@ TEXTS: Mapping[Code, tuple[str, str]] = {
         ),
         "Fit first, then examine the fitted vehicle.",
     ),
+    Code.BENCH_CONFLICT: (
+        (
+            "What it says of {coefficients} lies {deviation:+.1f} standard errors from what all "
+            "other experiments say."
+        ),
+        "Check its geometry (levers, arms, wires), its units and its calibration.",
+    ),
     Code.STARTS_DISAGREE: (
         "No two of {starts:.0f} starts ended in the same minimum; {second_search}.",
         "",
@@ -140,6 +147,7 @@ def _values(finding: Finding) -> dict[str, object]:
     values: dict[str, object] = {"subject": finding.subject, **finding.numbers}
     if names:
         values |= {"names": listed(names), "first": names[0]}
+        values["coefficients"] = listed(finding.names)
     seconds = finding.numbers.get("seconds", 0.0)
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
     changed = finding.numbers.get("changed")

@@ -26,7 +26,7 @@ def reason_in_words(reason: Reason) -> str:
     phrase = _main_clause(reason)
     if reason.tied_to is not None:
         phrase = f"tied to {reason.tied_to}: {phrase}"
-    if reason.correlated_with is not None:
+    if reason.correlated_with is not None and reason.correlation is not None:
         phrase += (
             f"; hard to distinguish from {reason.correlated_with} "
             f"(correlation {reason.correlation:+.2f})"
@@ -61,6 +61,9 @@ def _main_clause(reason: Reason) -> str:
         ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",
         ReasonCode.IMPOSSIBLE_INERTIA: f"fitted to {reason.fitted_value or 0.0:.4g}, which no "
         "rigid body has together with the other moments of inertia",
+        ReasonCode.COMBINATION_MEASURED: "measured only in combination with "
+        f"{reason.correlated_with}, whose value alone was not measured",
+        ReasonCode.MEASURED_ROUGHLY: f"measured only to ±{_half_width(reason)} (95 %)",
         ReasonCode.NOT_FITTED: "",
     }[reason.code]
 

@@ -1,8 +1,9 @@
-"""Simulated rigs with known truth: noise, drift, tachometer outliers, a spring's offset, geometry read off a ruler."""
+"""Simulated rigs of known truth: noise, drift, tachometer outliers, a spring's offset, a ruler."""
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -13,6 +14,7 @@ TRUTH = {
     "moment_constant": 0.033,
     "input_scaling": 950.0,
     "zero_position_armed": 100.0,
+    "quadratic": 0.0,
     "battery_exponent": 0.9,
     "time_constant_up": 0.03,
     "time_constant_down": 0.05,
@@ -30,21 +32,8 @@ def outliers(random: np.random.Generator, speed: np.ndarray, share: float = 0.01
 def swing(random: np.random.Generator, *, amplitude: float = 0.15, seconds: float = 40.0):
     """Return the samples of a bifilar pendulum and what a ruler reads of it."""
     mass, distance, length = 2.243, 0.34, 1.14
-    inertia, damping = TRUTH["inertia_xx"], 0.03
-    stiffness = mass * GRAVITY * distance**2 / (4 * length)
-    step, rate = 1e-3, 100.0
-    angle, speed = amplitude, 0.0
-    states = []
-    for _ in range(
-        int(seconds / step)
-    ):  # exact law of a pendulum's restoring moment, midpoint steps
-        middle = angle + 0.5 * step * speed
-        pull = -stiffness / inertia * math.sin(middle) - 2 * damping * speed
-        speed += step * pull
-        angle = middle + 0.5 * step * speed
-        states.append(angle)
-    every = int(1 / rate / step)
-    series = np.array(states)[::every]
+    rate = 100.0
+    series = _pendulum(amplitude, seconds, rate)
     time = np.arange(len(series)) / rate
     drift = random.normal(0, 0.01) + random.normal(0, 2e-4) * time
     measured = series + drift + random.normal(0, 0.003, len(series))
@@ -54,6 +43,24 @@ def swing(random: np.random.Generator, *, amplitude: float = 0.15, seconds: floa
         "wire_length": length + random.normal(0, 0.002),
     }
     return {"time": time, "angle": measured}, ruler
+
+
+@lru_cache
+def _pendulum(amplitude: float, seconds: float, rate: float) -> np.ndarray:
+    """Return the angle of a damped pendulum by its exact law, in midpoint steps of 1 ms."""
+    mass, distance, length = 2.243, 0.34, 1.14
+    inertia, damping = TRUTH["inertia_xx"], 0.03
+    stiffness = mass * GRAVITY * distance**2 / (4 * length)
+    step = 1e-3
+    angle, speed = amplitude, 0.0
+    states = []
+    for _ in range(int(seconds / step)):
+        middle = angle + 0.5 * step * speed
+        pull = -stiffness / inertia * math.sin(middle) - 2 * damping * speed
+        speed += step * pull
+        angle = middle + 0.5 * step * speed
+        states.append(angle)
+    return np.array(states)[:: int(1 / rate / step)]
 
 
 def stepped(levels, seconds: float, rate: float) -> tuple[np.ndarray, np.ndarray]:
@@ -73,7 +80,7 @@ def lagged(asked: np.ndarray, constant: float, rate: float) -> np.ndarray:
 
 
 def stand(random: np.random.Generator, *, slope: float, lever: float, noise: float = 0.05):
-    """Return the samples of a stand whose sensor reads slope·Ω²/lever, a spring's offset and drift."""
+    """Return the samples of a stand that reads slope·Ω²/lever, a spring's offset and drift."""
     rate = 50.0
     time, asked = stepped([300, 400, 480, 550, 610, 670, 600, 500, 380], 6.0, rate)
     speed = lagged(asked, 0.15, rate)
@@ -109,8 +116,9 @@ def motor_steps(random: np.random.Generator, *, rate: float = 500.0, second: flo
     dense = np.repeat(command, fine)
     delay = round(TRUTH["actuator_latency"] * rate * fine)
     goal = np.full_like(dense, dense[0])
-    for edge in np.flatnonzero(np.diff(dense)) + 1:  # a step happens between two samples of the log
-        goal[edge - random.integers(0, fine) + delay :] = dense[edge]
+    before = random.integers(0, fine)  # steps happen between two samples of the log
+    for edge in np.flatnonzero(np.diff(dense)) + 1:
+        goal[edge - before + delay :] = dense[edge]
     goal = TRUTH["input_scaling"] * goal + TRUTH["zero_position_armed"]
     level, slow = goal[0], goal[0]
     series = np.empty_like(goal)

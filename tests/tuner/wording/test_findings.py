@@ -61,6 +61,9 @@ MADE = {
     Code.POORLY_MET: Finding(
         Code.POORLY_MET, "warning", "a", {"noise_multiple": 40.0}, ("body_rate",)
     ),
+    Code.BENCH_CONFLICT: Finding(
+        Code.BENCH_CONFLICT, "warning", "torque_stand", {"deviation": 5.2}, ("motor_constant",)
+    ),
     Code.STARTS_DISAGREE: Finding(
         Code.STARTS_DISAGREE, "info", "search", {"starts": 4, "changed": 1.0}
     ),

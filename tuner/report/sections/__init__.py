@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
 from tuner.report.sections.effects import effects
 from tuner.report.sections.errors import errors
@@ -26,6 +27,7 @@ from tuner.report.sections.search import search
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
     coefficients,
+    bench,
     errors,
     flights,
     effects,

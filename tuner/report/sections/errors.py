@@ -21,7 +21,7 @@ class Row:
 
 def errors(contents: Contents) -> Section | None:
     """Return the RMSE before and after, of flights and of laps."""
-    if contents.run is None:
+    if contents.run is None or not contents.run.result.flights:
         return None
     rows = [
         Row(

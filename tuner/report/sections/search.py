@@ -11,7 +11,7 @@ from tuner.wording.status import ending_sentence
 
 def search(contents: Contents) -> Section | None:
     """Return the waterfall of starts and the search's trace."""
-    if contents.run is None:
+    if contents.run is None or not contents.run.result.flights:
         return None
     charts = []
     if contents.search is not None:

@@ -1,0 +1,74 @@
+"""Ground measurements: what each experiment gave, from which samples, and whether they agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tuner.bench.bench_json import CurveRecord, ExperimentRecord
+from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
+from tuner.report.contents import Contents
+from tuner.report.section import Section
+from tuner.wording.bench import agreement_in_words, numbers_in_words, remarks_in_words
+
+USED = Look(PALETTE[2], marks=True)
+NOT_USED = Look(GREY, marks=True)
+RESIDUAL = Look(PALETTE[1], marks=True)
+
+
+@dataclass(frozen=True)
+class Row:
+    """An experiment: its name, the numbers that it gives, and what its checks noticed."""
+
+    name: str
+    numbers: list[str]
+    remarks: list[str]
+
+
+def bench(contents: Contents) -> Section | None:
+    """Return a table of the experiments and a picture of each: data, law, residuals."""
+    if contents.bench is None:
+        return None
+    experiments = contents.bench.experiments
+    rows = [Row(e.name, numbers_in_words(e), remarks_in_words(e)) for e in experiments]
+    values = {"rows": rows, "agreement": agreement_in_words(contents.bench)}
+    charts = [
+        chart for number, experiment in enumerate(experiments)
+        for chart in _charts(number, experiment)
+    ]  # fmt: skip
+    return Section("bench", "Ground measurements", values, charts)
+
+
+def _charts(number: int, experiment: ExperimentRecord) -> list[Chart]:
+    return [
+        Chart(
+            key=f"bench_{number + 1}_{place + 1}",
+            title=f"{experiment.name}: {curve.title}",
+            caption="The estimate rests on the green points; grey ones were left out."
+            if not all(curve.used)
+            else "",
+            panels=_panels(curve),
+            x_title=curve.x_label,
+            height=440 if curve.law else 320,
+        )
+        for place, curve in enumerate(experiment.curves)
+    ]
+
+
+def _panels(curve: CurveRecord) -> list[Panel]:
+    used = np.array(curve.used, bool)
+    x, measured = np.array(curve.x), np.array(curve.measured)
+    marks = [
+        Line(name, x[chosen].tolist(), measured[chosen].tolist(), look, joined=False)
+        for name, chosen, look in (("left out", ~used, NOT_USED), ("used", used, USED))
+        if chosen.any()
+    ]
+    name = "law" if curve.law else "level"
+    marks.append(Line(name, curve.fit_x, curve.fit, FITTED, joined=curve.law))
+    panels = [Panel(marks, y_title=curve.y_label)]
+    if curve.law and len(curve.fit_x) > 1:
+        rest = measured[used] - np.interp(x[used], curve.fit_x, curve.fit)
+        line = Line("residual", x[used].tolist(), rest.tolist(), RESIDUAL, joined=False)
+        panels.append(Panel([line], y_title="residual"))
+    return panels

@@ -1,0 +1,96 @@
+"""Ground measurements as sentences: what the checks of an experiment noticed, and the agreement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from tuner.bench.bench_json import BenchRecord, ExperimentRecord
+from tuner.bench.combine import DISAGREE
+from tuner.bench.scales import error_of, value_of
+from tuner.coefficients import COEFFICIENTS
+from tuner.wording.phrases import listed
+
+#: Code of a remark -> sentence, with its numbers in braces.
+REMARKS: Mapping[str, str] = {
+    "swing": "{oscillations:.0f} oscillations of {frequency:.4f} Hz, at first by {degrees:.1f}°.",
+    "beat": (
+        "A second oscillation has {share:.0%} of the amplitude, a beat: hang it so that it turns "
+        "only, without swinging sideways."
+    ),
+    "drift": "The angle drifts by {drift:.2g} rad, which was fitted beside it.",
+    "levels": "{levels:.0f} steady levels; {outliers:.0f} samples of the tachometer were dropped.",
+    "offset": "The sensor reads {force:+.2f} N at rest.",
+    "not_quadratic": (
+        "The force is not proportional to the squared speed ({deviation:+.1f} standard errors): "
+        "check for ground effect, a soft mount or a drifting sensor."
+    ),
+    "reference_voltage": "The curve holds at {voltage:.2f} V.",
+    "voltage_constant": (
+        "The voltage varied by a factor of {ratio:.3f} only, so that its exponent was not fitted."
+    ),
+    "battery_exponent": (
+        "Rotor speeds go with the voltage to the power of {exponent:.2f} ± {error:.2f}, for which "
+        "a vehicle file has no place."
+    ),
+    "steps": "{up:.0f} steps up and {down:.0f} down; {outliers:.0f} samples were dropped.",
+    "not_first_order": (
+        "The response is not first order: a second lag of {milliseconds:.1f} ms explains "
+        "{explained:.0%} of what remains."
+    ),
+    "points": "{points:.0f} points.",
+    "theory": (
+        "Thrust coefficient {thrust_coefficient:.4f}, power coefficient {power_coefficient:.4f}; "
+        "propellers on a vehicle differ from their table by tens of percent, which the standard "
+        "error includes."
+    ),
+}
+
+
+def remarks_in_words(experiment: ExperimentRecord) -> list[str]:
+    """Return what the checks of an experiment noticed, as sentences."""
+    sentences = []
+    for remark in experiment.remarks:
+        numbers = dict(remark.numbers)
+        numbers["degrees"] = math.degrees(numbers.get("amplitude", 0.0))
+        numbers["milliseconds"] = 1e3 * numbers.get("lag", 0.0)
+        sentences.append(REMARKS[remark.code].format(**numbers))
+    return sentences
+
+
+def numbers_in_words(experiment: ExperimentRecord) -> list[str]:
+    """Return each number that an experiment gives by itself, as a phrase."""
+    phrases = []
+    for row, scaled, deviation in zip(
+        experiment.rows, experiment.value, experiment.std_error, strict=True
+    ):
+        if list(row.values()) == [1.0]:
+            (name,) = row
+            value, error = value_of(name, scaled), error_of(name, scaled, deviation)
+            phrases.append(f"{name} {value:.5g} ± {error:.2g} {COEFFICIENTS[name].unit}".rstrip())
+        elif all(factor == 1.0 for factor in row.values()):
+            value = math.exp(scaled)
+            phrases.append(f"{' · '.join(row)} {value:.5g} ± {value * deviation:.2g}")
+        else:
+            phrases.append(f"a relation of {listed(list(row))} to ±{196 * deviation:.2g} %")
+    return phrases
+
+
+def agreement_in_words(record: BenchRecord) -> str:
+    """Return whether the experiments agree, as a sentence."""
+    if record.degrees_of_freedom < 1:
+        return "No coefficient was measured twice, so that nothing checks the experiments."
+    verdict = "disagree" if record.p_value < DISAGREE else "agree"
+    return (
+        f"The experiments {verdict}: χ² is {record.chi_square:.1f} with "
+        f"{record.degrees_of_freedom} degrees of freedom (p = {record.p_value:.2g})."
+    )
+
+
+def bench_in_words(record: BenchRecord) -> str:
+    """Return what ground measurements gave, in one sentence."""
+    count = len(record.experiments)
+    return (
+        f"{len(record.names)} coefficients come from {count} ground "
+        f"experiment{'s' if count != 1 else ''}; no flight was used."
+    )
