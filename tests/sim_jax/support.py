@@ -30,6 +30,15 @@ def vehicle() -> Vehicle:
     return golden_vehicle("new", rotor_height=0.06)
 
 
+def without_losses(craft: Vehicle) -> Vehicle:
+    """Return the vehicle in an air that takes nothing away."""
+    return eqx.tree_at(  # type: ignore[no-any-return]
+        lambda v: (v.aerodynamics.rotor_drag_coefficient, v.aerodynamics.max_relative_airspeed),
+        craft,
+        (0.0, 1e12),
+    )
+
+
 def controller(*, filters: bool = True, **mixer: object) -> Controller:
     """Return the airframe's controllers, with PX4's default gyro filters."""
     cutoffs = Filters(jnp.asarray(40.0), jnp.asarray(20.0)) if filters else Filters(None, None)

@@ -24,6 +24,7 @@ from tests.sim_jax.support import (
     reference,
     vec,
     vehicle,
+    without_losses,
 )
 
 COUNTS = [6, 8]
@@ -40,15 +41,6 @@ def round_airframe(count: int) -> Vehicle:
     )
     craft = eqx.tree_at(lambda v: v.body.inertia_yy, vehicle(), vehicle().body.inertia_xx)
     return Vehicle(craft.body, rotors, craft.motor, craft.aerodynamics, craft.setup)
-
-
-def without_losses(craft: Vehicle) -> Vehicle:
-    """Return the vehicle in an air that takes nothing away."""
-    return eqx.tree_at(  # type: ignore[no-any-return]
-        lambda v: (v.aerodynamics.rotor_drag_coefficient, v.aerodynamics.max_relative_airspeed),
-        craft,
-        (0.0, 1e12),
-    )
 
 
 def constant(values: tuple, steps: int = STEPS) -> tuple:

@@ -1,19 +1,28 @@
 """What is added in one place is seen all the way through.
 
 A coefficient is its row in the registry, a force is its function in the tuple of terms, an export
-target is a module: nothing else knows of them beforehand.
+target is a module: nothing else knows of them beforehand. No row of an effect is without its use.
 """
 
 import sys
+from dataclasses import replace
 from types import ModuleType
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import tuner
+from sim_jax.environment import Environment
 from sim_jax.numeric import safe_sqrt
 from sim_jax.rigid_body import Wrench
+from sim_jax.rollout import rollout
+from sim_jax.schedule import Schedule
 from sim_jax.terms import total
 from sim_jax.vector import Vec3
+from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.coefficients import EFFECTS, REGISTRY, Coefficient, NotCarried, Written
 from tuner.config import (
     ControllerFile,
@@ -32,6 +41,9 @@ from tuner.simulation.write import write_flights
 
 NAME = "sail_drag"
 TRUTH = 0.06
+
+SURROUNDINGS = Environment(wind=vec(1.5, -0.5, 0.0))
+"""All that a term can depend on, so that each acts."""
 
 ROW = Coefficient(
     name=NAME,
@@ -95,6 +107,43 @@ def ini_target(monkeypatch):
     module.TARGET = Target("ini", ".ini", draft, entry)
     monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr(targets, "NAMES", [*targets.NAMES, "ini"])
+
+
+def effects_that_do_nothing():
+    """Return the effects of the registry that change neither motion nor rotor speed of a flight.
+
+    The first flight of a batch has all at their neutral values, each other one moves one of them.
+    """
+    rows = [row for row in REGISTRY.values() if row.is_effect]
+    effects = {
+        row.name: row.neutral + row.step * jnp.eye(len(rows) + 1)[number]
+        for number, row in enumerate(rows, start=1)
+    }
+    craft = vehicle()
+    near_the_ground = eqx.tree_at(
+        lambda start: start.motion.position.z, moving_start(craft), jnp.asarray(0.3)
+    )
+    log = eqx.filter_jit(rollout)(
+        replace(craft, effects=effects),
+        controller(),
+        Schedule(log_rate=400),
+        wobble(craft, 6),
+        near_the_ground,
+        samples=5,
+        environment=SURROUNDINGS,
+    ).log
+    last = np.stack([leaf[-1] for leaf in jax.tree.leaves((log.motion, log.rotor_speed))], axis=1)
+    changes = np.max(np.abs(last[1:] - last[0]), axis=1)
+    return [row.name for row, change in zip(rows, changes, strict=True) if change < 1e-10]
+
+
+def test_every_effect_of_the_registry_acts():
+    assert effects_that_do_nothing() == []
+
+
+def test_a_row_without_a_term_is_noticed(monkeypatch):
+    monkeypatch.setitem(REGISTRY, NAME, ROW)
+    assert effects_that_do_nothing() == [NAME]
 
 
 @pytest.mark.usefixtures("added")
