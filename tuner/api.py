@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from tuner.config import (
-    ControllerFile,
-    Options,
-    VehicleFile,
-)
+from tuner.config import ControllerFile, Options, VehicleFile
 from tuner.config.job import Method
 from tuner.flights.flight import Array
 from tuner.flights.load import load_flight
@@ -103,18 +99,18 @@ def fit(
     configure()
     from tuner.job.run import run  # noqa: PLC0415 (jax)
 
-    options = Options(
-        flights=[str(path) for path in flights],
+    options = _options(
+        flights,
         holdout=holdout,
-        vehicle=_text(vehicle),
-        controller=_text(controller),
+        vehicle=vehicle,
+        controller=controller,
         mass=mass,
-        config=_text(config),
+        config=config,
         fit=free,
         fix=fixed,
         method=method,
         seed=seed,
-        topics=_text(topics),
+        topics=topics,
         namespace=namespace,
     )
     folder, _ = run(
@@ -164,17 +160,15 @@ def compare(
     configure()
     from tuner.comparison.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
-    options = Options(
-        flights=[str(path) for path in flights],
-        controller=_text(controller),
-        config=_text(config),
-        topics=_text(topics),
+    options = _options(
+        flights,
+        controller=controller,
+        config=config,
+        topics=topics,
         namespace=namespace,
     )
     labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
-    sets: dict[str, str | VehicleFile] = {}
-    for label, vehicle in labelled.items():
-        sets[label] = _text(vehicle)
+    sets: dict[str, str | VehicleFile] = {k: _text(v) for k, v in labelled.items()}
     table, _ = compare_vehicles(options, sets, [Path(path) for path in out])
     return table
 
@@ -237,15 +231,15 @@ def sensitivity(
     from tuner.job.folder import folder_for  # noqa: PLC0415
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
-    options = Options(
-        flights=[str(path) for path in flights],
-        vehicle=_text(vehicle),
-        controller=_text(controller),
+    options = _options(
+        flights,
+        vehicle=vehicle,
+        controller=controller,
         mass=mass,
-        config=_text(config),
+        config=config,
         fit=free,
         fix=fixed,
-        topics=_text(topics),
+        topics=topics,
         namespace=namespace,
     )
     return examine_vehicle(
@@ -384,6 +378,11 @@ def export(
         simulator=simulator,
         accept=accept,
     )
+
+
+def _options(flights: Sequence[Named], **given: Any) -> Options:
+    settings: dict[str, Any] = {name: _text(value) for name, value in given.items()}
+    return Options([str(path) for path in flights], **settings)
 
 
 def _text(named: Path | T) -> str | T:

@@ -76,8 +76,3 @@ for _name, (_summary, *_examples) in COMMANDS.items():
         help_format="plaintext",
     )
 app.default(tune)
-
-
-def commands() -> tuple[str, ...]:
-    """Return the names of the commands."""
-    return tuple(COMMANDS)

@@ -39,25 +39,9 @@ def export(
     accept
         Export although a condition is not met, and record this reason in the file.
     """
-    from datetime import date
+    from tuner.api import export as export_run
 
-    from tuner.runtime import configure
-
-    configure()
-    from tuner.exporters.export import export as export_run
-    from tuner.exporters.refly import refly
-    from tuner.result import read_run
-
-    done = export_run(
-        read_run(run),
-        format,
-        refly=refly,
-        today=date.today(),
-        into=into,
-        out=out,
-        simulator=simulator,
-        accept=accept,
-    )
+    done = export_run(run, format, into=into, out=out, simulator=simulator, accept=accept)
     if not quiet:
         from tuner.cli.tables import print_export
 

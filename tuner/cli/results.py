@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from tuner.cli.tables import console
+from tuner.result import RMSE_UNITS
 
 if TYPE_CHECKING:
     from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
-
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 def print_run(folder: Path, result: RunResult) -> None:
@@ -127,7 +126,7 @@ def _errors(result: RunResult) -> Table:
     table = _rmse_table("RMSE with the initial → with the best coefficients", "flight")
     for flight in result.flights:
         cells = []
-        for axis in AXES:
+        for axis in RMSE_UNITS:
             before, after = getattr(flight.rmse_initial, axis), getattr(flight.rmse_best, axis)
             cells.append(f"{_number(before)} → {_number(after)}")
         held_out = " (held out)" if flight.split == "holdout" else ""
@@ -141,7 +140,7 @@ def folds_table(folds: Sequence[Fold]) -> Table:
     for fold in folds:
         cells = [
             "impossible" if fold.rmse is None else _number(getattr(fold.rmse, axis))
-            for axis in AXES
+            for axis in RMSE_UNITS
         ]
         table.add_row(fold.left_out, *cells)
     return table
@@ -150,8 +149,7 @@ def folds_table(folds: Sequence[Fold]) -> Table:
 def _rmse_table(title: str, first: str) -> Table:
     table = Table(box=None, title=title, title_justify="left")
     table.add_column(first)
-    for axis in AXES:
-        unit = "m" if axis in ("x", "y", "z") else "deg"
+    for axis, unit in RMSE_UNITS.items():
         table.add_column(f"{axis} {unit}", justify="right")
     return table
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from cyclopts import CycloptsError
 
-from tuner.cli.app import app, commands
+from tuner.cli.app import COMMANDS, app
 from tuner.cli.options import TYPED
 from tuner.errors import InputError, did_you_mean
 
@@ -62,18 +62,18 @@ def _unforeseen(error: Exception) -> int:
 
 def _know_the_command(arguments: Sequence[str]) -> None:
     """Refuse a first word that is neither an option nor a command."""
-    if arguments and not arguments[0].startswith("-") and arguments[0] not in commands():
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
         raise InputError("command line", f"no command '{arguments[0]}'", _remedy(arguments[0]))
 
 
 def _remedy(word: str) -> str:
     if "." in word or "/" in word:
         return f"for a fit write: tune --flights {word}"
-    return did_you_mean(word, commands())
+    return did_you_mean(word, COMMANDS)
 
 
 def _help(arguments: Sequence[str]) -> str:
-    named = arguments and arguments[0] in commands()
+    named = arguments and arguments[0] in COMMANDS
     return f"tune {arguments[0]} --help" if named else "tune --help"
 
 

@@ -56,13 +56,14 @@ def simulate(
     from tuner.runtime import configure
 
     configure()
-    from tuner.simulation.plan import simulate_to_file
+    from tuner.simulation.plan import fly
+    from tuner.simulation.sweep import grid_of
+    from tuner.simulation.write import write_flights
 
-    summaries = simulate_to_file(
-        out,
-        vehicle=vehicle,
-        controller=controller,
-        trajectory={
+    flights = fly(
+        vehicle,
+        controller,
+        {
             "name": trajectory,
             "radius": radius,
             "omega": omega,
@@ -72,8 +73,9 @@ def simulate(
         speed=speed,
         duration=duration,
         rate=rate,
-        sweep=sweep or (),
+        grid=grid_of(sweep or ()) or None,
         precision=precision,
     )
+    summaries = write_flights(flights, out)
     if not quiet:
         print_flights(summaries, out)

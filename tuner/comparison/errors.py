@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.flights.flight import Array, Flight
-from tuner.result import AxesRmse
+from tuner.result import RMSE_UNITS, AxesRmse
 
 #: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
 CLEARANCE = 0.3
@@ -82,14 +82,13 @@ class FlightErrors:
 
 def rmse_of(flights: Sequence[FlightErrors]) -> AxesRmse:
     """Return the RMSE over all samples of some flights, None throughout if one crashed."""
-    axes = ("x", "y", "z", "roll", "pitch", "yaw")
     if any(flight.crash_time is not None for flight in flights):
-        return AxesRmse(**dict.fromkeys(axes))
+        return AxesRmse(**dict.fromkeys(RMSE_UNITS))
     values = [
         *_root_mean_square(np.concatenate([flight.position.error for flight in flights])),
         *_root_mean_square(np.concatenate([flight.attitude.error for flight in flights])),
     ]
-    return AxesRmse(**dict(zip(axes, values, strict=True)))
+    return AxesRmse(**dict(zip(RMSE_UNITS, values, strict=True)))
 
 
 def _root_mean_square(errors: Array) -> list[float | None]:

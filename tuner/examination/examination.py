@@ -14,7 +14,8 @@ from tuner.sensitivity_analysis.local import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.estimates import Uncertainty, references, uncertainty_at
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 from tuner.uncertainty.information import FisherInformation, information_from_jacobian
-from tuner.uncertainty.whiteness import Residual, whiteness
+from tuner.uncertainty.residual import Residual
+from tuner.uncertainty.whiteness import whiteness
 
 Array = NDArray[np.float64]
 

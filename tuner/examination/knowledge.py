@@ -16,7 +16,6 @@ from tuner.examination.sensitivity_json import (
     EffectOverTime,
     Knowledge,
     OutputSensitivity,
-    ResidualWhiteness,
 )
 from tuner.objective.criterion import Point
 from tuner.uncertainty.estimates import Uncertainty
@@ -44,19 +43,7 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         channels=list(uncertainty.channels),
         outputs=_outputs(examination),
         effects_over_time=_effects_over_time(examination),
-        residuals=[
-            ResidualWhiteness(
-                flight=residual.flight,
-                channel=residual.channel,
-                rms=residual.rms,
-                spacing=float(residual.lag[1]),
-                autocorrelation=residual.autocorrelation.round(4).tolist(),
-                limit=residual.limit,
-                memory=residual.memory,
-                white=residual.white,
-            )
-            for residual in examination.residuals
-        ],
+        residuals=list(examination.residuals),
         directions=list(uncertainty.directions),
         names=list(uncertainty.names),
         correlation=uncertainty.covariance.correlation.tolist(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.verdict import Reason, Verdict
 
 
@@ -94,19 +95,6 @@ class EffectOverTime(Part):
     span: dict[str, tuple[float, float]]
 
 
-class ResidualWhiteness(Part):
-    """Whether residuals are white noise, see `tuner.uncertainty.whiteness.Residual`."""
-
-    flight: str
-    channel: str
-    rms: float
-    spacing: float
-    autocorrelation: list[float]
-    limit: float
-    memory: float
-    white: bool
-
-
 class Knowledge(ResultFile):
     """The content of ``sensitivity.json``.
 
@@ -138,7 +126,7 @@ class Knowledge(ResultFile):
     channels: list[str]
     outputs: list[OutputSensitivity]
     effects_over_time: list[EffectOverTime]
-    residuals: list[ResidualWhiteness]
+    residuals: list[Residual]
     directions: list[Direction]
     names: list[str]
     correlation: list[list[float]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from tuner.config import VehicleFile
 from tuner.errors import InputError
-from tuner.result import AxesRmse, Run
+from tuner.result import RMSE_UNITS, AxesRmse, Run
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.
 Refly = Callable[[Run, VehicleFile], Mapping[str, AxesRmse]]
@@ -63,15 +63,13 @@ def _differing(run: Run, flown: Mapping[str, AxesRmse]) -> list[str]:
         if again is None:
             objections.append(f"{flight.name} was not flown again")
             continue
-        for axis in (*POSITION, *ATTITUDE):
+        for axis in RMSE_UNITS:
             then, now = getattr(flight.rmse_best, axis), getattr(again, axis)
-            if then is not None and now is not None and not _same(then, now):
+            if then is None or now is None:
+                continue
+            if not math.isclose(then, now, rel_tol=SAME_RELATIVE, abs_tol=SAME_ABSOLUTE):
                 objections.append(f"{flight.name} {axis} gives {now:.4g}, the run {then:.4g}")
     return objections
-
-
-def _same(then: float, now: float) -> bool:
-    return math.isclose(then, now, rel_tol=SAME_RELATIVE, abs_tol=SAME_ABSOLUTE)
 
 
 def _worse(run: Run) -> list[str]:

@@ -19,12 +19,11 @@ from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
 from tuner.objective.normal import Objective
-from tuner.result import AxesRmse
+from tuner.result import RMSE_UNITS, AxesRmse
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 
 CROSS_VALIDATION_FILE = "cross_validation.csv"
-AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,7 @@ def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:
     names = list(folds[0].coefficients)
     rows = [
         [
-            *(None if fold.rmse is None else getattr(fold.rmse, axis) for axis in AXES),
+            *(None if fold.rmse is None else getattr(fold.rmse, axis) for axis in RMSE_UNITS),
             *(fold.coefficients[name] for name in names),
         ]
         for fold in folds
@@ -115,5 +114,5 @@ def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:
     ]
     labels = (*(fold.left_out for fold in folds), "spread")
     table = ([label, *row] for label, row in zip(labels, (*rows, spread), strict=True))
-    header = ("left_out", *(f"rmse_{axis}" for axis in AXES), *names)
+    header = ("left_out", *(f"rmse_{axis}" for axis in RMSE_UNITS), *names)
     write_text(folder / CROSS_VALIDATION_FILE, csv_text(header, table))

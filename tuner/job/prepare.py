@@ -19,7 +19,7 @@ from tuner.objective.noise import CHANNELS, noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, segments_of, window_segments
 from tuner.objective.start import begins_gently
-from tuner.recordings import Recording, read_recordings
+from tuner.recordings import Recording
 
 #: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust
 #: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
@@ -94,17 +94,6 @@ class Job:
             for flight in self.fitted
             if flight.has("command")
         )
-
-
-def prepare(settings: Settings) -> Job:
-    """Read the flights and build the problem.
-
-    Raises
-    ------
-    InputError
-        A recording cannot be read or used, or the job leaves nothing to fit.
-    """
-    return job_of(settings, read_recordings(settings))
 
 
 def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:

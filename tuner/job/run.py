@@ -26,9 +26,10 @@ from tuner.job.findings import finer_than_steps
 from tuner.job.folder import folder_for
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
-from tuner.job.prepare import Job, prepare
+from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
+from tuner.recordings import read_recordings
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
@@ -82,7 +83,7 @@ def run(
     settings = settle(options)
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
-    job = prepare(settings)
+    job = job_of(settings, read_recordings(settings))
     findings = check(job)
     _report(findings, listener, force=force)
 

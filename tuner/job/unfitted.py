@@ -18,6 +18,7 @@ from tuner.search.continuation import FEEDBACK_GAIN
 from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, with_feedback
 from tuner.search.stages import WHOLE, schedule_of
+from tuner.search.weights import misfit, root_mean_squares
 
 
 def unfitted(job: Job) -> Fitted:
@@ -81,15 +82,9 @@ def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
     )
     fresh, point = beginning(objective, vector[None]), objective.start(vector)
     offsets = np.asarray(point.offsets)
-    sums = objective.sums(
-        point, criterion_of(whole, fresh.scales, offsets, fresh.states), derivatives=False
-    )
-    flight = np.asarray(objective.segments.flight)
-    scale = {}
-    for name, squares in sums.squares.items():
-        total = np.bincount(flight, np.asarray(squares), minlength=objective.flights)
-        count = np.bincount(flight, np.asarray(sums.counts[name]), minlength=objective.flights)
-        scale[name] = np.maximum(np.sqrt(total / np.maximum(count, 1.0)), 1.0)
+    unscaled = criterion_of(whole, fresh.scales, offsets, fresh.states)
+    sums = objective.sums_of(fresh.points, unscaled, derivatives=False)
+    scale = misfit(root_mean_squares(objective, fresh.losses, sums))
     criterion = criterion_of(whole, scale, offsets, fresh.states)
     return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
 

@@ -1,9 +1,9 @@
 """The normal equations of a whole fit, and the least-squares problem that has the same.
 
 Each of F segments contributes a loss, a gradient and a Gauss-Newton Hessian from which its own
-start has been eliminated (`tuner.objective.sums`); `normal_equations` sums them over the segments
-and adds the priors: loss c, gradient g (P,) and Hessian H (P, P). The residuals themselves, some
-hundred thousand, are never laid in one array.
+start has been eliminated (`tuner.objective.simulator`); `normal_equations` sums them over the
+segments and adds the priors: loss c, gradient g (P,) and Hessian H (P, P). The residuals
+themselves, some hundred thousand, are never laid in one array.
 
 optimistix's least-squares solvers ask for residuals. `linear_residuals` gives the smallest problem
 that has these normal equations. With H = L Lᵀ (Cholesky) and y₀ the point where they were computed,

@@ -1,10 +1,10 @@
-"""From what a user names to flights in a file."""
+"""From what a user names to flights."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, NotRequired, TypedDict, Unpack
+from typing import Annotated
 
 from annotated_types import Interval
 
@@ -20,9 +20,7 @@ from tuner.config import (
 )
 from tuner.flights.flight import Array
 from tuner.simulation.simulate import Simulation, simulate
-from tuner.simulation.sweep import grid_of
 from tuner.simulation.trajectory import at_speed
-from tuner.simulation.write import Summary, write_flights
 from tuner.yaml_files.section import Number, Section, build
 
 
@@ -33,18 +31,6 @@ class Plan(Section):
     duration: Annotated[Number, Interval(gt=0, le=3600)]
     rate: Annotated[Number, Interval(gt=0, le=10_000)]
     precision: Precision
-
-
-class Flown(TypedDict):
-    """The arguments of `fly` that the command line gives."""
-
-    vehicle: str
-    controller: str
-    trajectory: Mapping[str, object]
-    speed: NotRequired[float | None]
-    duration: NotRequired[float]
-    rate: NotRequired[float]
-    precision: NotRequired[Precision]
 
 
 def fly(
@@ -104,25 +90,3 @@ def fly(
         grid=grid,
         precision=plan.precision,
     )
-
-
-def simulate_to_file(
-    out: Path, *, sweep: Sequence[str] = (), **flown: Unpack[Flown]
-) -> tuple[Summary, ...]:
-    """Fly, and write the flight or each of a grid.
-
-    Parameters
-    ----------
-    out
-        FILE.csv or FILE.bag.
-    sweep
-        Each ``name=low:high:count``.
-    flown
-        As of `fly`.
-
-    Raises
-    ------
-    InputError
-        Something named does not exist or cannot be flown, or the file cannot be written.
-    """
-    return write_flights(fly(**flown, grid=grid_of(sweep) or None), out)

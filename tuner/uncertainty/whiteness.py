@@ -3,58 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Jacobian
 from tuner.objective.normal import Objective
+from tuner.uncertainty.residual import Residual
 
 Array = NDArray[np.float64]
 
 LAGS = 50
 """Number of lags of the autocorrelation, in samples."""
+OUTSIDE = 0.1
+"""Share of the lags outside the band of 95 % up to which residuals count as white: twice chance."""
 MIN_SAMPLES = 4 * LAGS
 """Samples below which the autocorrelation is not computed."""
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The residuals of one channel of one flight.
-
-    Attributes
-    ----------
-    flight, channel
-        Names.
-    rms
-        In standard deviations of the measurement noise.
-    lag
-        (L,) s.
-    autocorrelation
-        (L,) mean over the axes; 1 at lag 0.
-    limit
-        Half the band within which 95 % of the lags of white noise lie.
-    memory
-        Correlation time in s: the integral of the autocorrelation's square, on either side of 0; a
-        sample's spacing for white noise.
-    outside
-        Share of the lags beyond ``limit``.
-    """
-
-    flight: str
-    channel: str
-    rms: float
-    lag: Array
-    autocorrelation: Array
-    limit: float
-    memory: float
-    outside: float
-
-    @property
-    def white(self) -> bool:
-        """Whether at most twice the share of lags expected by chance lies outside the band."""
-        return self.outside <= 0.1
 
 
 def whiteness(
@@ -98,9 +62,9 @@ def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:
         flight=flight,
         channel=channel,
         rms=float(np.sqrt(np.mean(error**2))),
-        lag=np.asarray(spacing * np.arange(LAGS)),
-        autocorrelation=correlation,
+        spacing=spacing,
+        autocorrelation=correlation.round(4).tolist(),
         limit=float(limit),
         memory=float(spacing * (1.0 + 2.0 * (correlation[1:] ** 2).sum())),
-        outside=float(np.mean(np.abs(correlation[1:]) > limit)),
+        white=bool(np.mean(np.abs(correlation[1:]) > limit) <= OUTSIDE),
     )

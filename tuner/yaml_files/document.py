@@ -10,7 +10,7 @@ from pathlib import Path
 
 import yaml
 
-from tuner.disk import exists, write_text
+from tuner.disk import exists
 from tuner.errors import ConfigError
 from tuner.files import read_bytes
 from tuner.validation import Place
@@ -103,21 +103,6 @@ def read_yaml(path: str | Path) -> Document:
         raise ConfigError(path, f"is not YAML ({error})", "correct the file") from None
     except RecursionError:
         raise ConfigError(path, "is nested too deeply", "give a plain configuration file") from None
-
-
-def write_yaml(data: object, path: str | Path, *, header: str = "") -> None:
-    """Write a document that `read_yaml` reads back to equal values.
-
-    Parameters
-    ----------
-    data
-        Plain dicts, lists, strings, numbers, booleans and None.
-    path
-        The file to make or replace.
-    header
-        Comment lines, without the ``#``.
-    """
-    write_text(Path(path), commented(header) + dump_yaml(data))
 
 
 def commented(text: str) -> str:

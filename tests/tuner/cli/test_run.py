@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tuner.cli import main
-from tuner.cli.app import commands
+from tuner.cli.app import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -15,11 +15,11 @@ ROOT = Path(__file__).resolve().parents[3]
 def test_the_help_names_every_command(capsys):
     assert main(["--help"]) == 0
     text = capsys.readouterr().out
-    for name in (*commands(), "--flights", "--holdout", "--resume", "Example: tune --flights"):
+    for name in (*COMMANDS, "--flights", "--holdout", "--resume", "Example: tune --flights"):
         assert name in text
 
 
-@pytest.mark.parametrize("name", commands())
+@pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name, capsys):
     assert main([name, "--help"]) == 0
     words = " ".join(capsys.readouterr().out.split())

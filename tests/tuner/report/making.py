@@ -16,7 +16,6 @@ from tuner.examination.sensitivity_json import (
     EffectOverTime,
     Knowledge,
     OutputSensitivity,
-    ResidualWhiteness,
 )
 from tuner.examination.tables import write_files
 from tuner.report import write_traces
@@ -31,6 +30,7 @@ from tuner.result import (
 )
 from tuner.search.iteration import Iteration
 from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
 from tuner.wording.verdicts import judgement_in_words
 from tuner.yaml_files.shipped import find_config
@@ -122,7 +122,7 @@ def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Directio
             for flight in FLIGHTS
         ],
         residuals=[
-            ResidualWhiteness(
+            Residual(
                 flight=flight,
                 channel=channel,
                 rms=1.0,

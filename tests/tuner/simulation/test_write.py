@@ -6,7 +6,7 @@ import pytest
 
 from tuner.errors import InputError
 from tuner.flights.load import load_flight
-from tuner.simulation.plan import simulate_to_file
+from tuner.simulation.plan import fly
 from tuner.simulation.sweep import grid_of
 from tuner.simulation.table import roll_pitch_yaw, write_csv
 from tuner.simulation.write import summary_of, write_flights
@@ -123,14 +123,9 @@ def test_a_wrong_sweep_is_named(sweep, expected):
 
 
 def test_a_grid_goes_into_one_table(tmp_path):
-    summaries = simulate_to_file(
-        tmp_path / "g.csv",
-        vehicle="hovergames_updated",
-        controller="hovergames",
-        trajectory={"name": "hover"},
-        duration=4.0,
-        sweep=["motor_constant=1.3e-5:1.5e-5:2", "inertia_xx=0.025"],
-    )
+    grid = grid_of(["motor_constant=1.3e-5:1.5e-5:2", "inertia_xx=0.025"])
+    flights = fly("hovergames_updated", "hovergames", {"name": "hover"}, duration=4.0, grid=grid)
+    summaries = write_flights(flights, tmp_path / "g.csv")
     table = pd.read_csv(tmp_path / "g.csv")
     assert list(table.columns) == ["motor_constant", "inertia_xx", *COLUMNS]
     assert table.groupby("motor_constant")["time"].count().tolist() == [401, 401]
@@ -155,7 +150,7 @@ def test_what_cannot_be_flown_is_refused_in_one_line(tmp_path, options, expected
         "trajectory": {"name": "hover"},
     }
     with pytest.raises(InputError) as error:
-        simulate_to_file(tmp_path / "c.csv", **usual | options)
+        write_flights(fly(**usual | options), tmp_path / "c.csv")
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
     assert not list(Path(tmp_path).iterdir())

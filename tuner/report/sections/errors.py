@@ -6,9 +6,7 @@ from dataclasses import dataclass
 
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.result import AxesRmse
-
-AXES = {"x": "m", "y": "m", "z": "m", "roll": "°", "pitch": "°", "yaw": "°"}
+from tuner.result import RMSE_UNITS, AxesRmse
 
 
 @dataclass(frozen=True)
@@ -30,12 +28,12 @@ def errors(contents: Contents) -> Section | None:
         )
         for flight in contents.run.result.flights
     ]
-    values = {"axes": AXES, "rows": rows, "laps": _laps(contents)}
+    values = {"axes": RMSE_UNITS, "rows": rows, "laps": _laps(contents)}
     return Section("errors", "RMSE of each flight", values)
 
 
 def _pairs(before: AxesRmse, after: AxesRmse) -> list[tuple[float | None, float | None]]:
-    return [(getattr(before, axis), getattr(after, axis)) for axis in AXES]
+    return [(getattr(before, axis), getattr(after, axis)) for axis in RMSE_UNITS]
 
 
 def _laps(contents: Contents) -> list[Row]:
