@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
 
+from sim_jax.numeric import Scalar
+from sim_jax.schedule import Schedule
+from sim_jax.trees import row_of
 from sim_jax.vector import Vec3
 
 
@@ -12,6 +18,28 @@ class Environment(eqx.Module):
 
     wind: Vec3 | None = None
     """m/s, world ENU: the air's steady velocity over the ground, leaves (\\*batch)."""
+    log_voltage: Float[Array, "ticks *batch"] | None = None
+    """Logarithm of the battery's voltage over its reference voltage, one a control tick."""
+    battery_decline: Scalar | None = None
+    """1/s by which rotor speeds fall, where no voltage was recorded."""
+
+    def speed_factor(
+        self, battery_exponent: Scalar | None, step: Int[Array, ""], schedule: Schedule
+    ) -> Scalar | None:
+        """Return the factor of the battery on reference rotor speeds in a step; None for none.
+
+        (V/V_ref)^battery_exponent where the voltage is known (thesis 10.4), 1 - battery_decline·t
+        where a flight's decline is.
+        """
+        factor = None
+        if battery_exponent is not None and self.log_voltage is not None:
+            factor = jnp.exp(
+                battery_exponent * row_of(self.log_voltage, schedule.control_tick(step))
+            )
+        if self.battery_decline is not None:
+            declined = 1.0 - self.battery_decline * (step * schedule.step)
+            factor = declined if factor is None else factor * declined
+        return factor
 
 
 NOTHING_AROUND = Environment()

@@ -9,6 +9,21 @@ from sim_jax.numeric import Scalar
 from sim_jax.vehicle import Motor
 
 
+class LagSlope(eqx.Module):
+    """How the time constants change with the rotor speed: τ·(1 + slope·(Ω - Ω_hover)/Ω_hover).
+
+    Source: thesis 5, where bench and flight disagree about the time constants.
+    """
+
+    slope: Scalar
+    hover_speed: Scalar
+    """rad/s."""
+
+    def stretch(self, speed: Scalar) -> Scalar:
+        """Return the factor on the time constants at a speed; a tenth at least."""
+        return jnp.maximum(1.0 + self.slope * (speed / self.hover_speed - 1.0), 0.1)
+
+
 class Lag(eqx.Module):
     """The exact first-order filter over one physics step, prepared once a rollout."""
 
@@ -16,9 +31,12 @@ class Lag(eqx.Module):
     decay_down: Scalar
     mean_up: Scalar
     mean_down: Scalar
+    steps: tuple[Scalar, ...] = ()
+    """The step over both time constants; for a slope alone."""
+    slope: LagSlope | None = None
 
     @staticmethod
-    def over(motor: Motor, step: Scalar | float) -> Lag:
+    def over(motor: Motor, step: Scalar | float, slope: LagSlope | None = None) -> Lag:
         """Prepare the filter α = exp(-step/τ), and the mean of the decay over the step.
 
         Parameters
@@ -27,6 +45,8 @@ class Lag(eqx.Module):
             Gives both time constants in s.
         step
             Physics step in s, or a part of it, which may be zero.
+        slope
+            Where the time constants change with the speed.
         """
         up, down = step / motor.time_constant_up, step / motor.time_constant_down
         return Lag(
@@ -34,12 +54,18 @@ class Lag(eqx.Module):
             decay_down=jnp.exp(-down),
             mean_up=_mean_decay(up),
             mean_down=_mean_decay(down),
+            steps=() if slope is None else (up, down),
+            slope=slope,
         )
 
     def advance(self, speed: Scalar, reference: Scalar) -> tuple[Scalar, Scalar]:
         """Return the rotor speed after the step and its mean over the step, in rad/s."""
         rising = reference > speed
         gap = speed - reference
+        if self.slope is not None:
+            up, down = self.steps
+            steps = jnp.where(rising, up, down) / self.slope.stretch(speed)
+            return reference + jnp.exp(-steps) * gap, reference + _mean_decay(steps) * gap
         after = reference + jnp.where(rising, self.decay_up, self.decay_down) * gap
         mean = reference + jnp.where(rising, self.mean_up, self.mean_down) * gap
         return after, mean
@@ -54,10 +80,14 @@ class SwitchedLag(eqx.Module):
     """Part of the step before the change, 0..1."""
 
     @staticmethod
-    def over(motor: Motor, step: float, share: Scalar) -> SwitchedLag:
+    def over(
+        motor: Motor, step: float, share: Scalar, slope: LagSlope | None = None
+    ) -> SwitchedLag:
         """Prepare both parts of a step of ``step`` s."""
         return SwitchedLag(
-            Lag.over(motor, step * share), Lag.over(motor, step * (1.0 - share)), share
+            Lag.over(motor, step * share, slope),
+            Lag.over(motor, step * (1.0 - share), slope),
+            share,
         )
 
     def advance(self, speed: Scalar, before: Scalar, after: Scalar) -> tuple[Scalar, Scalar]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,8 @@ from sim_jax.terms.total import total_wrench
 from sim_jax.trees import forgetful, like, repeat, replaced, row_of, where
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
+
+T = TypeVar("T")
 
 
 class Sample(eqx.Module):
@@ -153,6 +157,7 @@ class Plant(eqx.Module):
         if isinstance(self.lag, SwitchedLag) and state.reference_history is not None:
             age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
             before, after = switched(state.reference_history, step, age)
+            before, after = self._on_battery(before, step), self._on_battery(after, step)
             moves = [
                 self.lag.advance(speed, old, new)
                 for speed, old, new in zip(state.rotor_speed, before, after, strict=True)
@@ -161,18 +166,33 @@ class Plant(eqx.Module):
             assert isinstance(self.lag, Lag)
             moves = [
                 self.lag.advance(speed, reference)
-                for speed, reference in zip(state.rotor_speed, state.reference_speed, strict=True)
+                for speed, reference in zip(
+                    state.rotor_speed, self._on_battery(state.reference_speed, step), strict=True
+                )
             ]
         speeds = tuple(end for end, _ in moves)
         mean = tuple(mean for _, mean in moves)
         return speeds, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
 
+    def _on_battery(self, references: T, step: Int[Array, ""]) -> T:
+        """Return reference speeds, rad/s, as the battery's voltage lets the motors reach them."""
+        exponent = self.vehicle.effects.get("battery_exponent")
+        factor = self.environment.speed_factor(exponent, step, self.schedule)
+        if factor is None:
+            return references
+        reached: T = jax.tree.map(lambda speed: factor * speed, references)
+        return reached
+
     def physics(self, state: State, step: Int[Array, ""]) -> State:
         """Advance rotors and body by one step."""
         speeds, acting = self.inlet.next_rotor_speeds(self, state, step)
+        accelerations: PerRotor = ()
+        if "rotor_inertia" in self.vehicle.effects:
+            changes = zip(speeds, state.rotor_speed, strict=True)
+            accelerations = tuple((end - begin) / self.schedule.step for end, begin in changes)
 
         def wrench_at(motion: Motion) -> Wrench:
-            air = Air.around(self.vehicle, motion, self.environment)
+            air = Air.around(self.vehicle, motion, self.environment, accelerations)
             return total_wrench(self.vehicle, motion, acting, air)
 
         integrator = self.schedule.integrator

@@ -16,13 +16,13 @@ from sim_jax.control.gains import Controller
 from sim_jax.crash import Limits
 from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
-from sim_jax.motor import Lag, SwitchedLag
+from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.plant import Plant, Sample
 from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter
-from sim_jax.state import Start, State, first_state
+from sim_jax.state import Start, State, first_state, hover_speed
 from sim_jax.trees import following, forgetful, replaced
 from sim_jax.vehicle import Vehicle
 
@@ -44,9 +44,15 @@ class Rollout(eqx.Module):
 
 def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
     if schedule.longest_actuator_latency == 0:
-        return Lag.over(vehicle.motor, schedule.step)
+        return Lag.over(vehicle.motor, schedule.step, _lag_slope(vehicle))
     age = vehicle.setup.actuator_latency * schedule.physics_rate
-    return SwitchedLag.over(vehicle.motor, schedule.step, age - jnp.floor(age))
+    part = age - jnp.floor(age)
+    return SwitchedLag.over(vehicle.motor, schedule.step, part, _lag_slope(vehicle))
+
+
+def _lag_slope(vehicle: Vehicle) -> LagSlope | None:
+    slope = vehicle.effects.get("time_constant_slope")
+    return None if slope is None else LagSlope(slope, hover_speed(vehicle))
 
 
 def _batch_shape(inlet: Inlet, others: PyTree[Array]) -> tuple[int, ...]:

@@ -56,11 +56,15 @@ class State(eqx.Module):
     """s, infinite while flying."""
 
 
+def hover_speed(vehicle: Vehicle, *, gravity: float = GRAVITY) -> Scalar:
+    """Return the speed, rad/s, at which equal rotors carry a vehicle's weight in still air."""
+    thrust = vehicle.body.mass * gravity / len(vehicle.rotors)
+    return jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
+
+
 def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Start:
     """Return a level vehicle at rest at a position in m, its rotors carrying its weight."""
-    count = len(vehicle.rotors)
-    thrust = vehicle.body.mass * gravity / count
-    speed = jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
+    count, speed = len(vehicle.rotors), hover_speed(vehicle, gravity=gravity)
     command = (speed - vehicle.motor.zero_position_armed) / vehicle.motor.input_scaling
     rest = Vec3.zeros(position.x)
     return Start(

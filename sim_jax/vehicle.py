@@ -97,3 +97,5 @@ class Vehicle(eqx.Module):
     setup: Setup
     effects: dict[str, Scalar] = eqx.field(default_factory=dict)
     """Coefficients of terms beyond the base model by name; a term without them does not act."""
+    rotor_radius: Scalar = eqx.field(converter=_number, default=0.13)
+    """m, of which the ground effect depends; an 11 inch propeller has 0.14."""

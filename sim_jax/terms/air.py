@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.rigid_body import Motion
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Vehicle
+from sim_jax.vehicle import PerRotor, Vehicle
 
 
 class Air(eqx.Module):
@@ -21,18 +22,40 @@ class Air(eqx.Module):
     """m/s, of each rotor's centre through the air: velocity + ω × arm."""
     up: Vec3
     """The world's z axis."""
+    rotor_acceleration: PerRotor = ()
+    """rad/s² of each rotor during the step; empty where no term asks for it."""
 
     @staticmethod
-    def around(vehicle: Vehicle, motion: Motion, environment: Environment = NOTHING_AROUND) -> Air:
+    def around(
+        vehicle: Vehicle,
+        motion: Motion,
+        environment: Environment = NOTHING_AROUND,
+        rotor_acceleration: PerRotor = (),
+    ) -> Air:
         """Return the air as a vehicle meets it in a motion."""
         through = motion.velocity
         if environment.wind is not None:
             through = through - environment.wind
         velocity = motion.attitude.to_body(through)
         arms = tuple(rotor.position for rotor in vehicle.rotors)
+        offset = _center_of_mass(vehicle)
+        if offset is not None:
+            arms = tuple(arm - offset for arm in arms)
         return Air(
             velocity=velocity,
             arms=arms,
             at_rotors=tuple(velocity + motion.body_rate.cross(arm) for arm in arms),
             up=motion.attitude.world_up(),
+            rotor_acceleration=rotor_acceleration,
         )
+
+
+def _center_of_mass(vehicle: Vehicle) -> Vec3 | None:
+    """Return where the centre of mass lies from where the vehicle file has it, in m."""
+    names = [f"center_of_mass_{axis}" for axis in "xyz"]
+    known = [vehicle.effects[name] for name in names if name in vehicle.effects]
+    if not known:
+        return None
+    zero = jnp.zeros_like(known[0])
+    x, y, z = (vehicle.effects.get(name, zero) for name in names)
+    return Vec3(x, y, z)

@@ -1,7 +1,11 @@
-"""Terms of the body as a whole, beyond Gazebo's motor model; each acts where its coefficient is."""
+"""Terms of the body as a whole, beyond Gazebo's motor model; each acts where its coefficient is.
+
+v is the velocity of the centre of mass through the air and ω the body rate, both in body axes.
+"""
 
 from __future__ import annotations
 
+from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms.air import Air
 from sim_jax.vector import Vec3
@@ -14,7 +18,7 @@ def fuselage_drag(
     rotor_speed: PerRotor,  # noqa: ARG001
     air: Air,
 ) -> Wrench | None:
-    """Return -fuselage_drag·‖v‖·v, v the velocity of the centre of mass through the air.
+    """Return the force -fuselage_drag·‖v‖·v.
 
     Source: drag of a bluff body at the Reynolds numbers of a multirotor, quadratic in the velocity.
     """
@@ -23,3 +27,54 @@ def fuselage_drag(
         return None
     force = air.velocity * (-coefficient * air.velocity.norm())
     return Wrench(force, Vec3.zeros(air.velocity.x))
+
+
+def linear_drag(
+    vehicle: Vehicle,
+    motion: Motion,  # noqa: ARG001
+    rotor_speed: PerRotor,  # noqa: ARG001
+    air: Air,
+) -> Wrench | None:
+    """Return the force -linear_drag·v, axis by axis: rotor drag at one speed of the rotors.
+
+    Source: Faessler, Franchi, Scaramuzza, "Differential flatness of quadrotor dynamics subject to
+    rotor drag", RA-L 2018.
+    """
+    coefficients = _along_axes(vehicle, "linear_drag", air.velocity.x)
+    if coefficients is None:
+        return None
+    return Wrench(-coefficients.scaled_by(air.velocity), Vec3.zeros(air.velocity.x))
+
+
+def torque_trim(
+    vehicle: Vehicle,
+    motion: Motion,  # noqa: ARG001
+    rotor_speed: PerRotor,  # noqa: ARG001
+    air: Air,
+) -> Wrench | None:
+    """Return the steady moment torque_trim: what rotors and blades that differ leave over."""
+    moment = _along_axes(vehicle, "torque_trim", air.velocity.x)
+    return None if moment is None else Wrench(Vec3.zeros(air.velocity.x), moment)
+
+
+def angular_drag(
+    vehicle: Vehicle,
+    motion: Motion,
+    rotor_speed: PerRotor,  # noqa: ARG001
+    air: Air,
+) -> Wrench | None:
+    """Return the moment -angular_drag·ω, axis by axis: what is left of inflow and flapping."""
+    coefficients = _along_axes(vehicle, "angular_drag", air.velocity.x)
+    if coefficients is None:
+        return None
+    return Wrench(Vec3.zeros(air.velocity.x), -coefficients.scaled_by(motion.body_rate))
+
+
+def _along_axes(vehicle: Vehicle, stem: str, like: Scalar) -> Vec3 | None:
+    """Return the effects ``stem_x``, ``_y``, ``_z``, absent ones zero; None if all are absent."""
+    names = [f"{stem}_{axis}" for axis in "xyz"]
+    if not any(name in vehicle.effects for name in names):
+        return None
+    zero = Vec3.zeros(like).x
+    x, y, z = (vehicle.effects.get(name, zero) for name in names)
+    return Vec3(x, y, z)

@@ -6,6 +6,8 @@ v∥ along its axis, which is body z, and v⊥ across it.
 
 from __future__ import annotations
 
+import math
+
 import jax.numpy as jnp
 
 from sim_jax.numeric import Scalar
@@ -18,30 +20,39 @@ from sim_jax.vehicle import Aerodynamics, PerRotor, Vehicle
 def thrust(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) -> Wrench:
     """Return motor_constant·Ω²·clip(1 - |v∥|/max_relative_airspeed, 0, 1) along body z, at r.
 
-    Source: thesis Eq. 6.5 and 6.6. The equation is signed; the code that was flown, followed here,
-    takes the length of v∥.
+    Times the rotor's own ``rotor_thrust_scale_i`` and 1/(1 - ground_effect·(R/4h)²), h the height
+    of the rotor's centre, where a vehicle has these effects. Source: thesis Eq. 6.5 and 6.6 (the
+    equation is signed; the code that was flown, followed here, takes the length of v∥); Cheeseman
+    and Bennett, "The effect of the ground on a helicopter rotor in forward flight", 1955.
     """
     aerodynamics = vehicle.aerodynamics
     zero = jnp.zeros_like(motion.velocity.x)
-
-    def lift(speed: Scalar, through: Vec3) -> Vec3:
+    lifts = []
+    for number, (speed, through) in enumerate(zip(rotor_speed, air.at_rotors, strict=True)):
         square = speed * speed * _remaining_share(aerodynamics, through.z)
-        return Vec3(zero, zero, aerodynamics.motor_constant * square)
-
-    lifts = (lift(speed, v) for speed, v in zip(rotor_speed, air.at_rotors, strict=True))
+        scale = _thrust_scale(vehicle, number)
+        if scale is not None:
+            square = scale * square
+        ground = vehicle.effects.get("ground_effect")
+        if ground is not None:
+            height = motion.position.z + air.arms[number].dot(air.up)
+            square = square * _near_ground(ground, vehicle.rotor_radius, height)
+        lifts.append(Vec3(zero, zero, aerodynamics.motor_constant * square))
     return Wrench.at_each_rotor(tuple(lifts))
 
 
 def rotor_drag(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) -> Wrench:
-    """Return -rotor_drag_coefficient·Ω·v⊥, at r.
+    """Return -rotor_drag_coefficient·Ω·v⊥, at r; along body y ``rotor_drag_ratio_y`` times that.
 
-    Source: thesis Eq. 7.2.
+    Source: thesis Eq. 8.2, 10.4.
     """
     coefficient = vehicle.aerodynamics.rotor_drag_coefficient
+    ratio = vehicle.effects.get("rotor_drag_ratio_y")
+    across = coefficient if ratio is None else coefficient * ratio
     zero = jnp.zeros_like(motion.velocity.x)
 
     def drag(speed: Scalar, through: Vec3) -> Vec3:
-        return Vec3(-coefficient * (speed * through.x), -coefficient * (speed * through.y), zero)
+        return Vec3(-coefficient * (speed * through.x), -across * (speed * through.y), zero)
 
     drags = (drag(speed, v) for speed, v in zip(rotor_speed, air.at_rotors, strict=True))
     return Wrench.at_each_rotor(tuple(drags))
@@ -63,12 +74,14 @@ def drag_torque(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Ai
     """Return the moment -s·moment_constant·motor_constant·Ω² about body z.
 
     The thrust in it is that without axial speed, as in Gazebo. The thesis's branch turns about
-    world z instead (``reaction_torque``). Source: thesis Eq. 8.2.
+    world z instead (``reaction_torque``). Source: thesis Eq. 7.2.
     """
     aerodynamics = vehicle.aerodynamics
     square = zero = jnp.zeros_like(motion.velocity.x)
-    for rotor, speed in zip(vehicle.rotors, rotor_speed, strict=True):
-        square = square + rotor.spin * (speed * speed)
+    for number, (rotor, speed) in enumerate(zip(vehicle.rotors, rotor_speed, strict=True)):
+        scale = _thrust_scale(vehicle, number)
+        turned = speed * speed if scale is None else scale * (speed * speed)
+        square = square + rotor.spin * turned
     torque = -aerodynamics.motor_constant * aerodynamics.moment_constant * square
     if aerodynamics.reaction_torque == "world":
         return Wrench(Vec3.zeros(zero), air.up * torque)
@@ -79,3 +92,23 @@ def _remaining_share(aerodynamics: Aerodynamics, axial: Scalar) -> Scalar:
     """Return the share of a rotor's static thrust that is left at an axial air speed in m/s."""
     lost = jnp.abs(axial) * (1.0 / aerodynamics.max_relative_airspeed)
     return jnp.where(lost < 1.0, 1.0 - lost, 0.0)
+
+
+def _thrust_scale(vehicle: Vehicle, number: int) -> Scalar | None:
+    """Return a rotor's own factor on thrust and torque; None where all rotors are alike.
+
+    Their product is 1: the last rotor's follows from the others', unless it is given itself. What
+    all rotors have in common is the motor constant.
+    """
+    count = len(vehicle.rotors)
+    scales = [vehicle.effects.get(f"rotor_thrust_scale_{i + 1}") for i in range(count)]
+    given = [scale for scale in scales if scale is not None]
+    if not given or scales[number] is not None or number < count - 1:
+        return scales[number]
+    return 1.0 / math.prod(given[1:], start=given[0])
+
+
+def _near_ground(ground: Scalar, radius: Scalar, height: Scalar) -> Scalar:
+    """Return by how much the ground raises a rotor's thrust; bounded where the law diverges."""
+    ratio = radius / (4.0 * jnp.maximum(height, 0.5 * radius))
+    return 1.0 / (1.0 - jnp.clip(ground * ratio * ratio, -1.0, 0.5))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from sim_jax.rigid_body import Motion, Wrench
-from sim_jax.terms import body, rotor
+from sim_jax.terms import body, inflow, rotor
 from sim_jax.terms.air import Air
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
@@ -23,6 +23,12 @@ TERMS: tuple[Term, ...] = (
     rotor.rolling_moment,
     rotor.drag_torque,
     body.fuselage_drag,
+    body.linear_drag,
+    inflow.thrust_inflow,
+    inflow.flapping_moment,
+    inflow.gyroscopic_moment,
+    body.angular_drag,
+    body.torque_trim,
 )
 """Everything that acts on the vehicle besides gravity; a term that is added here flies."""
 

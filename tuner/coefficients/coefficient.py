@@ -88,6 +88,9 @@ class Coefficient:
         is weighed or set rather than flown. None comes after all ranks.
     neutral
         The value at which its term vanishes.
+    group
+        Of an effect: what a selection of terms adds together; empty for one that follows from the
+        others of its kind and is never chosen by itself.
     exported_as
         Export target -> where the coefficient stands in it, or why it does not.
     informed_by
@@ -116,6 +119,7 @@ class Coefficient:
     mass_exponent: int = 0
     hold_rank: int | None = None
     neutral: float | None = None
+    group: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None
     plausible: tuple[float, float] | None = None

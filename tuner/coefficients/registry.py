@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Scope, Written
+from tuner.coefficients.coefficient import Coefficient, NotCarried, Scope, Written
+from tuner.coefficients.effects import EFFECT_ROWS
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
 _FROM_SPEEDS = Written("CA_ROTOR*_CT, SIH_T_MAX, SIM_GZ_EC_*")
@@ -172,7 +173,7 @@ _ROWS = (
         name="moment_constant",
         unit="m",
         meaning="drag torque per thrust",
-        source="thesis Eq. 8.2; SDF <momentConstant>",
+        source="thesis Eq. 7.2; SDF <momentConstant>",
         place=("aerodynamics", "moment_constant"),
         bounds=12.0,
         prior_sd=0.7,
@@ -188,7 +189,7 @@ _ROWS = (
         name="rotor_drag_coefficient",
         unit="N s²/(rad m)",
         meaning="drag in the rotor plane per rotor speed and air velocity",
-        source="thesis Eq. 7.2; SDF <rotorDragCoefficient>",
+        source="thesis Eq. 8.2; SDF <rotorDragCoefficient>",
         place=("aerodynamics", "rotor_drag_coefficient"),
         bounds=40.0,
         prior_sd=1.5,
@@ -227,24 +228,7 @@ _ROWS = (
         informed_by="climb",
     ),
     # terms beyond Gazebo's motor model
-    Coefficient(
-        name="fuselage_drag",
-        unit="N s²/m²",
-        meaning="drag of the body per squared air velocity, opposite to it",
-        source="quadratic drag of a bluff body, F = -d‖v‖v",
-        place=(EFFECTS, "fuselage_drag"),
-        scale="linear",
-        bounds=(-0.5, 0.5),
-        prior_sd=0.05,
-        step=0.02,
-        mass_exponent=1,
-        neutral=0.0,
-        exported_as={
-            "sdf": NotCarried("the motor plugins know no drag of the body", 0.0),
-            "px4": NotCarried("the SIH model's drag is linear in the velocity"),
-        },
-        informed_by="speed",
-    ),
+    *EFFECT_ROWS,
     # what the set-up adds
     Coefficient(
         name="estimate_latency",

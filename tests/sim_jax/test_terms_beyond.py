@@ -1,0 +1,152 @@
+"""The laws of the terms beyond Gazebo's motor model, which do nothing at their neutral values."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim_jax.environment import Environment
+from sim_jax.motor import Lag, LagSlope
+from sim_jax.rigid_body import Motion, angular_acceleration
+from sim_jax.schedule import Schedule
+from sim_jax.state import hover_speed
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
+from tests.sim_jax.support import quaternion, vec, vehicle
+from tuner.coefficients import REGISTRY
+
+CRAFT = vehicle()
+EFFECTS = [row for row in REGISTRY.values() if row.is_effect]
+IN_WRENCH = [row for row in EFFECTS if row.name not in ("battery_exponent", "time_constant_slope")]
+SPEEDS = tuple(jnp.asarray(speed) for speed in (590.0, 610.0, 600.0, 630.0))
+ACCELERATIONS = tuple(jnp.asarray(change) for change in (40.0, -20.0, 10.0, 90.0))
+MOVING = Motion(
+    vec(0.2, -0.1, 0.4), vec(3.0, -1.0, 0.7), quaternion(0.9, 0.1, -0.2, 0.3), vec(0.7, -0.4, 1.1)
+)
+
+
+def with_effects(**effects):
+    return replace(CRAFT, effects={name: jnp.asarray(value) for name, value in effects.items()})
+
+
+def wrench(craft, motion=MOVING, speeds=SPEEDS, environment=None):
+    around = environment or Environment()
+    air = Air.around(craft, motion, around, ACCELERATIONS)
+    sum_ = total_wrench(craft, motion, speeds, air)
+    return jnp.concatenate([sum_.force.stacked(), sum_.moment.stacked()])
+
+
+def change(**effects):
+    return np.asarray(wrench(with_effects(**effects)) - wrench(CRAFT))
+
+
+@pytest.mark.parametrize("row", IN_WRENCH, ids=lambda row: row.name)
+def test_the_neutral_value_changes_no_bit_and_another_value_does(row):
+    at_neutral = wrench(with_effects(**{row.name: row.neutral}))
+    np.testing.assert_array_equal(at_neutral, wrench(CRAFT))
+    assert np.abs(change(**{row.name: row.neutral + row.prior_sd})).max() > 1e-6
+
+
+@pytest.mark.parametrize("row", IN_WRENCH, ids=lambda row: row.name)
+def test_derivatives_agree_with_differences(row):
+    at = row.neutral + 0.3 * row.prior_sd
+    slope = jax.jacfwd(lambda value: wrench(with_effects(**{row.name: value})))(jnp.asarray(at))
+    width = 1e-4 * row.prior_sd
+    up, down = (wrench(with_effects(**{row.name: at + side * width})) for side in (1, -1))
+    np.testing.assert_allclose(slope, (up - down) / (2 * width), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_drags_take_energy(axis):
+    velocity = np.asarray(MOVING.attitude.to_body(MOVING.velocity).stacked())
+    rate = np.asarray(MOVING.body_rate.stacked())
+    assert change(**{f"linear_drag_{axis}": 0.1})[:3] @ velocity < 0
+    assert change(**{f"angular_drag_{axis}": 0.01})[3:] @ rate < 0
+
+
+def test_inflow_takes_energy_from_every_motion_of_the_rotors():
+    added = change(thrust_inflow_coefficient=1e-4)
+    velocity = np.asarray(MOVING.attitude.to_body(MOVING.velocity).stacked())
+    assert added[:3] @ velocity + added[3:] @ np.asarray(MOVING.body_rate.stacked()) < 0
+    rolling = replace(MOVING, velocity=vec(0, 0, 0), body_rate=vec(1.0, 0, 0))
+    craft = with_effects(thrust_inflow_coefficient=1e-4)
+    assert wrench(craft, rolling)[3] < wrench(CRAFT, rolling)[3]
+
+
+def test_a_level_spin_feels_wind_as_its_own_motion():
+    craft = with_effects(fuselage_drag=0.02, linear_drag_x=0.1, flapping_moment_coefficient=1e-5)
+    wind = Environment(wind=vec(-3.0, 0.5, 0.0))
+    still = replace(MOVING, velocity=MOVING.velocity - vec(-3.0, 0.5, 0.0))
+    np.testing.assert_allclose(
+        wrench(craft, MOVING, environment=wind), wrench(craft, still), rtol=1e-12
+    )
+
+
+def test_the_centre_of_mass_turns_thrust_into_moment():
+    lift = np.asarray(wrench(CRAFT))[2]
+    still = replace(MOVING, velocity=vec(0, 0, 0), body_rate=vec(0, 0, 0))
+    added = wrench(with_effects(center_of_mass_x=0.01), still) - wrench(CRAFT, still)
+    assert added[4] == pytest.approx(0.01 * float(wrench(CRAFT, still)[2]))
+    assert lift > 0
+
+
+def test_the_last_rotors_scale_follows_so_that_their_product_is_one():
+    three = with_effects(
+        rotor_thrust_scale_1=1.1, rotor_thrust_scale_2=0.9, rotor_thrust_scale_3=1.05
+    )
+    last = 1 / (1.1 * 0.9 * 1.05)
+    four = replace(three, effects=three.effects | {"rotor_thrust_scale_4": jnp.asarray(last)})
+    np.testing.assert_allclose(wrench(three), wrench(four), rtol=1e-14)
+
+
+def test_rotors_keep_the_whole_angular_momentum():
+    """A body free of aerodynamics: d(Iω + h e_z)/dt is zero in inertial axes."""
+    inertia = 3e-5
+    moment = change(rotor_inertia=inertia)[3:]
+    spins = np.array([rotor.spin for rotor in CRAFT.rotors])
+    momentum = inertia * float(spins @ np.array(SPEEDS))
+    spin_up = inertia * float(spins @ np.array(ACCELERATIONS))
+    body = np.array([CRAFT.body.inertia_xx, CRAFT.body.inertia_yy, CRAFT.body.inertia_zz])
+    rate = np.asarray(MOVING.body_rate.stacked())
+    turned = np.asarray(angular_acceleration(CRAFT.body, MOVING.body_rate, vec(*moment)).stacked())
+    whole = body * rate + np.array([0, 0, momentum])
+    np.testing.assert_allclose(
+        body * turned + np.array([0, 0, spin_up]) + np.cross(rate, whole), 0.0, atol=1e-12
+    )
+
+
+def test_ground_lifts_by_cheeseman_and_bennett():
+    level = replace(
+        MOVING, velocity=vec(0, 0, 0), body_rate=vec(0, 0, 0), attitude=quaternion(1, 0, 0, 0),
+        position=vec(0, 0, 0.2),
+    )  # fmt: skip
+    ratio = wrench(with_effects(ground_effect=1.0), level)[2] / wrench(CRAFT, level)[2]
+    height = 0.2 + float(CRAFT.rotors[0].position.z)
+    assert float(ratio) == pytest.approx(1 / (1 - (0.13 / (4 * height)) ** 2), rel=1e-9)
+
+
+def test_time_constants_grow_with_the_speed_and_stay_at_hover():
+    hover = float(hover_speed(CRAFT))
+    plain = Lag.over(CRAFT.motor, 0.0025)
+    sloped = Lag.over(CRAFT.motor, 0.0025, LagSlope(jnp.asarray(0.5), jnp.asarray(hover)))
+    for gap in (50.0, -50.0):
+        at_hover = [lag.advance(jnp.asarray(hover), hover + gap) for lag in (plain, sloped)]
+        np.testing.assert_allclose(*at_hover, rtol=1e-12)
+    faster = 1.2 * hover
+    longer = 0.0025 / (float(CRAFT.motor.time_constant_up) * (1 + 0.5 * 0.2))
+    after, _ = sloped.advance(jnp.asarray(faster), faster + 50.0)
+    assert float(after) == pytest.approx(faster + 50 - 50 * np.exp(-longer), rel=1e-12)
+
+
+def test_the_battery_scales_reference_speeds_and_declines():
+    schedule = Schedule(physics_rate=400, rate_control_rate=400, position_control_rate=100)
+    volts = jnp.log(jnp.asarray([1.0, 0.95, 0.9]))
+    step = jnp.asarray(8)
+    factor = Environment(log_voltage=volts).speed_factor(jnp.asarray(0.8), step, schedule)
+    assert float(factor) == pytest.approx(0.9**0.8)
+    falling = Environment(battery_decline=jnp.asarray(0.01)).speed_factor(None, step, schedule)
+    assert float(falling) == pytest.approx(1 - 0.01 * 8 / 400)
+    assert Environment().speed_factor(jnp.asarray(0.8), step, schedule) is None
+    assert Environment(log_voltage=volts).speed_factor(None, step, schedule) is None
