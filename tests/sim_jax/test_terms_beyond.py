@@ -132,11 +132,13 @@ def test_time_constants_grow_with_the_speed_and_stay_at_hover():
     plain = Lag.over(CRAFT.motor, 0.0025)
     sloped = Lag.over(CRAFT.motor, 0.0025, LagSlope(jnp.asarray(0.5), jnp.asarray(hover)))
     for gap in (50.0, -50.0):
-        at_hover = [lag.advance(jnp.asarray(hover), hover + gap) for lag in (plain, sloped)]
+        at_hover = [
+            lag.advance(jnp.asarray(hover), jnp.asarray(hover + gap)) for lag in (plain, sloped)
+        ]
         np.testing.assert_allclose(*at_hover, rtol=1e-12)
     faster = 1.2 * hover
     longer = 0.0025 / (float(CRAFT.motor.time_constant_up) * (1 + 0.5 * 0.2))
-    after, _ = sloped.advance(jnp.asarray(faster), faster + 50.0)
+    after, _ = sloped.advance(jnp.asarray(faster), jnp.asarray(faster + 50.0))
     assert float(after) == pytest.approx(faster + 50 - 50 * np.exp(-longer), rel=1e-12)
 
 
