@@ -32,9 +32,10 @@ def inspect(
     if json:
         print(as_json(inspections, errors))
     else:
-        from tuner.cli.tables import print_inspections
+        from tuner.cli.tables import console
+        from tuner.flights.inspection_table import render
 
-        print_inspections(inspections)
+        console().print(render(inspections))
     if errors:
         for error in errors[:-1]:
             sys.stderr.write(f"tune: {error}\n")

@@ -72,10 +72,14 @@ def print_sensitivity(result: SensitivityResult) -> None:
     table.add_column("how well it is known")
     for name, known in result.knowledge.coefficients.items():
         error = "" if known.std_error is None else f"{known.std_error:.2g}"
-        label = name if known.fitted else f"{name} (fixed)"
         judgement = judgement_in_words(known.verdict, known.reason)
         table.add_row(
-            label, f"{known.value:.5g}", error, known.unit, _largest_change(result, name), judgement
+            known.label(name),
+            f"{known.value:.5g}",
+            error,
+            known.unit,
+            _largest_change(result, name),
+            judgement,
         )
     screen.print(table)
     for finding in result.findings:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from tuner.comparison.table import Table as Comparison
     from tuner.config import Settings
     from tuner.exporters.export import Exported
-    from tuner.flights.inspection import Inspection
     from tuner.simulation.write import Summary
 
 
@@ -46,13 +45,6 @@ def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     screen = console()
     screen.print(table)
     screen.print(f"written to {path}", markup=False)
-
-
-def print_inspections(inspections: Sequence[Inspection]) -> None:
-    """Print what recordings hold."""
-    from tuner.flights.inspection_table import render
-
-    console().print(render(inspections))
 
 
 def print_export(done: Exported) -> None:

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, nn
+from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
@@ -157,6 +158,10 @@ class Space:
             for index, parameter in enumerate(self.parameters)
             for name, ratio in parameter.ratios.items()
         }
+
+    def numbers(self, vector: ArrayLike) -> dict[str, float]:
+        """Return what `values` does, as plain numbers."""
+        return {name: float(value) for name, value in self.values(jnp.asarray(vector)).items()}
 
     def share(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""

@@ -44,6 +44,10 @@ class CoefficientKnowledge(Part):
     prior_share: float
     bias: dict[str, float]
 
+    def label(self, name: str) -> str:
+        """Return its name as tables and figures have it: a fixed coefficient is called so."""
+        return name if self.fitted else f"{name} (fixed)"
+
 
 class OutputSensitivity(Part):
     """Effects of the coefficients on one recorded signal: an axis of a channel of a flight.

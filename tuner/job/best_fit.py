@@ -31,8 +31,8 @@ def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
     """Return each free coefficient's reported value: fitted, or initial for one that is held."""
     initial = initial_of(job)
     held = {*impossible_inertia(job, fitted), *_held(job, fitted)}
-    values = job.space.values(fitted.point.coefficients)
-    return {name: initial[name] if name in held else float(v) for name, v in values.items()}
+    values = job.space.numbers(fitted.point.coefficients)
+    return {name: initial[name] if name in held else v for name, v in values.items()}
 
 
 def initial_of(job: Job) -> dict[str, float]:
@@ -49,9 +49,9 @@ def _held(job: Job, fitted: Fitted) -> frozenset[str]:
 
 def impossible_inertia(job: Job, fitted: Fitted) -> tuple[str, ...]:
     """Return the fitted moments of inertia, if together they are no rigid body's."""
-    fit, initial = job.space.values(fitted.point.coefficients), initial_of(job)
+    fit, initial = job.space.numbers(fitted.point.coefficients), initial_of(job)
     inertia = [name for name, row in COEFFICIENTS.items() if row.place[0] == "inertia"]
-    moments = {name: float(fit.get(name, initial[name])) for name in inertia}
+    moments = {name: fit.get(name, initial[name]) for name in inertia}
     if 2 * max(moments.values()) <= sum(moments.values()):
         return ()
     return tuple(name for name in inertia if name in fit)

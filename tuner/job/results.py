@@ -23,7 +23,7 @@ from tuner.job.best_fit import (
 )
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
-from tuner.objective.initial_conditions import STATES
+from tuner.objective.initial_conditions import ROWS
 from tuner.objective.segments import OFFSETS
 from tuner.result import (
     BEST_FIT_FILE,
@@ -111,17 +111,14 @@ def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
 def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
     """Return by how much the initial states of windows were moved; empty for whole flights.
 
-    Name of `STATES` -> root mean square in its unit there: what was ascribed to initial states and
+    State -> root mean square in its unit: what was ascribed to initial states and
     not to coefficients.
     """
     freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
     if freedom is None or states is None:
         return {}
-    moved, by_state, first = np.asarray(states) * np.asarray(freedom), dict[str, JsonValue](), 0
-    for name, (count, _) in STATES.items():
-        by_state[name] = float(np.sqrt(np.mean(moved[first : first + count] ** 2)))
-        first += count
-    return by_state
+    moved = np.asarray(states) * np.asarray(freedom)
+    return {name: float(np.sqrt(np.mean(moved[rows] ** 2))) for name, rows in ROWS.items()}
 
 
 def _coefficients(
@@ -172,9 +169,9 @@ def _judgements(
                 judgements[name] = judge_after_holding(
                     name, *judgements[name], fitted.held[parameter.name]
                 )
-    values = job.space.values(fitted.point.coefficients)
+    values = job.space.numbers(fitted.point.coefficients)
     for name in impossible_inertia(job, fitted):
-        judgements[name] = judge_impossible_inertia(float(values[name]))
+        judgements[name] = judge_impossible_inertia(values[name])
     return judgements
 
 

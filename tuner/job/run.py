@@ -108,8 +108,9 @@ def run(
     initial, best = validate(job, fitted, vehicle)
     result = result_of(job, fitted, uncertainty, (initial, best), command=command)
     write_folder(folder, result, vehicle, job)
-    write_traces(folder, initial, best)
-    table_of({"initial": initial, "best": best}).write(folder)
+    simulations = {"initial": initial, "best": best}
+    write_traces(folder, simulations)
+    table_of(simulations).write(folder)
     write_search(folder, fitted)
     if cross_validated:
         listener.on_folds(cross_validate(job, fitted, folder, _reporting(listener)))

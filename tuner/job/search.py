@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -251,5 +250,4 @@ def _loss_at(objective: Objective, point: Point, criterion: Criterion) -> float:
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:
     """Return the best coefficients so far."""
-    values = job.space.values(jnp.asarray(progress.best_point.coefficients))
-    return {name: float(value) for name, value in values.items()}
+    return job.space.numbers(progress.best_point.coefficients)

@@ -21,7 +21,7 @@ from tuner.job.unfitted import unfitted
 from tuner.recordings import read_recordings
 from tuner.report import render
 from tuner.report.record import About, Recording
-from tuner.report.traces import write_simulated
+from tuner.report.traces import write_traces
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.global_indices import global_sensitivity
 from tuner.sensitivity_analysis.global_sensitivity_json import Method
@@ -115,7 +115,7 @@ def examine_vehicle(
     on_message("simulating what could be flown next")
     proposals = write_next_flight(out, job, examination, fitted, arena)
     _write_requested(request, job, fitted, examination, folder=out, on_message=on_message)
-    write_simulated(out, comparison_of(job, fitted).fly(settings.vehicle))
+    write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
     _about(settings, job, fitted, command).write(out)
     render(out)
     return SensitivityResult(out, knowledge, proposals, fitted.findings)

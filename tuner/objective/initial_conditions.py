@@ -36,7 +36,12 @@ The trim is no state: rotors differ and the mass is never quite in the middle, s
 recorded of the motors holds a steady torque about each axis that the model has no use for. In
 closed loop the integrator takes it; where commands are fed in, it is a part of each rotor's.
 """
-COUNT = sum(count for count, _ in STATES.values())
+_ENDS = np.cumsum([count for count, _ in STATES.values()]).tolist()
+ROWS: Mapping[str, slice] = {
+    name: slice(end - count, end)
+    for end, (name, (count, _)) in zip(_ENDS, STATES.items(), strict=True)
+}
+"""State -> its rows in the vector of a start."""
 
 
 def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
@@ -48,10 +53,7 @@ def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
 
 def moved(start: Start, change: Float[Array, "L F"]) -> Start:
     """Return a start that differs from a recorded one by so much, in the units of `STATES`."""
-    parts, first = {}, 0
-    for name, (count, _) in STATES.items():
-        parts[name] = change[first : first + count]
-        first += count
+    parts = {name: change[rows] for name, rows in ROWS.items()}
     motion = start.motion
     turn = parts["attitude"]
     attitude = motion.attitude.product(
@@ -80,14 +82,12 @@ def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inle
         parts = (trimmed(part, vehicle, change) for part in inlet.parts)
         changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
         return changed
-    first = COUNT - STATES["trim"][0]
+    roll, pitch, yaw = change[ROWS["trim"]]
     arms = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
     width = sum(abs(y) for _, y in arms) / len(arms)
     length = sum(abs(x) for x, _ in arms) / len(arms)
     trim = [
-        change[first] * (y / width)
-        - change[first + 1] * (x / length)
-        - change[first + 2] * rotor.spin
+        roll * (y / width) - pitch * (x / length) - yaw * rotor.spin
         for (x, y), rotor in zip(arms, vehicle.rotors, strict=True)
     ]
     return recorded_inlet_of(inlet).trimmed(inlet, trim)

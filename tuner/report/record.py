@@ -57,22 +57,16 @@ class About(ResultFile):
 
 def write_search(folder: Path, fitted: Fitted) -> None:
     """Write ``search.json`` of a finished search."""
+    numbers = fitted.objective.space.numbers
     SearchRecord(
         iterations=list(fitted.iterations),
         starts=[
             Start(
                 origin=outcome.origin,
                 loss=outcome.loss,
-                start=_values(fitted, outcome.start),
-                end=_values(fitted, outcome.vector),
+                start=numbers(outcome.start),
+                end=numbers(outcome.vector),
             )
             for outcome in fitted.outcomes
         ],
     ).write(folder)
-
-
-def _values(fitted: Fitted, vector: object) -> dict[str, float]:
-    import jax.numpy as jnp  # noqa: PLC0415 (a page is rendered without it)
-
-    values = fitted.objective.space.values(jnp.asarray(vector))
-    return {name: float(value) for name, value in values.items()}

@@ -19,39 +19,19 @@ POINTS = 1200
 """Points of a curve: as many as a wide screen has pixels."""
 
 
-def write_traces(
-    folder: Path, initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
-) -> None:
-    """Write ``traces.npz``: per flight times in s, positions in m, roll, pitch, yaw in degrees."""
-    save_traces(
-        folder,
-        {name: _traces({"initial": initial[name], "best": best[name]}) for name in initial},
-    )
+def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErrors]]) -> None:
+    """Write ``traces.npz`` of simulation -> flight -> errors, thinned to what a screen can show.
 
-
-def write_simulated(folder: Path, flown: Mapping[str, FlightErrors]) -> None:
-    """Write ``traces.npz`` of flights simulated with one vehicle."""
-    save_traces(folder, {name: _traces({"simulated": errors}) for name, errors in flown.items()})
-
-
-def _traces(simulations: Mapping[str, FlightErrors]) -> dict[str, Array]:
-    """Return what was recorded of one flight, and what each simulation of it had."""
-    traces: dict[str, Array] = {}
-    for suffix, errors in simulations.items():
-        for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
-            traces[f"{signal}_time"] = of_signal.time
-            traces[signal] = of_signal.recorded
-            traces[f"{signal}_{suffix}"] = of_signal.simulated
-    return traces
-
-
-def save_traces(folder: Path, flights: Mapping[str, Mapping[str, Array]]) -> None:
-    """Write ``traces.npz`` of flight -> name -> array, thinned to what a screen can show."""
-    arrays = {
-        f"{flight}/{name}": _thinned(values)
-        for flight, parts in flights.items()
-        for name, values in parts.items()
-    }
+    Per flight: times in s, positions in m, roll, pitch and yaw in degrees; first what was
+    recorded, then, with its name behind, what each simulation had.
+    """
+    arrays: dict[str, Array] = {}
+    for suffix, flights in simulations.items():
+        for flight, errors in flights.items():
+            for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
+                arrays[f"{flight}/{signal}_time"] = _thinned(of_signal.time)
+                arrays[f"{flight}/{signal}"] = _thinned(of_signal.recorded)
+                arrays[f"{flight}/{signal}_{suffix}"] = _thinned(of_signal.simulated)
     with whole_file(folder / TRACES_FILE) as unfinished, unfinished.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 

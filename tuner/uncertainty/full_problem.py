@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -56,33 +56,18 @@ class FullProblem:
 def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     """Return a fit's problem with its fixed coefficients free, too, around their values."""
     space = objective.space
-    values = {
-        name: float(value) for name, value in space.values(jnp.asarray(point.coefficients)).items()
-    }
+    values = space.numbers(point.coefficients)
     fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
     parameters = [*space.parameters, *(_parameter(name, value) for name, value in fixed.items())]
     full_space = Space(parameters, {})
     vector = full_space.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
     return FullProblem(
-        objective=with_space(objective, full_space),
+        objective=replace(objective, space=full_space),
         point=Point(jnp.asarray(vector), point.offsets),
         fitted=space.names,
         fixed=tuple(fixed),
         fit_space=space,
-    )
-
-
-def with_space(objective: Objective, space: Space) -> Objective:
-    """Return the same problem in other coordinates."""
-    return Objective(
-        model=objective.model,
-        segments=objective.segments,
-        space=space,
-        schedule=objective.schedule,
-        samples=objective.samples,
-        limits=objective.limits,
-        memory=objective.memory,
     )
 
 

@@ -7,6 +7,8 @@ analysis of partially observed dynamical models by exploiting the profile likeli
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.full_problem import FullProblem, with_space
+from tuner.uncertainty.full_problem import FullProblem
 from tuner.uncertainty.profiles_json import THRESHOLD, Profile
 
 Array = NDArray[np.float64]
@@ -52,7 +54,7 @@ def profile_likelihood(
         The coefficient.
     """
     space, indices = full_problem.subspace(uncertainty.names)
-    objective = with_space(full_problem.objective, space)
+    objective = replace(full_problem.objective, space=space)
     index = space.names.index(name)
     vector = np.asarray(full_problem.point.coefficients)[indices]
     centre = np.asarray(space.scaled(jnp.asarray(vector)))
@@ -99,14 +101,7 @@ def _refitted(
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
     free[index] = 0.0
-    weak_priors = Criterion(
-        horizon=criterion.horizon,
-        scale=criterion.scale,
-        reference_offset=criterion.reference_offset,
-        huber=criterion.huber,
-        prior=jnp.asarray(1.0 / WIDE),
-        states=criterion.states,
-    )
+    weak_priors = replace(criterion, prior=jnp.asarray(1.0 / WIDE))
     points = Point(jnp.asarray(starts), jnp.asarray(np.repeat(offsets[None], len(starts), axis=0)))
     step, previous = begin(on_host(points)), np.full(len(starts), np.inf)
     for _ in range(MAX_ITERATIONS):

@@ -47,8 +47,9 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
     initial = {name: _errors(name, 0.2) for name in FLIGHTS}
     best = {name: _errors(name, 0.002) for name in FLIGHTS}
-    table_of({"initial": initial, "best": best}).write(folder)
-    write_traces(folder, initial, best)
+    simulations = {"initial": initial, "best": best}
+    table_of(simulations).write(folder)
+    write_traces(folder, simulations)
     values = values_of(vehicle)
     SearchRecord(
         iterations=[

@@ -45,17 +45,10 @@ class Inertial:
 
 def pose_of(numbers: Sequence[float]) -> Pose:
     """Return SDF's ``x y z roll pitch yaw`` (m, rad; fixed axes) as a pose."""
-    x, y, z, roll, pitch, yaw = numbers
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    cy, sy = np.cos(yaw), np.sin(yaw)
-    rotation = np.array(
-        [
-            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-            [-sp, cp * sr, cp * cr],
-        ]
-    )
-    return Pose(np.array([x, y, z], dtype=np.float64), rotation)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
+
+    rotation = Rotation.from_euler("xyz", numbers[3:]).as_matrix()
+    return Pose(np.array(numbers[:3], dtype=np.float64), rotation)
 
 
 IDENTITY = Pose(np.zeros(3), np.eye(3))

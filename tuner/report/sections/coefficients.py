@@ -107,7 +107,7 @@ def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
                 f"{name}: ±{wide[name]:.2g} %, {verdict_in_words(known[name].verdict)}"
                 for name in order
             ]
-            labels = [name if known[name].fitted else f"{name} (fixed)" for name in order]
+            labels = [known[name].label(name) for name in order]
             bars.append(Bars(f"{sign} {verdict_in_words(verdict)}", labels, widths, colour, texts))
     return [
         Chart(

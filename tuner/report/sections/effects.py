@@ -134,7 +134,7 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
 
 
 def _labels(knowledge: Knowledge, names: Sequence[str]) -> list[str]:
-    return [n if knowledge.coefficients[n].fitted else f"{n} (fixed)" for n in names]
+    return [knowledge.coefficients[name].label(name) for name in names]
 
 
 def _name(channel: str, axis: str) -> str:

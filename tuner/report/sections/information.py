@@ -81,10 +81,7 @@ def _by_flight(knowledge: Knowledge) -> Chart:
 def _stacked(
     knowledge: Knowledge, parts: dict[str, list[float]], key: str, title: str, caption: str
 ) -> Chart:
-    labels = [
-        name if known.fitted else f"{name} (fixed)"
-        for name, known in knowledge.coefficients.items()
-    ]
+    labels = [known.label(name) for name, known in knowledge.coefficients.items()]
     priors = [known.prior_share for known in knowledge.coefficients.values()]
     bars = [
         Bars(
