@@ -61,6 +61,11 @@ COMMANDS = {
         "Estimate coefficients from ground measurements: pendulum, stands, steps, hovers, spins.",
         "tune bench bench.yaml --out runs/bench",
     ),
+    "new-vehicle": (
+        "Write a starting vehicle file from what can be read off a vehicle.",
+        "tune new-vehicle --mass 2.2 --wheelbase 0.5 --propeller 11x4.7 --out quad.yaml",
+        "tune new-vehicle --like crazyflie --mass 0.034 --out cf.yaml",
+    ),
     "simulate": (
         "Simulate a trajectory and write the flight as CSV or ROS 1 bag.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",
@@ -69,7 +74,7 @@ COMMANDS = {
 }
 for _name, (_summary, *_examples) in COMMANDS.items():
     app.command(
-        f"tuner.cli.{_name}:{_name}",
+        "tuner.cli.{0}:{0}".format(_name.replace("-", "_")),
         name=_name,
         help=_summary,
         help_epilogue="\n".join(f"Example: {example}" for example in _examples),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from tuner.comparison.table import Table as Comparison
     from tuner.config import Settings
     from tuner.exporters.export import Exported
+    from tuner.scaling_laws import Estimate
     from tuner.simulation.write import Summary
 
 
@@ -57,6 +58,26 @@ def print_export(done: Exported) -> None:
     for note in done.notes:
         screen.print(f"note: {note}", markup=False)
     screen.print(f"written to {done.path} and read back", markup=False)
+
+
+def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
+    """Print a vehicle's coefficients by scaling laws, how crude each is, and where they lie."""
+    from tuner.coefficients import COEFFICIENTS
+
+    table = Table(box=None)
+    for name in ("coefficient", "value", "±", "unit", "source"):
+        table.add_column(name, justify="right" if name in ("value", "±") else "left")
+    for name, estimate in estimates.items():
+        table.add_row(
+            name,
+            f"{estimate.value:.4g}",
+            f"{estimate.error:.0%}",
+            COEFFICIENTS[name].unit,
+            estimate.source,
+        )
+    screen = console()
+    screen.print(table)
+    screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
 
 
 def print_settings(settings: Settings, screen: Console | None = None) -> None:
