@@ -14,6 +14,7 @@ from tuner.disk import exists
 from tuner.errors import InputError
 from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.findings import Finding
+from tuner.selection.table import SelectionRow
 from tuner.uncertainty.verdict import Reason, Verdict
 
 BEST_FIT_FILE = "best_fit.yaml"
@@ -124,7 +125,10 @@ class SearchResult(Part):
 
 
 class RunResult(ResultFile):
-    """The content of ``result.json``."""
+    """The content of ``result.json``.
+
+    ``selection`` holds the terms that the fit could have added, empty where it was not asked.
+    """
 
     FILE = "result.json"
     INDENT = 2
@@ -138,6 +142,7 @@ class RunResult(ResultFile):
     flights: tuple[FlightResult, ...]
     findings: tuple[Finding, ...]
     search: SearchResult
+    selection: tuple[SelectionRow, ...] = ()
 
 
 class Run(BaseModel):

@@ -12,6 +12,8 @@ from tuner.cli.tables import console
 from tuner.result import RMSE_UNITS
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
@@ -24,6 +26,8 @@ def print_run(folder: Path, result: RunResult) -> None:
 
     screen = console()
     screen.print(_coefficients(result))
+    if result.selection:
+        _print_selection(screen, result)
     screen.print(_errors(result))
     search = result.search
     screen.print(
@@ -124,6 +128,23 @@ def _coefficients(result: RunResult) -> Table:
             judgement_in_words(coefficient.verdict, coefficient.reason),
         )
     return table
+
+
+def _print_selection(screen: Console, result: RunResult) -> None:
+    """Print what each group of terms beyond the base model is worth."""
+    from tuner.wording.selection import gain_in_words, reason_in_words, selection_in_words
+
+    table = Table(box=None, title="Terms beyond the motor model", title_justify="left")
+    table.add_column("term")
+    table.add_column("gain in the fit", justify="right")
+    table.add_column("gain held out", justify="right")
+    table.add_column("in the model")
+    table.add_column("why")
+    for row in result.selection:
+        gains = gain_in_words(row.gain_fit), gain_in_words(row.gain_holdout)
+        table.add_row(row.group, *gains, "yes" if row.kept else "no", reason_in_words(row))
+    screen.print(table)
+    screen.print(selection_in_words(result.selection), markup=False)
 
 
 def _errors(result: RunResult) -> Table:

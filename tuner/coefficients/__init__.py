@@ -1,7 +1,7 @@
 """The coefficients of the model: the table that defines them and the space that a fit searches."""
 
 from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Written
-from tuner.coefficients.registry import COEFFICIENTS, REGISTRY, of_scope, scale_group
+from tuner.coefficients.registry import COEFFICIENTS, REGISTRY, of_scope, scale_group, term_groups
 
 __all__ = [
     "COEFFICIENTS",
@@ -12,4 +12,5 @@ __all__ = [
     "Written",
     "of_scope",
     "scale_group",
+    "term_groups",
 ]

@@ -439,3 +439,12 @@ def of_scope(scope: Scope) -> dict[str, Coefficient]:
 def scale_group() -> tuple[str, ...]:
     """Return the coefficients that go with the mass: by one common factor, every motion stays."""
     return tuple(name for name, row in COEFFICIENTS.items() if row.mass_exponent == 1)
+
+
+def term_groups() -> dict[str, tuple[str, ...]]:
+    """Return every group of terms that a fit may add, with its coefficients."""
+    groups: dict[str, tuple[str, ...]] = {}
+    for name, row in COEFFICIENTS.items():
+        if row.group:
+            groups[row.group] = (*groups.get(row.group, ()), name)
+    return groups

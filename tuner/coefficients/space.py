@@ -221,7 +221,7 @@ def space_of(vehicle: VehicleFile, controller: ControllerFile, job: JobFile) -> 
         for name in group[1:]:
             groups.pop(name)
         groups[group[0]] = tuple(group)
-    parameters = [_parameter(names, values, job) for names in groups.values()]
+    parameters = [parameter_of(names, values, job) for names in groups.values()]
     return Space(parameters, {n: v for n, v in values.items() if n not in free})
 
 
@@ -234,7 +234,28 @@ def _free_names(job: JobFile) -> tuple[str, ...]:
     return free
 
 
-def _parameter(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:
+def extended(
+    space: Space, names: Sequence[str], job: JobFile, values: Mapping[str, float]
+) -> Space:
+    """Return a space with more coefficients free, after those that it has.
+
+    Parameters
+    ----------
+    space
+        Where they are fixed, or act in no term.
+    names
+        Of the coefficients.
+    job
+        Their bounds and priors.
+    values
+        Coefficient -> where it starts; of all in ``names``.
+    """
+    parameters = (*space.parameters, *(parameter_of((name,), values, job) for name in names))
+    return Space(parameters, {n: v for n, v in space.fixed.items() if n not in names})
+
+
+def parameter_of(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:
+    """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
     name = names[0]
     row, given, start = COEFFICIENTS[name], job.coefficients.get(name), values[name]
     scale = given.scale if given is not None and given.scale is not None else row.scale

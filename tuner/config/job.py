@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
-from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients import COEFFICIENTS, term_groups
 from tuner.errors import ConfigError, did_you_mean
 from tuner.exporters.targets import NAMES
 from tuner.trajectory_settings import TrajectorySettings
@@ -36,9 +36,17 @@ def _known(word: str, known: tuple[str, ...], kind: str) -> str:
     return word
 
 
+def _terms() -> tuple[str, ...]:
+    """Return the names of groups of terms, and of the coefficients in them."""
+    groups = term_groups()
+    names = (name for group, names in groups.items() for name in names if name != group)
+    return (*groups, *names)
+
+
 CoefficientName = Annotated[
     str, AfterValidator(lambda name: _known(name, tuple(COEFFICIENTS), "coefficient"))
 ]
+TermName = Annotated[str, AfterValidator(lambda name: _known(name, _terms(), "term"))]
 FormatName = Annotated[
     str, AfterValidator(lambda name: _known(name, tuple(NAMES), "export format"))
 ]
@@ -174,6 +182,9 @@ class JobFile(Section):
         Exactly the coefficients to fit; None for the tuner's own choice.
     fixed
         Coefficients to leave alone, out of the tuner's own choice.
+    terms
+        What the fit may hold beyond Gazebo's motor model: ``auto`` adds those without which flights
+        left out are predicted worse, ``none`` adds none; else the groups, or coefficients, to add.
     coefficients
         Bounds, scale and prior of single coefficients.
     ties
@@ -198,6 +209,7 @@ class JobFile(Section):
     holdout: tuple[str, ...] = ()
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()
+    terms: Literal["auto", "none"] | tuple[TermName, ...] = "auto"
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()
     channels: dict[ChannelName, Flag] = Field(default_factory=dict)
@@ -213,6 +225,7 @@ class JobFile(Section):
         if self.free is not None and self.fixed:
             raise refuse("both 'free' and 'fixed' are given", "keep one of them")
         _once("free", self.free or ())
+        _once("terms", () if isinstance(self.terms, str) else self.terms)
         _once("ties", tuple(name for group in self.ties for name in group))
         if self.channels and not any(self.channels.get(name, True) for name in CHANNELS):
             raise refuse("every channel is switched off", "leave one on")

@@ -37,6 +37,7 @@ from tuner.result import (
     Status,
 )
 from tuner.search.fitted import Fitted
+from tuner.selection.table import SelectionRow
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.verdict import (
     NOT_FITTED,
@@ -58,6 +59,7 @@ def result_of(
     errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
     *,
     command: str = "",
+    selection: tuple[SelectionRow, ...] = (),
 ) -> RunResult:
     """Assemble ``result.json``."""
     initial, best = errors
@@ -96,6 +98,7 @@ def result_of(
             converged=fitted.converged,
             message=Ending.NO_FURTHER_GAIN if fitted.converged else Ending.ITERATION_LIMIT,
         ),
+        selection=selection,
     )
 
 

@@ -29,6 +29,7 @@ from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
+from tuner.job.selection import with_terms_selected
 from tuner.recordings import read_recordings
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
@@ -91,6 +92,7 @@ def run(
     on_progress = _keeping_best(folder, listener)
     try:
         fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
+        selected = with_terms_selected(job, fitted, on_progress, listener.on_message)
     except (KeyboardInterrupt, OutputError):
         listener.on_message(
             f"The best coefficients so far are in {folder}. "
@@ -98,6 +100,7 @@ def run(
         )
         raise
     drawing = BackgroundDrawing()
+    job, fitted = selected.job, selected.fitted
     listener.on_message("Examining how well each coefficient is known.")
     fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
     uncertainty = examination.uncertainty
@@ -106,7 +109,9 @@ def run(
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
     initial, best = validate(job, fitted, vehicle)
-    result = result_of(job, fitted, uncertainty, (initial, best), command=command)
+    result = result_of(
+        job, fitted, uncertainty, (initial, best), command=command, selection=selected.rows
+    )
     write_folder(folder, result, vehicle, job)
     simulations = {"initial": initial, "best": best}
     write_traces(folder, simulations)

@@ -29,6 +29,7 @@ from tuner.result import (
     Status,
 )
 from tuner.search.iteration import Iteration
+from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
@@ -225,6 +226,26 @@ def _result(
         coefficients=coefficients,
         flights=flights,
         findings=(),
+        selection=(
+            SelectionRow(
+                group="fuselage_drag",
+                names=("fuselage_drag",),
+                gain_fit=0.3,
+                gain_holdout=0.28,
+                scatter=0.04,
+                kept=True,
+                reason=SelectionCode.PREDICTS_FLIGHTS,
+            ),
+            SelectionRow(
+                group="ground_effect",
+                names=("ground_effect",),
+                gain_fit=1e-5,
+                gain_holdout=-0.001,
+                scatter=0.002,
+                kept=False,
+                reason=SelectionCode.IMMATERIAL,
+            ),
+        ),
         search=SearchResult(
             method="gradient",
             evaluations=9,

@@ -23,10 +23,12 @@ from tuner.report.sections.profiles import profiles
 from tuner.report.sections.provenance import provenance
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
+from tuner.report.sections.selection import selection
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
     coefficients,
+    selection,
     bench,
     errors,
     flights,

@@ -1,0 +1,57 @@
+"""Small fits with a term in the truth that the base model lacks, or without one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+
+from tests.tuner.uncertainty.making import (
+    FLIGHTS,
+    NOISE,
+    controller_file,
+    fitted_of,
+    problem,
+    vehicle_file,
+    with_data,
+)
+from tuner.coefficients.space import space_of
+from tuner.config import JobFile
+from tuner.job.polish import polished
+from tuner.job.prepare import Job
+from tuner.job.search import free_offsets
+from tuner.search.fitted import Fitted
+from tuner.search.optimiser import Free
+from tuner.uncertainty.full_problem import with_space
+
+BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
+
+
+def job_with(drag: float, *, seed: int, job: JobFile | None = None) -> tuple[Job, Fitted]:
+    """Return a job whose flights were flown with some drag of the body, and its base fit."""
+    truth = problem((*BASE, "fuselage_drag"))
+    vector = truth.space.vector_of(
+        dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
+        | {"fuselage_drag": drag}
+    )
+    truth = with_data(truth, truth.start(vector), noise=np.random.default_rng(seed))
+    file = JobFile(free=BASE)
+    space = space_of(vehicle_file(), controller_file(), file)
+    objective = with_space(truth, space)
+    recordings = tuple(
+        SimpleNamespace(
+            flight=SimpleNamespace(name=name), holdout=False, inlet="reference", time_offset=0.0
+        )
+        for name in FLIGHTS
+    )
+    settings = SimpleNamespace(job=job or JobFile(), vehicle=vehicle_file())
+    made = Job(settings, recordings, NOISE, space, objective)
+    fitted = fitted_of(objective, objective.start(space.initial))
+    return made, _fit(made, fitted)
+
+
+def _fit(job: Job, fitted: Fitted) -> Fitted:
+    free = Free(np.ones(len(job.space), bool), free_offsets(job))
+    end = polished(job, fitted, free=free, title="base", on_progress=lambda _: None)
+    return replace(end, outcomes=())

@@ -1,0 +1,94 @@
+"""What a group is worth, on losses that are quadratic by construction."""
+
+import numpy as np
+import pytest
+
+from tuner.selection.linear import Linear
+from tuner.selection.score import best_first, score
+from tuner.selection.table import SelectionCode
+
+MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
+FLIGHTS, STRETCHES, SAMPLES = 4, 12, 200
+
+
+def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS):
+    """Return the loss of straight regressions: each stretch has its own regressors.
+
+    The truth moves the second column by the effect of each flight. Correlated residuals are
+    constant over a stretch. Flights from ``shown_by`` on do not excite the second column.
+    """
+    random = np.random.default_rng(seed)
+    hessian, score_, loss = [], [], 0.0
+    flight = np.repeat(np.arange(FLIGHTS), STRETCHES)
+    for number in flight:
+        columns = random.normal(size=(SAMPLES, 3)) + 1.0
+        columns[:, 1] *= number < shown_by
+        columns = np.column_stack([columns, columns[:, 0] * (1 + 1e-12)])
+        noise = random.normal() if correlated else random.normal(size=SAMPLES)
+        residual = noise - columns[:, 1] * effects[number % len(effects)]
+        hessian.append(columns.T @ columns)
+        score_.append(columns.T @ residual)
+        loss += 0.5 * float(residual @ residual)
+    return Linear(
+        scaled=np.zeros(4),
+        hessian=np.array(hessian),
+        score=np.array(score_),
+        prior=np.eye(4) * 1e-6,
+        pull=np.zeros(4),
+        flight=flight,
+        section=np.tile(np.arange(STRETCHES) * 3 // STRETCHES, FLIGHTS),
+        loss=loss,
+    )
+
+
+def test_a_term_of_the_truth_earns_its_place_and_the_other_does_not():
+    found = best_first(linear_fit(0.5), MODEL, {"first": FIRST, "second": SECOND}, candidates=2)
+    assert list(found) == ["first"]
+    assert found["first"].reason is SelectionCode.PREDICTS_FLIGHTS
+    assert found["first"].gain_fit == pytest.approx(found["first"].gain_holdout, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("correlated", [False, True])
+def test_noise_buys_no_term_even_where_it_is_correlated_in_time(seed, correlated):
+    linear = linear_fit(0.0, seed=seed, correlated=correlated)
+    assert not best_first(linear, MODEL, {"first": FIRST, "second": SECOND}, candidates=2)
+
+
+def test_what_the_flights_disagree_about_lowers_the_loss_and_is_not_added():
+    found = score(linear_fit(1.0, 0.0, 0.0, 0.0), MODEL, FIRST, candidates=1)
+    assert found.gain_fit > 0.01
+    assert found.reason is SelectionCode.NOT_PREDICTED
+
+
+def test_a_term_that_one_flight_alone_shows_is_predicted_by_sections():
+    linear = linear_fit(0.5, shown_by=1)
+    found = score(linear, MODEL, FIRST, candidates=1)
+    assert found.reason is SelectionCode.PREDICTS_SECTIONS
+
+
+def test_a_term_that_a_coefficient_of_the_model_copies_is_not_distinguished():
+    found = score(linear_fit(0.5), MODEL, COPY, candidates=1)
+    assert found.reason is SelectionCode.NO_INFORMATION
+
+
+def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
+    before = linear_fit(0.5)
+    added = score(before, MODEL, FIRST, candidates=1)
+    everything = np.ones(len(before.flight), bool)
+    both = np.concatenate([MODEL, FIRST])
+    change = before.step(both, inside=everything)
+    after = Linear(
+        scaled=change,
+        hessian=before.hessian,
+        score=before.score + before.hessian @ change,
+        prior=before.prior,
+        pull=before.pull + before.prior @ change,
+        flight=before.flight,
+        section=before.section,
+        loss=before.loss + before.change_of_loss(change).sum(),
+    )
+    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    assert inside.gain_fit == pytest.approx(added.gain_fit, rel=1e-6)
+    assert inside.gain_holdout == pytest.approx(added.gain_holdout, rel=1e-6)
+    assert inside.earns_place

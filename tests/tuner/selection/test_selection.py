@@ -1,0 +1,67 @@
+"""The whole selection on short simulated flights whose truth holds a term, or does not."""
+
+import pytest
+
+from tests.tuner.selection.making import BASE, job_with
+from tuner.config import JobFile
+from tuner.job import selection
+from tuner.job.selection import with_terms_selected
+from tuner.selection.table import SelectionCode
+from tuner.uncertainty.estimates import uncertainty_of
+
+DRAG = 0.03
+
+
+def selected(drag, *, seed=0, job=None):
+    messages = []
+    result = with_terms_selected(
+        *job_with(drag, seed=seed, job=job), lambda *_: None, messages.append
+    )
+    return result, messages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_term_that_was_flown_is_found_and_its_interval_holds_the_truth(seed):
+    result, messages = selected(DRAG, seed=seed)
+    (row,) = result.rows
+    assert (row.group, row.kept) == ("fuselage_drag", True)
+    assert row.gain_fit > 0.3
+    assert result.job.space.names == (*BASE_IN_ORDER, "fuselage_drag")
+    low, high = uncertainty_of(result.fitted).estimates["fuselage_drag"].ci95
+    assert low < DRAG < high
+    assert messages == ["Fitting again with fuselage_drag."]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_no_term_is_added_to_flights_that_lack_none(seed):
+    result, messages = selected(0.0, seed=seed)
+    assert [row.kept for row in result.rows] == [False]
+    assert result.job.space.names == BASE_IN_ORDER
+    assert not messages
+
+
+@pytest.mark.slow
+def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(monkeypatch):
+    monkeypatch.setattr(selection, "_predicts_better", lambda *_, **__: False)
+    result, _ = selected(DRAG)
+    (row,) = result.rows
+    assert not row.kept
+    assert row.reason is SelectionCode.WORSE_AFTER_REFIT
+    assert result.job.space.names == BASE_IN_ORDER
+
+
+@pytest.mark.slow
+def test_a_job_that_names_terms_gets_these_and_one_that_wants_none_gets_none():
+    named, _ = selected(0.0, job=JobFile(terms=("fuselage_drag",)))
+    (row,) = named.rows
+    assert row.reason is SelectionCode.ASKED_FOR
+    assert "fuselage_drag" in named.job.space.names
+    for job in (JobFile(terms="none"), JobFile(free=BASE), JobFile(fixed=("fuselage_drag",))):
+        without, _ = selected(DRAG, job=job)
+        assert not without.rows
+        assert without.job.space.names == BASE_IN_ORDER
+
+
+BASE_IN_ORDER = ("inertia_xx", "motor_constant", "rotor_drag_coefficient")

@@ -1,0 +1,237 @@
+"""What one group of coefficients is worth: in the fit, against chance, and in what is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from tuner.selection.linear import RIDGE, Columns, Linear
+from tuner.selection.table import SelectionCode
+
+SIGNIFICANCE = 0.01
+"""Probability with which chance alone would add any term at all, over all candidates together."""
+MATERIAL = 0.01
+"""Share of the loss below which a gain is no evidence: two simulators of a vehicle differ, too."""
+SURE = 2.0
+"""Standard deviations by which what was left out must be predicted better."""
+DETERMINED = 1e-8
+"""Share of a group's information that must be left once the model's coefficients follow it."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a group is worth beside a model, all gains as shares of the loss.
+
+    Attributes
+    ----------
+    gain_fit
+        In the loss of the fit, in one linear step.
+    gain_holdout, scatter
+        In the loss of what is left out of linear fits to the rest, and its standard deviation over
+        stretches.
+    chance
+        Probability of such a score if the group's coefficients were neutral (Hotelling's T² of the
+        stretches' scores: residuals that are correlated in time count as they scatter).
+    reason
+        Whether it earns its place.
+    """
+
+    gain_fit: float
+    gain_holdout: float
+    scatter: float
+    chance: float
+    reason: SelectionCode
+
+    @property
+    def earns_place(self) -> bool:
+        """Whether what was left out is predicted better."""
+        return self.reason in (SelectionCode.PREDICTS_FLIGHTS, SelectionCode.PREDICTS_SECTIONS)
+
+
+def score(
+    linear: Linear,
+    model: Columns,
+    group: Columns,
+    *,
+    candidates: int,
+    neutral: NDArray[np.float64] | None = None,
+) -> Score:
+    """Return what a group is worth beside a model.
+
+    Parameters
+    ----------
+    linear
+        The loss about the point.
+    model
+        Columns of the coefficients in the model, without the group's.
+    group
+        Columns of the group.
+    candidates
+        Among how many groups it was picked: the level of significance is shared by them.
+    neutral
+        (K,) scaled neutral values of the group, where the point holds fitted ones; by default the
+        point is at the neutral values.
+    """
+    both = np.concatenate([model, group])
+    without = None
+    if neutral is not None:
+        without = np.zeros(len(linear.scaled))
+        without[group] = (neutral - linear.scaled)[group]
+    everything = np.ones(len(linear.flight), bool)
+    with_group = linear.step(both, inside=everything)
+    alone = linear.step(model, inside=everything, from_=without)
+    fit = _Gain.of(linear, alone, with_group, everything)
+    held_out = _held_out(linear, model, both, linear.flight, without)
+    reason = SelectionCode.PREDICTS_FLIGHTS
+    if not held_out.is_sure and held_out.share > -held_out.scatter:  # no flight contradicts it
+        by_section = _held_out(linear, model, both, linear.section, without)
+        if by_section.is_sure:
+            held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
+    chance = _chance(linear, model, group, (alone, with_group))
+    if not _is_determined(linear, model, group):
+        reason = SelectionCode.NO_INFORMATION
+    elif fit.share < MATERIAL:
+        reason = SelectionCode.IMMATERIAL
+    elif chance > SIGNIFICANCE / max(candidates, 1):
+        reason = SelectionCode.NOT_SIGNIFICANT
+    elif not held_out.is_sure:
+        reason = SelectionCode.NOT_PREDICTED
+    return Score(fit.share, held_out.share, held_out.scatter, chance, reason)
+
+
+def best_first(
+    linear: Linear,
+    model: Columns,
+    groups: Mapping[str, Columns],
+    *,
+    candidates: int,
+) -> dict[str, Score]:
+    """Return the groups that a linear forward selection adds, in that order, with their scores.
+
+    Each is scored beside the model and the groups added before it.
+    """
+    added: dict[str, Score] = {}
+    columns, left = model, dict(groups)
+    while left:
+        scores = {
+            name: score(linear, columns, group, candidates=candidates)
+            for name, group in left.items()
+        }
+        worthy = {name: found for name, found in scores.items() if found.earns_place}
+        if not worthy:
+            break
+        best = max(worthy, key=lambda name: worthy[name].gain_holdout)
+        added[best] = worthy[best]
+        columns = np.concatenate([columns, left.pop(best)])
+    return added
+
+
+@dataclass(frozen=True)
+class _Gain:
+    """By how much each stretch's loss (S,) is lower with a group, and the loss without it."""
+
+    of_stretch: NDArray[np.float64]
+    loss_without: float
+
+    @staticmethod
+    def of(
+        linear: Linear,
+        alone: NDArray[np.float64],
+        with_group: NDArray[np.float64],
+        inside: NDArray[np.bool_],
+    ) -> _Gain:
+        """Return the gain of one change (K,) over another in some stretches, none elsewhere."""
+        without = np.where(inside, linear.change_of_loss(alone), 0.0)
+        gain = without - np.where(inside, linear.change_of_loss(with_group), 0.0)
+        return _Gain(gain, linear.loss * inside.mean() + without.sum())
+
+    @property
+    def share(self) -> float:
+        """Of the loss without the group."""
+        return float(self.of_stretch.sum() / self.loss_without)
+
+    @property
+    def scatter(self) -> float:
+        """Standard deviation of ``share`` if stretches are independent."""
+        if len(self.of_stretch) < 2:
+            return float("inf")
+        deviation = np.sqrt(len(self.of_stretch)) * np.std(self.of_stretch, ddof=1)
+        return float(deviation / self.loss_without)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether it is material and exceeds its scatter."""
+        return self.share > max(SURE * self.scatter, MATERIAL)
+
+
+def _held_out(
+    linear: Linear,
+    model: Columns,
+    both: Columns,
+    by: NDArray[np.intp],
+    without: NDArray[np.float64] | None,
+) -> _Gain:
+    """Return the gain in each fold's stretches of linear fits to the other folds' stretches."""
+    folds = []
+    if len(np.unique(by)) > 1:
+        for out in linear.folds(by):
+            alone = linear.step(model, inside=~out, from_=without)
+            with_group = linear.step(both, inside=~out)
+            folds.append(_Gain.of(linear, alone, with_group, out))
+    if not folds:
+        return _Gain(np.zeros(len(by)), linear.loss)
+    return _Gain(
+        np.sum([fold.of_stretch for fold in folds], axis=0),
+        float(sum(fold.loss_without for fold in folds)),
+    )
+
+
+def _is_determined(linear: Linear, model: Columns, group: Columns) -> bool:
+    """Return whether all of a group's directions differ from what the model's coefficients do."""
+    information = linear.hessian.sum(axis=0) + linear.prior
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    information = information * np.outer(unit, unit)
+    own, across = information[np.ix_(group, group)], information[np.ix_(group, model)]
+    of_model = information[np.ix_(model, model)] + 1e-13 * np.eye(len(model))
+    left = own - across @ np.linalg.solve(of_model, across.T)
+    return bool(np.linalg.eigvalsh(left)[0] > DETERMINED)
+
+
+def _chance(
+    linear: Linear,
+    model: Columns,
+    group: Columns,
+    minima: tuple[NDArray[np.float64], NDArray[np.float64]],
+) -> float:
+    """Return the probability of such a score if the group were neutral, by Hotelling's T².
+
+    Parameters
+    ----------
+    linear, model, group
+        As of `score`.
+    minima
+        The changes (K,) that lead to the minimum without and with the group. The score of the
+        group's coefficients, the model's following them, is that of the first; how much it scatters
+        from stretch to stretch is seen at the second, where only what is no such term is left.
+    """
+    total = linear.hessian.sum(axis=0) + linear.prior
+    follow = np.linalg.solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
+    without, with_group = (
+        (at := linear.score + linear.hessian @ change)[:, group] - at[:, model] @ follow
+        for change in minima
+    )
+    seen = np.any(linear.hessian[:, group, group] > 0.0, axis=1)
+    count, size = int(seen.sum()), len(group)
+    if count <= size + 1:
+        return 1.0
+    sum_of_scores = (without - with_group).sum(axis=0)
+    spread = with_group.T @ with_group * count / (count - 1)
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
+    scaled = spread * np.outer(unit, unit) + RIDGE * np.eye(size)
+    along = sum_of_scores * unit
+    hotelling = float(along @ np.linalg.solve(scaled, along))
+    return float(stats.f.sf(hotelling * (count - size) / (size * (count - 1)), size, count - size))
