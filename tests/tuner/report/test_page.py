@@ -38,6 +38,7 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     assert "7 coefficients were fitted to 1 flight, of which the flights do not identify 1" in text
     for heading in (
         "Coefficients",
+        "Terms beyond the motor model",
         "RMSE of each flight",
         "Simulated against recorded",
         "Local sensitivity",
@@ -48,6 +49,7 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     ):
         assert heading in text
     assert "swing, lap 2" in text
+    assert "Added to Gazebo's motor model: fuselage_drag." in text
     assert "well known" in text
     assert "ab" * 32 in text
     assert "multirotor-tune 0.1.0" in text
