@@ -192,7 +192,9 @@ def _held_out(
 
 def _is_determined(linear: Linear, model: Columns, group: Columns) -> bool:
     """Return whether all of a group's directions differ from what the model's coefficients do."""
-    information = linear.hessian.sum(axis=0) + linear.prior
+    information = linear.hessian.sum(axis=0)
+    if not np.all(np.diag(information)[group] > 0.0):
+        return False
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     information = information * np.outer(unit, unit)
     own, across = information[np.ix_(group, group)], information[np.ix_(group, model)]
