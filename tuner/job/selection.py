@@ -35,7 +35,6 @@ from tuner.selection.candidates import (
 from tuner.selection.linear import Linear, linear_at
 from tuner.selection.score import Score, best_first, score
 from tuner.selection.table import SelectionCode, SelectionRow
-from tuner.uncertainty.full_problem import with_space
 from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 6
@@ -121,7 +120,9 @@ def _extended(job: Job, fitted: Fitted, names: Sequence[str]) -> tuple[Job, Fitt
         for outcome in fitted.outcomes
     )
     return (
-        replace(job, space=objective.space, objective=with_space(job.objective, objective.space)),
+        replace(
+            job, space=objective.space, objective=replace(job.objective, space=objective.space)
+        ),
         replace(fitted, objective=objective, point=point, outcomes=outcomes),
     )
 

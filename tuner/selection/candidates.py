@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,6 @@ from tuner.coefficients.space import Space, extended
 from tuner.config import JobFile, VehicleFile, values_of
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-from tuner.uncertainty.full_problem import with_space
 
 Groups = Mapping[str, tuple[str, ...]]
 """Group -> its coefficients."""
@@ -60,7 +60,7 @@ def with_terms(
     if not names:
         return objective, point
     space = extended(objective.space, names, job, start_of(names))
-    return with_space(objective, space), Point(
+    return replace(objective, space=space), Point(
         jnp.concatenate(
             [jnp.asarray(point.coefficients), jnp.asarray(space.initial[-len(names) :])]
         ),

@@ -23,7 +23,6 @@ from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.uncertainty.full_problem import with_space
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
@@ -38,7 +37,7 @@ def job_with(drag: float, *, seed: int, job: JobFile | None = None) -> tuple[Job
     truth = with_data(truth, truth.start(vector), noise=np.random.default_rng(seed))
     file = JobFile(free=BASE)
     space = space_of(vehicle_file(), controller_file(), file)
-    objective = with_space(truth, space)
+    objective = replace(truth, space=space)
     recordings = tuple(
         SimpleNamespace(
             flight=SimpleNamespace(name=name), holdout=False, inlet="reference", time_offset=0.0
