@@ -79,8 +79,8 @@ def _check_rotors(vehicle: Vehicle, inlet: Inlet, start: Start) -> None:
 
 
 def _advanced(batch: tuple[State, Plant], shared: Plant, number: Int[Array, ""]) -> Any:
-    state, own = batch
-    return eqx.combine(own, shared).sample(state, number)
+    state, per_vehicle = batch
+    return eqx.combine(per_vehicle, shared).sample(state, number)
 
 
 def rollout(
@@ -166,8 +166,8 @@ def rollout(
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
         if arranged is None:
             return plant.sample(state, number)
-        own, shared = eqx.partition(plant, lambda leaf: jnp.shape(leaf)[-1:] == shape)
-        together: tuple[State, Sample] = arranged(_advanced)((state, own), shared, number)
+        per_vehicle, shared = eqx.partition(plant, lambda leaf: jnp.shape(leaf)[-1:] == shape)
+        together: tuple[State, Sample] = arranged(_advanced)((state, per_vehicle), shared, number)
         return together
 
     if horizon is None:

@@ -74,10 +74,10 @@ def _outputs(airmode: int, torque: Vec3, thrust: Scalar) -> PerRotor:
     if airmode == 0:  # thrust may only be reduced; then roll, then pitch give way
         tilt = magnitude(roll) + magnitude(pitch)
         thrust = _reduced(thrust, tilt, 1.0 - tilt)
-        room = smaller(thrust, 1.0 - thrust)
-        for_roll = larger(room - magnitude(pitch), jnp.zeros_like(room))
+        margin = smaller(thrust, 1.0 - thrust)
+        for_roll = larger(margin - magnitude(pitch), jnp.zeros_like(margin))
         roll = saturate(roll, -for_roll, for_roll)
-        for_pitch = larger(room - magnitude(roll), jnp.zeros_like(room))
+        for_pitch = larger(margin - magnitude(roll), jnp.zeros_like(margin))
         pitch = saturate(pitch, -for_pitch, for_pitch)
     elif airmode == 1:  # thrust may rise to keep roll and pitch
         tilt = magnitude(roll) + magnitude(pitch)

@@ -112,13 +112,15 @@ def feedback_acceleration(
 
 def heading_of(gains: PositionGains, velocity: Vec3) -> Vec3:
     """Return the heading (cos ψ, sin ψ, 0): ψ = 0, or along the velocity in that mode."""
-    one, zero = jnp.ones_like(velocity.x), jnp.zeros_like(velocity.x)
+    ones, zeros = jnp.ones_like(velocity.x), jnp.zeros_like(velocity.x)
     if not gains.velocity_yaw:
-        return Vec3(one, zero, zero)
-    speed = Vec3(velocity.x, velocity.y, zero).norm()
+        return Vec3(ones, zeros, zeros)
+    speed = Vec3(velocity.x, velocity.y, zeros).norm()
     moving = speed > 0
     return Vec3(
-        jnp.where(moving, safe_divide(velocity.x, speed), one), safe_divide(velocity.y, speed), zero
+        jnp.where(moving, safe_divide(velocity.x, speed), ones),
+        safe_divide(velocity.y, speed),
+        zeros,
     )
 
 

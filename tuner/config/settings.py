@@ -107,7 +107,7 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
         A path, name or value cannot be used.
     """
     flights = find_flights(options.flights)
-    job_path = _job_path(options, flights)
+    job_path = Path(options.config).expanduser() if options.config else find_job_file(flights)
     job = read_job(job_path) if job_path else JobFile()
     origin: dict[str, str] = {}
 
@@ -158,10 +158,6 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
             files[1], f"is a second job file beside {files[0]}", "name one of them with --config"
         )
     return files[0] if files else None
-
-
-def _job_path(options: Options, flights: tuple[Path, ...]) -> Path | None:
-    return Path(options.config).expanduser() if options.config else find_job_file(flights)
 
 
 M = TypeVar("M", VehicleFile, ControllerFile)

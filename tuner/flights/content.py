@@ -115,7 +115,7 @@ def read_content(
     chosen = choose_map(recording, candidates)
     places, notes = locate(recording, chosen, strict=given is not None)
     require_pose(recording, chosen, places)
-    raw, contents, noticed = extract(recording, places, chosen.clocks)
+    raw, contents, noticed = extract(recording, places, chosen.time)
     all_notes = [
         Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
         *notes,

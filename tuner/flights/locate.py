@@ -56,7 +56,7 @@ def locate(
     RecordingError
         If `strict`: a topic is there, but not what the map says of it.
     """
-    times = [recording.lacking("", (clock.field,)) for clock in topics.clocks]
+    times = [recording.lacking("", (clock.field,)) for clock in topics.time]
     if is_tabular(recording.format) and all(times):
         return {}, ()
     places: dict[str, Place] = {}

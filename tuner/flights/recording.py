@@ -6,14 +6,16 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
 from tuner.errors import RecordingError
 from tuner.flights.damage import Damage
 from tuner.flights.flight import Array, Note
+from tuner.yaml_files.section import Section
 
 Nanoseconds = NDArray[np.int64]
 
@@ -27,9 +29,8 @@ class Topic:
     count: int
 
 
-@dataclass(frozen=True)
-class Clock:
-    """A field that holds the time of a message, or of a table's row.
+class Clock(Section):
+    """A field that holds the time of a message, or of a table's row; a bare name means seconds.
 
     Attributes
     ----------
@@ -40,7 +41,12 @@ class Clock:
     """
 
     field: str
-    unit: str = "s"
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"field": value} if isinstance(value, str) else value
 
 
 #: Unit of time -> nanoseconds.

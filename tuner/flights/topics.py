@@ -72,18 +72,6 @@ class Source(Section):
         return self
 
 
-class ClockField(Section):
-    """A field that holds the time; a bare name means seconds."""
-
-    field: str
-    unit: Literal["s", "ms", "us", "ns"] = "s"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"field": value} if isinstance(value, str) else value
-
-
 class TopicMap(Section):
     """Signals and the sources that may hold them, the preferred one first.
 
@@ -109,7 +97,7 @@ class TopicMap(Section):
     format: str
     extends: str | None = None
     priority: Whole = 0
-    time: Annotated[tuple[ClockField, ...], BeforeValidator(_as_list)] = ()
+    time: Annotated[tuple[Clock, ...], BeforeValidator(_as_list)] = ()
     messages: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = ()
     signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_list)]]
 
@@ -146,11 +134,6 @@ class TopicMap(Section):
                 if source.rotor is None and count != columns:
                     raise refuse(f"signal '{name}' has {count} fields", f"name all {columns}")
         return self
-
-    @property
-    def clocks(self) -> tuple[Clock, ...]:
-        """The fields that hold the time."""
-        return tuple(Clock(clock.field, clock.unit) for clock in self.time)
 
     def under(self, namespace: str) -> TopicMap:
         """Return the map with every topic moved under a namespace, as ``uav1`` or ``/uav1``."""

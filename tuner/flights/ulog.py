@@ -102,7 +102,7 @@ class ULogRecording:
         if "timestamp" not in data:
             raise RecordingError(self.path, f"{topic} has no timestamp", "leave it out of the map")
         receive = data["timestamp"].astype(np.int64) * NANOSECONDS["us"]
-        clocks = (*request.clocks, Clock("timestamp_sample", "us"))
+        clocks = (*request.clocks, Clock(field="timestamp_sample", unit="us"))
         stamp = receive
         for clock in clocks:
             if clock.field in data:

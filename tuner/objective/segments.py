@@ -210,12 +210,10 @@ def _measured(
         scale = finite * (factor / sigma)
         times.append(np.pad(time, (0, padding)))
         filled = np.where(finite, values, 0.0)
+        filled = np.pad(filled, ((0, padding), (0, 0)))
         if channel == "attitude":
             scale = scale[:, 1:]
-            filled = np.pad(filled, ((0, padding), (0, 0)))
             filled[len(time) :, 0] = 1.0
-        else:
-            filled = np.pad(filled, ((0, padding), (0, 0)))
         tables.append(filled)
         scales.append(np.pad(scale, ((0, padding), (0, 0))))
     return Measured(

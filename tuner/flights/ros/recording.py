@@ -31,9 +31,6 @@ from tuner.flights.ros.wire import UnknownFieldError, Walk, decode, missing_fiel
 
 _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
 
-#: Messages beyond this, of one topic, are no flight but an attack on the memory.
-MOST_MESSAGES = 50_000_000
-
 
 def open_container(path: Path) -> Container:
     """Open the container of a ROS recording by what it begins with."""
