@@ -10,10 +10,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from tuner.config import Settings, TrajectorySettings, check_mixer
+from tuner.config.job import InletName
 from tuner.errors import InputError, did_you_mean
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
-from tuner.objective.inlets import INLETS, InletName, inlet_for
+from tuner.objective.inlets import INLETS, inlet_for
 from tuner.simulation.trajectory import with_named_reference
 from tuner.yaml_files.section import build
 

@@ -31,10 +31,11 @@ from tuner.comparison.errors import (
     short_way,
 )
 from tuner.config import ControllerFile, VehicleFile, check_mixer
+from tuner.config.job import InletName
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.criterion import Criterion
-from tuner.objective.inlets import INLETS, InletName
+from tuner.objective.inlets import INLETS
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import fly, simulated_at_stamps

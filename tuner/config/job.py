@@ -23,10 +23,12 @@ from tuner.yaml_files.section import (
 )
 from tuner.yaml_files.shipped import Kind, find_config
 
-#: Recorded signals whose residuals a fit can weigh, by their names in a `Flight`.
+#: Recorded signals whose residuals a fit can weigh, in this order everywhere.
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 
-InletName = Literal["auto", "reference", "body_rate", "actuator", "rotor_speed"]
+#: Where a recording can be fed into the simulated loop, the upstream places first.
+InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
+InletChoice = Literal["auto", InletName]
 Method = Literal["auto", "gradient", "cma", "hybrid"]
 
 
@@ -143,7 +145,7 @@ class FlightSettings(Section):
         What was flown, where the recording holds no reference.
     """
 
-    inlet: InletName | None = None
+    inlet: InletChoice | None = None
     weight: Positive = 1.0
     time_offset: Number | Literal["free"] | None = None
     trajectory: TrajectorySettings | None = None
@@ -214,7 +216,7 @@ class JobFile(Section):
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()
     channels: dict[ChannelName, Flag] = Field(default_factory=dict)
     weights: dict[ChannelName, Positive] = Field(default_factory=dict)
-    inlet: InletName = "auto"
+    inlet: InletChoice = "auto"
     time_offset: Number | Literal["free"] = "free"
     search: Search = Search()
     flights: dict[str, FlightSettings] = Field(default_factory=dict)

@@ -10,12 +10,13 @@ import numpy as np
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.coefficients.space import Space, space_of
 from tuner.comparison.errors import limits_of
-from tuner.config import Settings
+from tuner.config import CHANNELS, Settings
+from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
-from tuner.objective.inlets import INLETS, InletName
-from tuner.objective.noise import CHANNELS, noise_of
+from tuner.objective.inlets import INLETS
+from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, segments_of, window_segments
 from tuner.objective.start import begins_gently

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -56,12 +57,10 @@ def portion(
     return (
         eqx.tree_at(lambda o: o.segments, objective, kept),
         Point(point.coefficients, point.offsets[:, flights]),
-        Criterion(
-            horizon=criterion.horizon,
+        replace(
+            criterion,
             scale={name: scale[flights] for name, scale in criterion.scale.items()},
             reference_offset=criterion.reference_offset[:, flights],
-            huber=criterion.huber,
-            prior=criterion.prior,
             states=None if criterion.states is None else criterion.states[:, segments],
         ),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +27,10 @@ from sim_jax.inlet import (
 )
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
+from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
 from tuner.padding import padded_size
-
-InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
 
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.config import CHANNELS
 from tuner.flights.flight import Flight, Series
-
-#: The channels that a fit compares, in this order everywhere.
-CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
 
 #: Smallest believable standard deviation, in the channel's unit (attitude: rad).
 FLOOR = {

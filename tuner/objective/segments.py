@@ -15,10 +15,11 @@ from sim_jax.inlet import Inlet
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from tuner.coefficients import of_scope
+from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
 from tuner.objective.initial_conditions import freedom_of
-from tuner.objective.inlets import INLETS, InletName, inlet_of
+from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.start import recent_command, start_of
 from tuner.objective.windows import windows_of
 from tuner.padding import padded_size

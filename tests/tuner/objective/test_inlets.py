@@ -5,17 +5,17 @@ from typing import get_args
 import pytest
 
 from sim_jax.inlet import Inlet, MixedInlet
+from tuner.config import CHANNELS
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.informs import inlets
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS, inlet_for
-from tuner.objective.noise import CHANNELS
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
     names = list(INLETS)
-    assert sorted(get_args(InletName)) == sorted(["auto", *names])
+    assert list(get_args(InletName)) == names
     assert [inlet.name for inlet in inlets({}, trajectory=False)] == names
 
 
