@@ -86,7 +86,7 @@ def main() -> None:
     time, command = stepped([0.1, 0.25, 0.4, 0.55, 0.7, 0.6, 0.45, 0.3, 0.2, 0.65], 3.0, rate)
     voltage = 16.4 - 0.02 * time - 0.8 * command**2
     asked = truth["input_scaling"] * command + truth["zero_position_armed"]
-    speed = lagged(asked * (voltage / 16.4) ** 0.9, 0.05, 0.05, rate)
+    speed = lagged(asked * (voltage / 16.4) ** truth["battery_exponent"], 0.05, 0.05, rate)
     write("steps.csv", time=time, command=command, rpm=tachometer(speed, 3.0, random),
           voltage=voltage + random.normal(0, 0.02, len(time)))  # fmt: skip
 

@@ -38,6 +38,7 @@ class Code(StrEnum):
     POORLY_MET = "poorly_met"  # noise_multiple; names: the channel
     STARTS_DISAGREE = "starts_disagree"  # starts, changed: 1 if CMA-ES ended lower, else 0
     FLIGHTS_FAR_OFF = "flights_far_off"  # far_off, flights, changed
+    GROUND_CONFLICT = "ground_conflict"  # deviation (standard errors), ground, flights; names: unit
     BENCH_CONFLICT = "bench_conflict"  # deviation (standard errors); names: the coefficients
 
 

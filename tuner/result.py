@@ -15,6 +15,7 @@ from tuner.errors import InputError
 from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.findings import Finding
 from tuner.selection.table import SelectionRow
+from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 
 BEST_FIT_FILE = "best_fit.yaml"
@@ -143,6 +144,7 @@ class RunResult(ResultFile):
     findings: tuple[Finding, ...]
     search: SearchResult
     selection: tuple[SelectionRow, ...] = ()
+    sources: dict[str, Sources] = Field(default_factory=dict)
 
 
 class Run(BaseModel):

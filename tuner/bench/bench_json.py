@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from tuner.bench.combine import Combination
 from tuner.bench.measurement import Curve, Measurement
+from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.joint_prior import JointPrior
+from tuner.errors import InputError
 from tuner.files import Part, ResultFile
 
 MOST_DRAWN = 800
@@ -108,6 +112,24 @@ def bench_record(combination: Combination, measurements: Sequence[Measurement]) 
         ],
         experiments=[_experiment(measurement) for measurement in measurements],
     )
+
+
+def joint_prior(folder: Path) -> JointPrior:
+    """Return what the ground measurements of a result folder say, as a prior of a fit.
+
+    Raises
+    ------
+    InputError
+        The folder is not that of `tune bench`, or names an unknown coefficient.
+    """
+    record = BenchRecord.read(folder, "give --bench the result folder of tune bench")
+    count = len(record.names)
+    information, mean = np.array(record.information, float), np.array(record.scaled, float)
+    whole = information.shape == (count, count) and mean.shape == (count,) and count > 0
+    known = all(name in COEFFICIENTS for name in record.names)
+    if not (whole and known and np.isfinite(information).all() and np.isfinite(mean).all()):
+        raise InputError(folder / BenchRecord.FILE, "was edited", "run tune bench again")
+    return JointPrior(tuple(record.names), mean, information)
 
 
 def _experiment(measurement: Measurement) -> ExperimentRecord:

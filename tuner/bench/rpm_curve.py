@@ -29,10 +29,9 @@ TRUSTED = 4
 def rpm_curve(
     name: str, path: str, samples: Mapping[str, Array], *, reference_voltage: float | None
 ) -> Measurement:
-    """Return input scaling, zero position and, if the data ask for it, curvature.
+    """Return input scaling, zero position and, if the data ask for them, curvature and exponent.
 
-    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step. The
-    battery's exponent γ has no place in a vehicle file: it is a remark.
+    Ω = (a u + b u² + c) (V/V_ref)^γ (Eq. 4.2, 4.4.1), one point for the middle of every step.
 
     Parameters
     ----------
@@ -80,11 +79,8 @@ def rpm_curve(
         remarks.append(Remark("reference_voltage", {"voltage": reference}))
         if not sags:
             remarks.append(Remark("voltage_constant", {"ratio": float(volts.max() / volts.min())}))
-    if sags:
-        exponent = {"exponent": float(solution[3]), "error": math.sqrt(covariance[3, 3])}
-        remarks.append(Remark("battery_exponent", exponent))
-    names = ["input_scaling", "zero_position_armed", "quadratic"]
-    kept_names = [0, 1, *([2] if curved else [])]
+    names = ["input_scaling", "zero_position_armed", "quadratic", "battery_exponent"]
+    kept_names = [0, 1, *([2] if curved else []), *([3] if sags else [])]
     values = solution[kept_names].copy()
     matrix = covariance[np.ix_(kept_names, kept_names)].copy()
     if values[1] <= 0:

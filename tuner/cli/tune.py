@@ -39,6 +39,7 @@ def tune(
     fit: Annotated[list[str] | None, Many] = None,
     fix: Annotated[list[str] | None, Many] = None,
     method: Method = None,
+    bench: str | None = None,
     out: Path | None = None,
     resume: Annotated[bool, Parameter(negative=())] = False,
     force: Annotated[bool, Parameter(negative=())] = False,
@@ -56,6 +57,9 @@ def tune(
         Fit exactly these coefficients.
     fix
         Fit the usual coefficients except these.
+    bench
+        Start from these ground measurements, a result folder of tune bench, and fit with them as
+        prior; conflicts between ground and flights are named.
     out
         Write into this result folder. Default: runs/ and the time.
     resume
@@ -88,6 +92,7 @@ def tune(
         fix=fix,
         method=method,
         seed=seed,
+        bench=bench,
     )
     with listening(quiet=quiet) as listener:
         folder, result = run(

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from tuner.coefficients.joint_prior import JointPrior
 from tuner.coefficients.registry import COEFFICIENTS
 from tuner.config import ControllerFile, JobFile, VehicleFile, initial_values
 from tuner.errors import ConfigError
@@ -79,6 +80,8 @@ class Coordinates(eqx.Module):
         (K,) whose scaled coordinate is the logarithm.
     prior_mean, prior_sd
         (K,) scaled.
+    joint_rows, joint_offset
+        (N, K) and (N,) of ground measurements, see `tuner.coefficients.joint_prior`; None without.
     """
 
     lower: Float[Array, " K"]
@@ -87,6 +90,8 @@ class Coordinates(eqx.Module):
     is_log: Bool[Array, " K"]
     prior_mean: Float[Array, " K"]
     prior_sd: Float[Array, " K"]
+    joint_rows: Float[Array, "N K"] | None = None
+    joint_offset: Float[Array, " N"] | None = None
 
     def __len__(self) -> int:
         return int(self.lower.shape[0])
@@ -105,7 +110,12 @@ class Coordinates(eqx.Module):
 class Space:
     """The free coefficients and the map between them and an unbounded vector."""
 
-    def __init__(self, parameters: Sequence[Parameter], fixed: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        fixed: Mapping[str, float],
+        joint_prior: JointPrior | None = None,
+    ) -> None:
         self.parameters = tuple(parameters)
         self.fixed = dict(fixed)
         self.names = tuple(parameter.name for parameter in self.parameters)
@@ -115,6 +125,11 @@ class Space:
         self.is_log = np.array([p.scale == "log" for p in self.parameters], bool)
         self.prior_mean = np.array([p.prior_mean for p in self.parameters])
         self.prior_sd = np.array([p.prior_sd for p in self.parameters])
+        self.joint_prior = joint_prior
+        self.joint_rows: NDArray[np.float64] | None = None
+        self.joint_offset: NDArray[np.float64] | None = None
+        if joint_prior is not None:
+            self.joint_rows, self.joint_offset = joint_prior.rows(self.parameters, self.fixed)
 
     @property
     def coordinates(self) -> Coordinates:
@@ -126,6 +141,8 @@ class Space:
             is_log=jnp.asarray(self.is_log),
             prior_mean=jnp.asarray(self.prior_mean),
             prior_sd=jnp.asarray(self.prior_sd),
+            joint_rows=None if self.joint_rows is None else jnp.asarray(self.joint_rows),
+            joint_offset=None if self.joint_offset is None else jnp.asarray(self.joint_offset),
         )
 
     def __len__(self) -> int:
@@ -182,7 +199,12 @@ class Space:
         return np.asarray(self.width * share * (1 - share) / self.stretch)
 
 
-def space_of(vehicle: VehicleFile, controller: ControllerFile, job: JobFile) -> Space:
+def space_of(
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    job: JobFile,
+    joint_prior: JointPrior | None = None,
+) -> Space:
     """Return what a job fits.
 
     Parameters
@@ -191,6 +213,8 @@ def space_of(vehicle: VehicleFile, controller: ControllerFile, job: JobFile) -> 
         Where the coefficients start.
     job
         Which are free, between which bounds, with which priors and ties.
+    joint_prior
+        What ground measurements say.
 
     Raises
     ------
@@ -222,7 +246,7 @@ def space_of(vehicle: VehicleFile, controller: ControllerFile, job: JobFile) -> 
             groups.pop(name)
         groups[group[0]] = tuple(group)
     parameters = [parameter_of(names, values, job) for names in groups.values()]
-    return Space(parameters, {n: v for n, v in values.items() if n not in free})
+    return Space(parameters, {n: v for n, v in values.items() if n not in free}, joint_prior)
 
 
 def _free_names(job: JobFile) -> tuple[str, ...]:
@@ -251,7 +275,9 @@ def extended(
         Coefficient -> where it starts; of all in ``names``.
     """
     parameters = (*space.parameters, *(parameter_of((name,), values, job) for name in names))
-    return Space(parameters, {n: v for n, v in space.fixed.items() if n not in names})
+    return Space(
+        parameters, {n: v for n, v in space.fixed.items() if n not in names}, space.joint_prior
+    )
 
 
 def parameter_of(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:

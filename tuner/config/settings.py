@@ -11,6 +11,8 @@ from typing import Generic, TypeVar
 
 from pydantic import ValidationError
 
+from tuner.bench.bench_json import joint_prior
+from tuner.coefficients.joint_prior import JointPrior
 from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import JobFile, Method, read_job
 from tuner.config.values import check_names, with_values
@@ -47,6 +49,8 @@ class Options:
         Of the search.
     topics, namespace
         The topic map, and the prefix of the recorded topics.
+    bench
+        Result folder of ground measurements: the fit starts from its vehicle, and it is a prior.
     """
 
     flights: Sequence[str]
@@ -61,6 +65,7 @@ class Options:
     seed: int | None = None
     topics: str | None = None
     namespace: str | None = None
+    bench: str | None = None
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,8 @@ class Settings:
         The job file that was read, None without one.
     origin
         Setting to where it comes from, in words: the command line, a file, or the default.
+    bench
+        What ground measurements say; None without.
     """
 
     flights: tuple[Path, ...]
@@ -89,6 +96,7 @@ class Settings:
     job: JobFile
     job_path: Path | None
     origin: Mapping[str, str]
+    bench: JointPrior | None = None
 
 
 def settle(options: Options, *, fits: bool = True) -> Settings:
@@ -122,7 +130,10 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     except ValidationError as error:
         raise config_error(error, Path("command line")) from None
 
-    vehicle, origin["vehicle"] = _choose(VEHICLES, options.vehicle, job.vehicle, job_path)
+    named = options.vehicle
+    if named is None and options.bench is not None:
+        named = str(Path(options.bench) / "best_fit.yaml")
+    vehicle, origin["vehicle"] = _choose(VEHICLES, named, job.vehicle, job_path)
     controller, origin["controller"] = _choose(
         CONTROLLERS, options.controller, job.controller, job_path
     )
@@ -140,7 +151,10 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
         "--fit" if options.fit is not None else "--fix" if options.fix is not None else None,
         job_path if job.free is not None or job.fixed else None,
     )
-    return Settings(flights, vehicle, controller, job, job_path, origin)
+    bench = None
+    if options.bench is not None:
+        bench, origin["bench"] = joint_prior(Path(options.bench)), f"--bench {options.bench}"
+    return Settings(flights, vehicle, controller, job, job_path, origin, bench)
 
 
 def find_job_file(flights: Iterable[Path]) -> Path | None:

@@ -121,6 +121,7 @@ def _restricted(information: FisherInformation, indices: NDArray[np.intp]) -> Fi
         score=information.score[..., indices],
         nuisance_prior=information.nuisance_prior[square],
         prior=information.prior[square],
+        ground=None if information.ground is None else information.ground[square],
     )
 
 

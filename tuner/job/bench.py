@@ -140,9 +140,9 @@ def _estimate(
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
     """Return each measurement, what they say together, and the vehicle that follows."""
     names, base = names_of(plan.experiments), path.parent
-    known = {
-        name: scaled_of(name, v) for name, v in values_of(start).items() if _has_scale(name, v)
-    }
+    neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
+    values = neutral | values_of(start)
+    known = {name: scaled_of(name, v) for name, v in values.items() if _has_scale(name, v)}
     measured = {
         name: measure(name, experiment, start, base)
         for name, experiment in zip(names, plan.experiments, strict=True)

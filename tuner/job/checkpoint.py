@@ -28,6 +28,8 @@ def fingerprint(job: Job) -> str:
         "controller": settings.controller.model_dump(mode="json"),
         "job": settings.job.model_dump(mode="json"),
     }
+    if settings.bench is not None:
+        parts["bench"] = [settings.bench.mean.tolist(), settings.bench.information.tolist()]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 

@@ -12,6 +12,7 @@ from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.sources import CONFLICT, Sources
 
 UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""
@@ -93,6 +94,23 @@ def saturation_feedback(level: Level, feedback: float) -> Finding:
     """Return that the recordings contradict the controller file; ``feedback`` is 0 or 1."""
     numbers = {"feedback": feedback}
     return Finding(Code.SATURATION_FEEDBACK, level, "saturation_feedback", numbers)
+
+
+def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
+    """Return the coefficients of which ground measurements and flights say different things."""
+    return tuple(
+        Finding(
+            Code.GROUND_CONFLICT,
+            "warning",
+            name,
+            {"deviation": source.deviation, "ground": source.ground, "flights": source.flights},
+            (COEFFICIENTS[name].unit,),
+        )
+        for name, source in sources.items()
+        if source.deviation is not None
+        and source.flights is not None
+        and abs(source.deviation) > CONFLICT
+    )
 
 
 def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:

@@ -116,7 +116,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
     noise = noise_of(fitted, channels)
-    space = space_of(settings.vehicle, settings.controller, job)
+    space = space_of(settings.vehicle, settings.controller, job, settings.bench)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(recording.flight, recording.time_offset or 0.0) for recording in to_fit]
     closed = all(INLETS[inlet].closed_loop for inlet in inlets)

@@ -39,6 +39,7 @@ from tuner.result import (
 from tuner.search.fitted import Fitted
 from tuner.selection.table import SelectionRow
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import (
     NOT_FITTED,
     Reason,
@@ -58,6 +59,7 @@ def result_of(
     uncertainty: Uncertainty,
     errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
     *,
+    sources: Mapping[str, Sources] | None = None,
     command: str = "",
     selection: tuple[SelectionRow, ...] = (),
 ) -> RunResult:
@@ -83,6 +85,7 @@ def result_of(
             ],
         },
         coefficients=_coefficients(job, fitted, uncertainty),
+        sources=dict(sources or {}),
         flights=tuple(
             _flight(job, fitted, flight, initial[flight.name].rmse, best[flight.name].rmse)
             for flight in job.flights

@@ -22,7 +22,7 @@ from tuner.job.best_fit import validate, vehicle_fitted
 from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate
 from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.findings import finer_than_steps
+from tuner.job.findings import finer_than_steps, ground_conflicts
 from tuner.job.folder import folder_for
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
@@ -35,6 +35,7 @@ from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.search.progress import Progress
+from tuner.uncertainty.ground import sources_of
 from tuner.wording.exports import export_sentence
 from tuner.wording.findings import one_line, remedy, sentence
 from tuner.wording.phrases import clause
@@ -104,13 +105,24 @@ def run(
     listener.on_message("Examining how well each coefficient is known.")
     fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
     uncertainty = examination.uncertainty
-    fitted = replace(fitted, findings=(*fitted.findings, *finer_than_steps(uncertainty)))
+    count = len(uncertainty.names)
+    sources = sources_of(fitted, uncertainty, examination.information.total[:count, :count])
+    conflicts = ground_conflicts(sources)
+    _report(conflicts, listener, force=True)
+    findings = (*fitted.findings, *finer_than_steps(uncertainty), *conflicts)
+    fitted = replace(fitted, findings=findings)
 
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
     initial, best = validate(job, fitted, vehicle)
     result = result_of(
-        job, fitted, uncertainty, (initial, best), command=command, selection=selected.rows
+        job,
+        fitted,
+        uncertainty,
+        (initial, best),
+        sources=sources,
+        command=command,
+        selection=selected.rows,
     )
     write_folder(folder, result, vehicle, job)
     simulations = {"initial": initial, "best": best}

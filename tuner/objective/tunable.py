@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -66,7 +68,7 @@ def tunable_of(model: Model, space: Space, *, count: int | None = None) -> Tunab
         coordinates=jax.tree.map(
             # as well any number that no bound or root stumbles over
             lambda leaf: jnp.pad(leaf, (0, spare), constant_values=1),
-            space.coordinates,
+            replace(space.coordinates, joint_rows=None, joint_offset=None),
         ),
         ratios=jnp.asarray(ratios),
         moves=jnp.asarray([name in free for name in names]),

@@ -129,6 +129,9 @@ def _loss(
         scaled = np.stack([np.asarray(space.scaled(jnp.asarray(vector))) for vector in vectors])
         pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
         total = np.asarray(batch.loss).sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
+        if space.joint_rows is not None and space.joint_offset is not None:
+            joint_pull = (scaled @ space.joint_rows.T + space.joint_offset) * float(criterion.prior)
+            total = total + 0.5 * (joint_pull**2).sum(axis=-1)
         squares = np.asarray(batch.squares.get("position", np.full((len(vectors), 1, 1), np.nan)))
         placed = np.sum(counts.get("position", np.ones(1)))
         rmse = sigma * np.sqrt(3.0 * squares.sum(axis=(1, 2)) / max(float(placed), 1.0))

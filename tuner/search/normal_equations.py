@@ -75,6 +75,15 @@ def normal_equations(
         [jnp.sum(sums.gradient[:count], axis=-1) + slope * pull, offset_gradient.ravel()]
     )
     shared = jnp.sum(sums.hessian[:count, :count], axis=-1) + jnp.diag(slope**2)
+    if space.joint_rows is not None:
+        rows, offset = jnp.asarray(space.joint_rows), jnp.asarray(space.joint_offset)
+        along = jnp.ones(count)
+        scaled, turn = jax.jvp(space.scaled, (point.coefficients,), (along,))
+        joint_pull = (rows @ scaled + offset) * criterion.prior
+        joint_slope = rows * turn * criterion.prior
+        loss = loss + 0.5 * jnp.sum(joint_pull**2)
+        gradient = gradient.at[:count].add(joint_slope.T @ joint_pull)
+        shared = shared + joint_slope.T @ joint_slope
     across = (sums.hessian[:count, count:] @ owner.T).reshape(count, -1)
     per_flight = sums.hessian[count:, count:] @ owner.T  # (kinds, kinds, N)
     spread = per_flight[:, :, :, None] * jnp.eye(flights)  # a flight's offsets meet only each other

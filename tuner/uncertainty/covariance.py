@@ -70,6 +70,8 @@ def covariance_of(information: FisherInformation) -> Covariance:
     inverse = _inverse(total, unit)
     white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
     priors = information.prior + information.nuisance_prior
+    if information.ground is not None:  # its noise is as large as it says
+        priors = priors + information.ground
     independent = inverse @ (white + priors) @ inverse
     clustered = inverse @ (_score_products(information, unit) + priors) @ inverse
     ratio = np.diag(clustered) / np.diag(independent) - np.sqrt(

@@ -59,7 +59,7 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     values = space.numbers(point.coefficients)
     fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
     parameters = [*space.parameters, *(_parameter(name, value) for name, value in fixed.items())]
-    full_space = Space(parameters, {})
+    full_space = Space(parameters, {}, space.joint_prior)
     vector = full_space.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
     return FullProblem(

@@ -45,6 +45,8 @@ class FisherInformation:
         (K, K): what the priors of the coefficients contribute.
     crashed
         (F,) which simulated segments crashed.
+    ground
+        (K, K): what ground measurements contribute, as data of their own; None without.
     """
 
     channels: tuple[str, ...]
@@ -55,6 +57,7 @@ class FisherInformation:
     nuisance_prior: Array
     prior: Array
     crashed: NDArray[np.bool_]
+    ground: Array | None = None
 
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
@@ -72,16 +75,18 @@ class FisherInformation:
             nuisance_prior=np.sum([part.nuisance_prior for part in parts], axis=0),
             prior=first.prior,
             crashed=np.concatenate([part.crashed for part in parts]),
+            ground=first.ground,
         )
 
     @property
     def data(self) -> Array:
-        """The information (K, K) of all flights."""
-        return np.asarray(self.blocks.sum(axis=(0, 1, 2)) + self.nuisance_prior)
+        """The information (K, K) of all flights and ground measurements."""
+        flights = self.blocks.sum(axis=(0, 1, 2)) + self.nuisance_prior
+        return np.asarray(flights if self.ground is None else flights + self.ground)
 
     @property
     def total(self) -> Array:
-        """The information (K, K) of flights and priors."""
+        """The information (K, K) of flights, ground measurements and priors."""
         return np.asarray(self.data + self.prior)
 
 
@@ -217,6 +222,9 @@ def _without_nuisances(
         nuisance_prior=nuisance_prior,
         prior=np.diag(float(criterion.prior) ** 2 / space.prior_sd**2),
         crashed=crashed,
+        ground=None
+        if space.joint_rows is None
+        else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,
     )
 
 

@@ -29,10 +29,6 @@ REMARKS: Mapping[str, str] = {
     "voltage_constant": (
         "The voltage varied by a factor of {ratio:.3f} only, so that its exponent was not fitted."
     ),
-    "battery_exponent": (
-        "Rotor speeds go with the voltage to the power of {exponent:.2f} ± {error:.2f}, for which "
-        "a vehicle file has no place."
-    ),
     "steps": "{up:.0f} steps up and {down:.0f} down; {outliers:.0f} samples were dropped.",
     "not_first_order": (
         "The response is not first order: a second lag of {milliseconds:.1f} ms explains "

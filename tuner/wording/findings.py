@@ -100,6 +100,13 @@ TEXTS: Mapping[Code, tuple[str, str]] = {
         ),
         "Fit first, then examine the fitted vehicle.",
     ),
+    Code.GROUND_CONFLICT: (
+        (
+            "Ground measurements give {ground:.5g} {unit}, the flights alone {flights:.5g} {unit}: "
+            "{deviation:+.1f} standard errors apart, model error included."
+        ),
+        "Find out which is wrong, the rig or the model, before believing the value of both.",
+    ),
     Code.BENCH_CONFLICT: (
         (
             "What it says of {coefficients} lies {deviation:+.1f} standard errors from what all "
@@ -149,6 +156,7 @@ def _values(finding: Finding) -> dict[str, object]:
         values |= {"names": listed(names), "first": names[0]}
         values["coefficients"] = listed(finding.names)
     seconds = finding.numbers.get("seconds", 0.0)
+    values["unit"] = finding.names[0] if finding.names else ""
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
     changed = finding.numbers.get("changed")
     lower = "ended lower, and its result was kept" if changed else "ended no lower"

@@ -98,12 +98,6 @@ def test_the_truth_lies_in_the_interval_as_often_as_it_says(rig):
     assert 0.9 <= inside <= 0.995, inside
 
 
-def test_the_battery_s_exponent_is_a_remark():
-    measurement = curve(np.random.default_rng(1))
-    (numbers,) = [r.numbers for r in measurement.remarks if r.code == "battery_exponent"]
-    assert abs(numbers["exponent"] - TRUTH["battery_exponent"]) < 4 * numbers["error"]
-
-
 def test_a_second_lag_is_named():
     samples = rigs.motor_steps(np.random.default_rng(0), second=0.02)
     codes = {remark.code for remark in step_response("steps", "s.csv", samples).remarks}

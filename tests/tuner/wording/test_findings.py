@@ -61,6 +61,13 @@ MADE = {
     Code.POORLY_MET: Finding(
         Code.POORLY_MET, "warning", "a", {"noise_multiple": 40.0}, ("body_rate",)
     ),
+    Code.GROUND_CONFLICT: Finding(
+        Code.GROUND_CONFLICT,
+        "warning",
+        "motor_constant",
+        {"deviation": 4.2, "ground": 1.5e-5, "flights": 1.4e-5},
+        ("N s²/rad²",),
+    ),
     Code.BENCH_CONFLICT: Finding(
         Code.BENCH_CONFLICT, "warning", "torque_stand", {"deviation": 5.2}, ("motor_constant",)
     ),

@@ -24,12 +24,14 @@ from tuner.report.sections.provenance import provenance
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 from tuner.report.sections.selection import selection
+from tuner.report.sections.sources import sources
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
     coefficients,
     selection,
     bench,
+    sources,
     errors,
     flights,
     effects,

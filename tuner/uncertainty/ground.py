@@ -1,0 +1,71 @@
+"""Ground measurements beside flights: each alone, both together, and whether they contradict."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients.space import Space
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.sources import Sources
+
+Array = NDArray[np.float64]
+
+
+def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[str, Sources]:
+    """Return each measured coefficient's value on the ground, from flights alone, and from both.
+
+    It is empty for a fit without ground measurements.
+
+    What flights alone give follows from the end of the fit by one Gauss-Newton step without the
+    ground measurements; there the loss's slope is theirs alone, with the opposite sign. Standard
+    errors of flights are widened for model error as those of the fit are.
+
+    Parameters
+    ----------
+    fitted, uncertainty
+        The fit; flights say nothing of what it holds at initial values.
+    total
+        (K, K) information about its parameters, priors and ground measurements included.
+    """
+    space = fitted.objective.space
+    prior, rows, offset = space.joint_prior, space.joint_rows, space.joint_offset
+    if prior is None or rows is None or offset is None:
+        return {}
+    end = np.asarray(space.scaled(jnp.asarray(fitted.point.coefficients)))
+    flights_only = total - rows.T @ rows
+    held = set(fitted.held.values())
+    moves = np.array([name not in held for name in space.names])
+    inverse = np.zeros_like(flights_only)
+    inverse[np.ix_(moves, moves)] = np.linalg.inv(flights_only[np.ix_(moves, moves)])
+    alone = end + inverse @ rows.T @ (rows @ end + offset)
+    alone_error = np.sqrt(np.diag(inverse)) * uncertainty.covariance.beyond_noise
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(prior.information), 1e-300))
+    measured = np.linalg.pinv(prior.information * np.outer(unit, unit), rcond=1e-10)
+    ground_error = np.sqrt(np.diag(measured)) * unit
+    sources = {}
+    for place, name in enumerate(prior.names):
+        if name not in space.names:
+            continue
+        index = space.names.index(name)
+        estimate = uncertainty.estimates[name]
+        ground = float(prior.mean[place])
+        known = bool(moves[index])
+        spread = float(np.hypot(alone_error[index], ground_error[place]))
+        sources[name] = Sources(
+            ground=space.from_scaled(index, ground),
+            ground_error=_error(space, index, ground, ground_error[place]),
+            flights=space.from_scaled(index, alone[index]) if known else None,
+            flights_error=_error(space, index, alone[index], alone_error[index]) if known else None,
+            both=estimate.value,
+            both_error=estimate.std_error,
+            deviation=float(alone[index] - ground) / spread if known else None,
+        )
+    return sources
+
+
+def _error(space: Space, index: int, scaled: float, error: float) -> float:
+    value = space.from_scaled(index, float(scaled))
+    return float(error * value) if space.is_log[index] else float(error)
