@@ -23,6 +23,12 @@ class Environment(eqx.Module):
     battery_decline: Scalar | None = None
     """1/s by which rotor speeds fall, where no voltage was recorded."""
 
+    @property
+    def at_first(self) -> tuple[Vec3 | Scalar | None, ...]:
+        """The values at the first control tick, every leaf (\\*batch)."""
+        series = self.log_voltage
+        return self.wind, self.battery_decline, None if series is None else series[0]
+
     def speed_factor(
         self, battery_exponent: Scalar | None, step: Int[Array, ""], schedule: Schedule
     ) -> Scalar | None:

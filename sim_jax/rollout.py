@@ -146,7 +146,7 @@ def rollout(
     arguments = vehicle, controller, inlet, start, environment
     dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
     vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
-    shape = _batch_shape(inlet, (vehicle, controller, start, environment))
+    shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
     plant = Plant(
         vehicle=vehicle,
         controller=controller,

@@ -42,7 +42,7 @@ from tuner.simulation.write import write_flights
 NAME = "sail_drag"
 TRUTH = 0.06
 
-SURROUNDINGS = Environment(wind=vec(1.5, -0.5, 0.0))
+SURROUNDINGS = Environment(wind=vec(1.5, -0.5, 0.0), log_voltage=jnp.full(4, -0.1))
 """All that a term can depend on, so that each acts."""
 
 ROW = Coefficient(

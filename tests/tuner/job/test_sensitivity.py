@@ -91,5 +91,5 @@ def test_the_command_prints_a_line_for_each_coefficient(bag, tmp_path, capsys):
     assert main(words) == 0
     shown = capsys.readouterr().out
     assert "rolling_moment_coefficient (fixed)" in shown
-    assert "Worst determined:" in shown
+    assert "The worst determined combination of coefficients: " in shown
     assert f"written to {out}/" in shown
