@@ -159,7 +159,7 @@ def rollout(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
-    causes = vehicle, controller, environment
+    causes = vehicle, controller, environment.at_first
     first = first_state(start, vehicle.motor, schedule, plant.gyro, shape)
     state = replaced(following(first, causes), crash_time=first.crash_time)
 
