@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from tuner.coefficients.coefficient import Coefficient, NotCarried, Scope, Written
+from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Scope, Written
 from tuner.coefficients.effects import EFFECT_ROWS
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
@@ -275,6 +275,42 @@ _ROWS = (
         fallback=("filters", "gyro_cutoff"),
         leaf=("controller", "filters", "gyro_cutoff"),
         exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+    ),
+    *(
+        Coefficient(
+            name=f"marker_offset_{axis}",
+            unit="m",
+            meaning=f"point that motion capture records, {direction} of the centre of mass",
+            source="the rigid body as defined in the motion capture's software",
+            scope="setup",
+            place=(EFFECTS, f"marker_offset_{axis}"),
+            scale="linear",
+            bounds=(-0.3, 0.3),
+            prior_sd=0.03,
+            step=0.01,
+            neutral=0.0,
+            group="marker_offset",
+            exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        )
+        for axis, direction in (("x", "ahead"), ("y", "left"), ("z", "above"))
+    ),
+    *(
+        Coefficient(
+            name=f"marker_tilt_{axis}",
+            unit="rad",
+            meaning=f"rotation vector from the body to the motion capture's axes, {direction}",
+            source="the rigid body as defined in the motion capture's software",
+            scope="setup",
+            place=(EFFECTS, f"marker_tilt_{axis}"),
+            scale="linear",
+            bounds=(-0.3, 0.3),
+            prior_sd=0.03,
+            step=0.01,
+            neutral=0.0,
+            group="marker_tilt",
+            exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        )
+        for axis, direction in (("x", "forward"), ("y", "left"), ("z", "up"))
     ),
     # what a recording may get wrong by a constant
     Coefficient(

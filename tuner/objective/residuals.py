@@ -13,11 +13,12 @@ from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
 from tuner.objective.initial_conditions import moved, spun_up, trimmed
+from tuner.objective.markers import markers_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
 
 
 class Trace(eqx.Module):
-    """What a rollout is compared by, logged at ``schedule.log_rate``.
+    """What a rollout is compared by, logged at ``schedule.log_rate``; its pose is the markers'.
 
     Attributes
     ----------
@@ -51,6 +52,9 @@ def fly(
         How far the starts lie from the recorded ones, in the segments' standard deviations.
     """
     start, inlet = segments.start, segments.inlet
+    markers = markers_of(model.vehicle)
+    if markers is not None:
+        start = markers.start(start, segments.resting)
     if segments.turning is not None:
         start = spun_up(start, model.vehicle, segments.turning)
     if states is not None and segments.freedom is not None:
@@ -67,9 +71,12 @@ def fly(
         limits=limits,
     )
     motion = flown.log.motion
+    position, attitude = motion.position, motion.attitude
+    if markers is not None:
+        position, attitude = markers.recorded(motion)
     logged = {
-        "position": (motion.position.x, motion.position.y, motion.position.z),
-        "attitude": (motion.attitude.w, motion.attitude.x, motion.attitude.y, motion.attitude.z),
+        "position": (position.x, position.y, position.z),
+        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
         "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
         "rotor_speed": flown.log.rotor_speed,
         "command": flown.log.command,

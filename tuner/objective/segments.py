@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from sim_jax.inlet import Inlet
@@ -20,7 +20,7 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
 from tuner.objective.initial_conditions import freedom_of
 from tuner.objective.inlets import INLETS, inlet_of
-from tuner.objective.start import recent_command, start_of
+from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.windows import windows_of
 from tuner.padding import padded_size
 
@@ -72,6 +72,8 @@ class Segments(eqx.Module):
     """Recent commands 0..1 of rotors whose speed at the start was not measured, else NaN."""
     begin: Float[Array, " F"] | None = None
     """s since the mission's start at which each segment begins; None where all begin there."""
+    resting: Bool[Array, " F"] | None = None
+    """Which segments start at rest, level; None where none does."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of the start (`tuner.objective.initial_conditions`); None if known."""
 
@@ -120,6 +122,7 @@ def segments_of(
         start=start_of([flight.initial for flight in flights]),
         measured=_all_measured(flights, noise, weights),
         flight=jnp.arange(len(flights)),
+        resting=jnp.asarray([rests(flight.initial) for flight in flights]),
     )
 
 

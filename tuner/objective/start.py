@@ -33,7 +33,7 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
         Whether a start that is as slow and level as a hover is at rest and level, heading as
         recorded. A slow moment in the middle of a flight is no hover.
     """
-    rows = [_start(state, resting=resting) for state in initial]
+    rows = [_start(state, resting=resting and rests(state)) for state in initial]
     stacked = {key: jnp.asarray(np.stack([row[key] for row in rows], axis=-1)) for key in rows[0]}
     speed, command = stacked["rotor_speed"], stacked["command"]
     return Start(
@@ -49,6 +49,16 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
     )
 
 
+def rests(initial: InitialState) -> bool:
+    """Return whether a start is as slow and level as a hover, and so taken to be at rest."""
+    tilt = 2.0 * np.hypot(initial.attitude[1], initial.attitude[2])
+    return bool(
+        np.linalg.norm(initial.velocity) < REST_SPEED
+        and np.linalg.norm(initial.body_rate) < REST_RATE
+        and tilt < REST_TILT
+    )
+
+
 def begins_gently(flight: Flight) -> bool:
     """Return whether a flight begins slowly enough for a fit to follow it from its beginning."""
     start = flight.initial
@@ -60,12 +70,6 @@ def begins_gently(flight: Flight) -> bool:
 
 def _start(initial: InitialState, *, resting: bool) -> dict[str, NDArray[np.float64]]:
     attitude, velocity, rate = initial.attitude, initial.velocity, initial.body_rate
-    tilt = 2.0 * np.hypot(attitude[1], attitude[2])
-    resting = resting and bool(
-        np.linalg.norm(velocity) < REST_SPEED
-        and np.linalg.norm(rate) < REST_RATE
-        and tilt < REST_TILT
-    )
     if resting:
         heading = np.array([attitude[0], 0.0, 0.0, attitude[3]])
         attitude, velocity, rate = heading / np.linalg.norm(heading), np.zeros(3), np.zeros(3)

@@ -1,0 +1,106 @@
+"""The point and the axes of the body that motion capture records, which are not the vehicle's own.
+
+A rigid body that is defined by hand has its point some millimetres beside the centre of mass, and
+its axes a degree off. What is simulated is the centre of mass in body axes; what is recorded is
+
+    p_recorded = p + R(q)·marker_offset,    q_recorded = q ⊗ exp(marker_tilt / 2).
+
+Both numbers belong to the set-up and act where a simulation is compared with a recording: at its
+start, which comes from the recorded pose, and on what it gives. The controllers see the centre of
+mass; velocity and body rate are the estimator's, which are the vehicle's own.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool
+
+from sim_jax.numeric import Scalar, safe_sqrt
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.state import Start
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+
+SMALL = 1e-6
+"""rad² below which sin(a)/a is its series."""
+
+
+class Markers(eqx.Module):
+    """Where the motion capture's frame sits in the body; what is None is not off.
+
+    Attributes
+    ----------
+    offset
+        m, from the centre of mass, body axes.
+    turn
+        The recorded attitude is the body's, turned by this.
+    """
+
+    offset: Vec3 | None
+    turn: Quaternion | None
+
+    def recorded(self, motion: Motion) -> tuple[Vec3, Quaternion]:
+        """Return the pose that motion capture records of a motion."""
+        position, attitude = motion.position, motion.attitude
+        if self.offset is not None:
+            position = position + attitude.to_world(self.offset)
+        return position, attitude if self.turn is None else attitude.product(self.turn)
+
+    def start(self, recorded: Start, resting: Bool[Array, "*batch"] | None) -> Start:
+        """Return the start whose pose motion capture recorded.
+
+        Parameters
+        ----------
+        recorded
+            With the recorded pose; level where the vehicle rests.
+        resting
+            Where the vehicle itself is level, however its markers are tilted.
+        """
+        motion = recorded.motion
+        position, attitude = motion.position, motion.attitude
+        if self.turn is not None:
+            attitude = attitude.product(self.turn.conjugate())
+            if resting is not None:
+                level = Quaternion(attitude.w, 0.0 * attitude.x, 0.0 * attitude.y, attitude.z)
+                attitude = _of_each(resting, level.normalized(), attitude)
+        if self.offset is not None:
+            position = position - attitude.to_world(self.offset)
+        moved = Motion(position, motion.velocity, attitude, motion.body_rate)
+        return Start(moved, recorded.rotor_speed, recorded.command, recorded.rate_integral)
+
+
+def markers_of(vehicle: Vehicle) -> Markers | None:
+    """Return a vehicle's markers; None where they are at its centre of mass and along its axes."""
+    offset, tilt = _vector(vehicle, "marker_offset"), _vector(vehicle, "marker_tilt")
+    if offset is None and tilt is None:
+        return None
+    return Markers(offset, None if tilt is None else rotation(tilt))
+
+
+def rotation(vector: Vec3) -> Quaternion:
+    """Return the rotation by a vector in rad, exp(vector / 2), with its derivative at zero."""
+    square = 0.25 * vector.dot(vector)
+    small = square < SMALL
+    half = safe_sqrt(jnp.where(small, 1.0, square))
+    cosine = jnp.where(small, 1.0 - square / 2.0, jnp.cos(half))
+    scale = 0.5 * jnp.where(small, 1.0 - square / 6.0, jnp.sin(half) / half)
+    turn = vector * scale
+    return Quaternion(cosine, turn.x, turn.y, turn.z)
+
+
+def _vector(vehicle: Vehicle, name: str) -> Vec3 | None:
+    parts = [vehicle.effects.get(f"{name}_{axis}") for axis in "xyz"]
+    if all(part is None for part in parts):
+        return None
+    x, y, z = (jnp.zeros(()) if part is None else part for part in parts)
+    return Vec3(x, y, z)
+
+
+def _of_each(flag: Array, first: Quaternion, second: Quaternion) -> Quaternion:
+    pairs: list[Scalar] = [
+        jnp.where(flag, getattr(first, name), getattr(second, name)) for name in "wxyz"
+    ]
+    return Quaternion(*pairs)
