@@ -30,6 +30,8 @@ class Model(eqx.Module):
 
     vehicle: Vehicle
     controller: Controller
+    reference_voltage: Scalar | None = None
+    """V of the battery at which the motors reach their reference speeds; None where unknown."""
 
 
 def coefficients_in(model: Model) -> dict[str, Scalar]:
@@ -73,7 +75,7 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     if not effects:
         return changed
     vehicle = replace(changed.vehicle, effects=changed.vehicle.effects | effects)
-    return Model(vehicle, changed.controller)
+    return replace(changed, vehicle=vehicle)
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
@@ -148,7 +150,9 @@ def controller_of(file: ControllerFile) -> Controller:
 
 def model_of(vehicle: VehicleFile, controller: ControllerFile) -> Model:
     """Return both files as one value to fly; of what both give, the vehicle file's holds."""
-    model = Model(vehicle_of(vehicle), controller_of(controller))
+    volts = vehicle.battery.reference_voltage
+    reference = None if volts is None else jnp.asarray(volts)
+    model = Model(vehicle_of(vehicle), controller_of(controller), reference)
     values = initial_values(vehicle, controller)
     shared = {name for name, row in COEFFICIENTS.items() if row.fallback and name in values}
     return with_coefficients(model, {name: jnp.asarray(values[name]) for name in shared})

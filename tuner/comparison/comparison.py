@@ -34,6 +34,7 @@ from tuner.config import ControllerFile, VehicleFile, check_mixer
 from tuner.config.job import InletName
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
+from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Criterion
 from tuner.objective.inlets import INLETS
 from tuner.objective.noise import noise_of
@@ -135,7 +136,9 @@ class _Group:
             self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
         else:
             self._windows = [(Window(flight, 0.0),) for flight in flights]
-            self._segments = segments_of(flights, noise=dict.fromkeys(POSE, 1.0))
+            self._segments = segments_of(
+                flights, noise=dict.fromkeys(POSE, 1.0), schedule=self._schedule
+            )
             longest = max(flight.duration for flight in flights)
             self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)
         late = np.array([recording.time_offset or 0.0 for recording in recordings])
@@ -145,7 +148,8 @@ class _Group:
         """Return flight name to its errors, those of windows behind each other."""
         if self._has_mixer:
             check_mixer(vehicle)
-        model = model_of(vehicle, self._controller)
+        flights = [recording.flight for recording in self._recordings]
+        model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         simulated, crash_times = _poses_at_stamps(
             model,
             self._segments,

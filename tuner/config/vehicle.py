@@ -133,6 +133,20 @@ class Setup(Section):
     gyro_cutoff: Positive | None = None
 
 
+class Battery(Section):
+    """What the motors are fed by.
+
+    Attributes
+    ----------
+    reference_voltage
+        V at which a command asks for the speed of `Motor`; with ``battery_exponent``, it asks for
+        less as the recorded voltage falls below. None takes the largest that the fitted flights
+        recorded.
+    """
+
+    reference_voltage: Positive | None = None
+
+
 def _of_the_registry(effects: dict[str, float]) -> dict[str, float]:
     known = [name for name, coefficient in COEFFICIENTS.items() if coefficient.is_effect]
     for name in effects:
@@ -155,7 +169,7 @@ class VehicleFile(Section):
     rotors
         Four in PX4's motor order (front right, rear left, front left, rear right), or six or eight
         in any order.
-    motor, aerodynamics, setup
+    motor, aerodynamics, setup, battery
         See there.
     effects
         Coefficients of terms beyond Gazebo's motor model, name -> value in the unit of the
@@ -171,6 +185,7 @@ class VehicleFile(Section):
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup = Setup()
+    battery: Battery = Battery()
     effects: Annotated[dict[str, Number], AfterValidator(_of_the_registry)] = Field(
         default_factory=dict
     )

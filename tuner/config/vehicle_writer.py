@@ -35,7 +35,7 @@ def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -
 def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
     """Return the text of a vehicle file, as `write_vehicle` writes it."""
     data = vehicle.model_dump(mode="json", exclude_none=True)
-    for section in ("effects", "source"):
+    for section in ("battery", "effects", "source"):
         if not data[section]:
             del data[section]
     return commented(header) + _with_units(dump_yaml(data))
@@ -45,6 +45,7 @@ def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
 _OTHER_UNITS = {
     ("", "rotors"): "positions in m from the centre of mass: forward, left, up",
     ("motor", "max_rotor_velocity"): "rad/s",
+    ("battery", "reference_voltage"): "V",
 }
 
 

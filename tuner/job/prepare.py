@@ -15,6 +15,7 @@ from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
+from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
 from tuner.objective.inlets import INLETS
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
@@ -88,6 +89,11 @@ class Job:
         )
 
     @property
+    def has_voltage(self) -> bool:
+        """Whether every fitted flight holds the battery's voltage, as battery_exponent needs."""
+        return all(flight.has(VOLTAGE) for flight in self.fitted)
+
+    @property
     def clipped(self) -> bool:
         """Whether some recorded rotor was clipped low."""
         return any(
@@ -112,11 +118,14 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             "--holdout", "all flights are held out, none is left to fit", "leave one to fit"
         )
     fitted = [recording.flight for recording in to_fit]
+    settings = replace(settings, vehicle=with_reference_voltage(settings.vehicle, fitted))
     inlets = [recording.inlet for recording in to_fit]
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
     noise = noise_of(fitted, channels)
     space = space_of(settings.vehicle, settings.controller, job, settings.bench)
+    if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
+        require_voltage(fitted)
     schedule = schedule_of(settings.controller)
     on_time = [_shifted(recording.flight, recording.time_offset or 0.0) for recording in to_fit]
     closed = all(INLETS[inlet].closed_loop for inlet in inlets)
@@ -142,7 +151,12 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             segments, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE
         )
     if closed:
-        whole = segments_of(on_time, noise=noise, weights=_weights(settings, fitted, whole=True))
+        whole = segments_of(
+            on_time,
+            noise=noise,
+            weights=_weights(settings, fitted, whole=True),
+            schedule=schedule,
+        )
         objective = problem(whole, longest, limits_of(fitted))
         return Job(settings, recordings, noise, space, objective, windows)
     assert windows is not None

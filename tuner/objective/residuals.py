@@ -8,10 +8,12 @@ from jax import Array, lax
 from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
+from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from tuner.model import Model
+from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import moved, spun_up, trimmed
 from tuner.objective.markers import markers_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
@@ -67,6 +69,7 @@ def fly(
         inlet,
         start,
         samples=samples,
+        environment=environment_of(model, segments),
         horizon=horizon,
         limits=limits,
     )
@@ -84,6 +87,14 @@ def fly(
     return Trace(
         {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
     )
+
+
+def environment_of(model: Model, segments: Segments) -> Environment:
+    """Return what surrounds the segments as far as it acts on a model; nothing if nothing does."""
+    volts, reference = segments.log_voltage, model.reference_voltage
+    if "battery_exponent" not in model.vehicle.effects or volts is None or reference is None:
+        return NOTHING_AROUND
+    return Environment(log_voltage=relative_log_voltage(volts, reference))
 
 
 def residuals(

@@ -18,10 +18,11 @@ from tuner.coefficients import of_scope
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
+from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import freedom_of
 from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.start import recent_command, rests, start_of
-from tuner.objective.windows import windows_of
+from tuner.objective.windows import Window, windows_of
 from tuner.padding import padded_size
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
@@ -74,6 +75,8 @@ class Segments(eqx.Module):
     """s since the mission's start at which each segment begins; None where all begin there."""
     resting: Bool[Array, " F"] | None = None
     """Which segments start at rest, level; None where none does."""
+    log_voltage: Float[Array, "ticks F"] | None = None
+    """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of the start (`tuner.objective.initial_conditions`); None if known."""
 
@@ -93,6 +96,7 @@ def segments_of(
     *,
     noise: Mapping[str, float],
     weights: Mapping[str, Mapping[str, float]] | None = None,
+    schedule: Schedule | None = None,
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
 
@@ -104,12 +108,15 @@ def segments_of(
         Channel -> standard deviation in its unit (attitude: rad). Channels not named are left out.
     weights
         Flight name -> channel -> factor on the residuals.
+    schedule
+        On whose control ticks the battery's voltage is laid out.
 
     Raises
     ------
     RecordingError
         A flight holds no reference.
     """
+    schedule = Schedule() if schedule is None else schedule
     for flight in flights:
         if not flight.has("reference_position"):
             raise RecordingError(
@@ -118,11 +125,12 @@ def segments_of(
                 "name its trajectory in the job file, or fit through another inlet",
             )
     return Segments(
-        inlet=INLETS["reference"].lay(flights, Schedule()),
+        inlet=INLETS["reference"].lay(flights, schedule),
         start=start_of([flight.initial for flight in flights]),
         measured=_all_measured(flights, noise, weights),
         flight=jnp.arange(len(flights)),
         resting=jnp.asarray([rests(flight.initial) for flight in flights]),
+        log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
     )
 
 
@@ -176,6 +184,9 @@ def window_segments(
         flight=jnp.asarray([number for number, _ in cut]),
         turning=jnp.asarray(np.stack([recent_command(piece, lag) for piece in pieces], axis=-1)),
         begin=jnp.asarray([window.begin for _, window in cut]),
+        log_voltage=log_voltage_of(
+            [flights[number] for number, _ in cut], [window for _, window in cut], schedule
+        ),
         freedom=jnp.asarray(freedom),
     )
 

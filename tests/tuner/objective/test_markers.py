@@ -74,7 +74,9 @@ def motion():
 
 
 def test_a_start_is_where_the_markers_say():
-    markers = Markers(Vec3.of(jnp.asarray([0.01, 0.02, 0.03])), rotation(Vec3.of(jnp.ones(3) * 0.02)))
+    markers = Markers(
+        Vec3.of(jnp.asarray([0.01, 0.02, 0.03])), rotation(Vec3.of(jnp.ones(3) * 0.02))
+    )
     position, attitude = markers.recorded(motion())
     seen = Start(
         Motion(position, motion().velocity, attitude, motion().body_rate),
@@ -100,7 +102,10 @@ def test_markers_at_the_centre_of_mass_are_none():
 
 def test_the_markers_are_flown_around_the_centre_of_mass(fit):
     objective, point = fit
-    seen, plain = fly_at(objective, point), fly_at(objective, objective.start(objective.space.initial))
+    seen, plain = (
+        fly_at(objective, point),
+        fly_at(objective, objective.start(objective.space.initial)),
+    )
     offset = seen["position"][0] - plain["position"][0]
     np.testing.assert_allclose(offset, 0.0, atol=1e-12)  # both starts were recorded there
     np.testing.assert_array_equal(seen["rotor_speed"][0], plain["rotor_speed"][0])
@@ -112,7 +117,9 @@ def test_the_gradient_is_the_finite_difference(fit):
     _, gradient, _ = equations(objective, vector)
     for index in range(len(vector)):
         step = 1e-4 * np.eye(len(vector))[index]
-        difference = (equations(objective, vector + step)[0] - equations(objective, vector - step)[0]) / 2e-4
+        difference = (
+            equations(objective, vector + step)[0] - equations(objective, vector - step)[0]
+        ) / 2e-4
         assert float(gradient[index]) == pytest.approx(float(difference), rel=1e-4, abs=1e-7)
 
 
@@ -130,4 +137,6 @@ def test_offset_and_tilt_are_estimated(fit):
 
 def test_no_target_carries_markers():
     for name in TRUTH:
-        assert all(isinstance(place, NotCarried) for place in COEFFICIENTS[name].exported_as.values())
+        assert all(
+            isinstance(place, NotCarried) for place in COEFFICIENTS[name].exported_as.values()
+        )
