@@ -22,12 +22,15 @@ class Environment(eqx.Module):
     """Logarithm of the battery's voltage over its reference voltage, one a control tick."""
     battery_decline: Scalar | None = None
     """1/s by which rotor speeds fall, where no voltage was recorded."""
+    begin: Float[Array, "*batch"] | None = None
+    """s since the battery began to decline at which the simulation begins; None for zero."""
 
     @property
     def at_first(self) -> tuple[Vec3 | Scalar | None, ...]:
         """The values at the first control tick, every leaf (\\*batch)."""
         series = self.log_voltage
-        return self.wind, self.battery_decline, None if series is None else series[0]
+        voltage = None if series is None else series[0]
+        return self.wind, self.battery_decline, self.begin, voltage
 
     def speed_factor(
         self, battery_exponent: Scalar | None, step: Int[Array, ""], schedule: Schedule
@@ -43,7 +46,8 @@ class Environment(eqx.Module):
                 battery_exponent * row_of(self.log_voltage, schedule.control_tick(step))
             )
         if self.battery_decline is not None:
-            declined = 1.0 - self.battery_decline * (step * schedule.step)
+            time = step * schedule.step if self.begin is None else step * schedule.step + self.begin
+            declined = 1.0 - self.battery_decline * time
             factor = declined if factor is None else factor * declined
         return factor
 

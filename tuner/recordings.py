@@ -7,7 +7,7 @@ check and the cross-validation.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from tuner.config import Settings, TrajectorySettings, check_mixer
 from tuner.config.job import InletName
@@ -33,12 +33,15 @@ class Recording:
         s by which its stamps are late; None where the fit estimates that.
     holdout
         Whether it is evaluated and never fitted.
+    conditions
+        What surrounded it, of `tuner.coefficients.conditions`, as far as that is known.
     """
 
     flight: Flight
     inlet: InletName = "reference"
     time_offset: float | None = 0.0
     holdout: bool = False
+    conditions: Mapping[str, float] = field(default_factory=dict)
 
 
 def read_recordings(
@@ -102,6 +105,13 @@ def with_offsets(
 ) -> tuple[Recording, ...]:
     """Return recordings whose clocks are late by known s: flight name -> s."""
     return tuple(replace(r, time_offset=offsets[r.flight.name]) for r in recordings)
+
+
+def with_conditions(
+    recordings: Sequence[Recording], conditions: Mapping[str, Mapping[str, float]]
+) -> tuple[Recording, ...]:
+    """Return recordings with what is known of their surroundings: flight name -> name -> value."""
+    return tuple(replace(r, conditions=conditions[r.flight.name]) for r in recordings)
 
 
 def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:

@@ -98,8 +98,9 @@ class AxesRmse(Part):
 class FlightResult(Part):
     """One recording: what it was used for and how closely it is met.
 
-    ``duration`` in s; ``time_offset`` in s by which its clock is late; RMSE with the initial and
-    the best coefficients.
+    ``duration`` in s; ``time_offset`` in s by which its clock is late; ``conditions`` are what
+    surrounded it, of the registry's scope ``flight``, as it was simulated; RMSE with the initial
+    and the best coefficients.
     """
 
     name: str
@@ -108,6 +109,7 @@ class FlightResult(Part):
     split: Literal["fit", "holdout"]
     duration: float
     time_offset: float
+    conditions: dict[str, float] = Field(default_factory=dict)
     rmse_initial: AxesRmse
     rmse_best: AxesRmse
 

@@ -1,7 +1,15 @@
 """The coefficients of the model: the table that defines them and the space that a fit searches."""
 
 from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Written
-from tuner.coefficients.registry import COEFFICIENTS, REGISTRY, of_scope, scale_group, term_groups
+from tuner.coefficients.registry import (
+    COEFFICIENTS,
+    REGISTRY,
+    conditions,
+    of_scope,
+    recording_offsets,
+    scale_group,
+    term_groups,
+)
 
 __all__ = [
     "COEFFICIENTS",
@@ -10,7 +18,9 @@ __all__ = [
     "Coefficient",
     "NotCarried",
     "Written",
+    "conditions",
     "of_scope",
+    "recording_offsets",
     "scale_group",
     "term_groups",
 ]

@@ -363,6 +363,32 @@ _ROWS = (
         prior_sd=0.02,
         neutral=0.0,
     ),
+    # what surrounds a flight
+    *(
+        Coefficient(
+            name=f"wind_{axis}",
+            unit="m/s",
+            meaning=f"steady velocity of the air towards world {axis} during a flight",
+            source="air conditioning of the hall; the vehicle's own wash",
+            scope="flight",
+            scale="linear",
+            prior_sd=0.5,
+            neutral=0.0,
+            group="wind",
+        )
+        for axis in "xy"
+    ),
+    Coefficient(
+        name="battery_decline",
+        unit="1/s",
+        meaning="share of the rotor speeds that is lost each second of a flight",
+        source="thesis 10.4, where no voltage was recorded: Ω·(1 - λt)",
+        scope="flight",
+        scale="linear",
+        prior_sd=0.004,
+        neutral=0.0,
+        group="battery_decline",
+    ),
     # by how much the start of a window differs from the recorded state
     Coefficient(
         name="position",
@@ -484,3 +510,13 @@ def term_groups() -> dict[str, tuple[str, ...]]:
         if row.group:
             groups[row.group] = (*groups.get(row.group, ()), name)
     return groups
+
+
+def conditions() -> dict[str, Coefficient]:
+    """Return name -> row of what may surround a flight: it enters the simulation of that flight."""
+    return {name: row for name, row in of_scope("flight").items() if row.group}
+
+
+def recording_offsets() -> dict[str, Coefficient]:
+    """Return name -> row of what a recording may get wrong by a constant."""
+    return {name: row for name, row in of_scope("flight").items() if not row.group}

@@ -35,7 +35,7 @@ from tuner.config.job import InletName
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.battery import with_reference_voltage
-from tuner.objective.criterion import Criterion
+from tuner.objective.criterion import Criterion, Point, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
@@ -143,6 +143,11 @@ class _Group:
             self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)
         late = np.array([recording.time_offset or 0.0 for recording in recordings])
         self._late = late[np.asarray(self._segments.flight)]
+        names = sorted({name for recording in recordings for name in recording.conditions})
+        self._conditions = {
+            name: np.array([recording.conditions.get(name, 0.0) for recording in recordings])
+            for name in names
+        }
 
     def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
@@ -150,10 +155,12 @@ class _Group:
             check_mixer(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
+        owner = np.asarray(self._segments.flight)
         simulated, crash_times = _poses_at_stamps(
             model,
             self._segments,
             jnp.asarray(self._late),
+            {name: jnp.asarray(values[owner]) for name, values in self._conditions.items()},
             schedule=self._schedule,
             samples=self._samples,
             limits=self._limits,
@@ -195,10 +202,22 @@ class _Group:
     def _likeliest_starts(self, model: Model) -> Array:
         """Return the likeliest starts (L, F), in the segments' standard deviations."""
         assert self._segments.freedom is not None
+        names, flights = tuple(self._conditions), len(self._recordings)
         objective = Objective(
-            model, self._segments, Space([], {}), self._schedule, self._samples, self._limits
+            model,
+            self._segments,
+            Space([], {}),
+            self._schedule,
+            self._samples,
+            self._limits,
+            conditions=names,
         )
-        point, flights = objective.start(np.zeros(0)), len(self._recordings)
+        rows = [
+            values / unit
+            for values, unit in zip(self._conditions.values(), units_of(names), strict=True)
+        ]
+        none = np.zeros((len(OFFSETS), flights))
+        point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
         states = np.zeros(self._segments.freedom.shape)
         for _ in range(ROUNDS):
             criterion = Criterion(
@@ -219,6 +238,7 @@ def _poses_at_stamps(
     model: Model,
     segments: Segments,
     late: Float[JaxArray, " F"],
+    conditions: dict[str, Float[JaxArray, " F"]],
     *,
     schedule: Schedule,
     samples: int,
@@ -239,6 +259,7 @@ def _poses_at_stamps(
         horizon=jnp.asarray(samples) if windowed else None,
         limits=limits,
         states=states,
+        conditions=conditions,
     )
     rate = float(schedule.log_rate)
     on_time = jnp.zeros((len(OFFSETS), segments.count))

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
-from tuner.coefficients import COEFFICIENTS, term_groups
+from tuner.coefficients import COEFFICIENTS, conditions, term_groups
 from tuner.errors import ConfigError, did_you_mean
 from tuner.exporters.targets import NAMES
 from tuner.trajectory_settings import TrajectorySettings
@@ -39,10 +39,11 @@ def _known(word: str, known: tuple[str, ...], kind: str) -> str:
 
 
 def _terms() -> tuple[str, ...]:
-    """Return the names of groups of terms, and of the coefficients in them."""
+    """Return the names of groups of terms, of the coefficients in them, and of surroundings."""
     groups = term_groups()
     names = (name for group, names in groups.items() for name in names if name != group)
-    return (*groups, *names)
+    surroundings = (word for name, row in conditions().items() for word in (row.group, name))
+    return (*groups, *names, *dict.fromkeys(surroundings))
 
 
 CoefficientName = Annotated[

@@ -93,6 +93,7 @@ def candidate_problem(
         samples=round(seconds * schedule.log_rate),
         limits=Limits(),
         memory=objective.memory,
+        conditions=objective.conditions,
     )
 
 

@@ -9,9 +9,9 @@ from tuner.comparison.comparison import Comparison
 from tuner.comparison.errors import FlightErrors
 from tuner.config import ControllerFile, VehicleFile, initial_values, with_values
 from tuner.job.prepare import Job
-from tuner.objective.criterion import OFFSET_UNIT
-from tuner.objective.segments import CLOCKS
-from tuner.recordings import with_offsets
+from tuner.objective.criterion import OFFSET_UNIT, units_of
+from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.recordings import with_conditions, with_offsets
 from tuner.search.fitted import Fitted
 
 
@@ -66,9 +66,24 @@ def offsets_of(job: Job, fitted: Fitted) -> dict[str, float]:
     return offsets
 
 
+def conditions_of(job: Job, fitted: Fitted) -> dict[str, dict[str, float]]:
+    """Return flight -> name -> what surrounded it.
+
+    It was estimated of the fitted flights; those held out are predicted with their mean.
+    """
+    names = fitted.objective.conditions
+    rows = np.asarray(fitted.point.offsets)[len(OFFSETS) :] * units_of(names)[:, None]
+    usual = dict(zip(names, rows.mean(axis=1).tolist(), strict=True))
+    conditions = {recording.flight.name: usual for recording in job.recordings}
+    for flight, values in zip(job.fitted, rows.T.tolist(), strict=True):
+        conditions[flight.name] = dict(zip(names, values, strict=True))
+    return conditions
+
+
 def comparison_of(job: Job, fitted: Fitted) -> Comparison:
-    """Return the job's recordings laid out as the search ended: controller and clocks."""
+    """Return the job's recordings laid out as the search ended: controller, clocks, air."""
     recordings = with_offsets(job.recordings, offsets_of(job, fitted))
+    recordings = with_conditions(recordings, conditions_of(job, fitted))
     window = job.settings.job.search.window
     return Comparison(recordings, controller_flown(job, fitted), window=window)
 

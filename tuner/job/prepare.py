@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim_jax.crash import AIRBORNE, Limits
+from tuner.coefficients import conditions
 from tuner.coefficients.space import Space, space_of
 from tuner.comparison.errors import limits_of
-from tuner.config import CHANNELS, Settings
+from tuner.config import CHANNELS, JobFile, Settings
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
@@ -89,11 +90,6 @@ class Job:
         )
 
     @property
-    def has_voltage(self) -> bool:
-        """Whether every fitted flight holds the battery's voltage, as battery_exponent needs."""
-        return all(flight.has(VOLTAGE) for flight in self.fitted)
-
-    @property
     def clipped(self) -> bool:
         """Whether some recorded rotor was clipped low."""
         return any(
@@ -118,7 +114,9 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             "--holdout", "all flights are held out, none is left to fit", "leave one to fit"
         )
     fitted = [recording.flight for recording in to_fit]
-    settings = replace(settings, vehicle=with_reference_voltage(settings.vehicle, fitted))
+    has_voltage = all(flight.has(VOLTAGE) for flight in fitted)
+    if has_voltage:
+        settings = replace(settings, vehicle=with_reference_voltage(settings.vehicle, fitted))
     inlets = [recording.inlet for recording in to_fit]
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
@@ -131,10 +129,14 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     closed = all(INLETS[inlet].closed_loop for inlet in inlets)
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
+    if not has_voltage:  # battery_exponent would act on some flights and not on others
+        model = replace(model, reference_voltage=None)
 
     def problem(segments: Segments, seconds: float, limits: Limits) -> Objective:
         samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
-        return Objective(model, segments, space, schedule, samples, limits)
+        return Objective(
+            model, segments, space, schedule, samples, limits, conditions=_conditions(job)
+        )
 
     windows = None
     if not closed or not all(begins_gently(flight) for flight in fitted):
@@ -161,6 +163,12 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         return Job(settings, recordings, noise, space, objective, windows)
     assert windows is not None
     return Job(settings, recordings, noise, space, windows)
+
+
+def _conditions(job: JobFile) -> tuple[str, ...]:
+    """Return what the job estimates of each flight's surroundings: what its terms name."""
+    named = set() if isinstance(job.terms, str) else set(job.terms)
+    return tuple(name for name, row in conditions().items() if named & {name, row.group})
 
 
 def _shifted(flight: Flight, late: float) -> Flight:

@@ -16,6 +16,7 @@ from tuner.files import csv_text
 from tuner.flights.flight import Flight
 from tuner.job.best_fit import (
     best_values,
+    conditions_of,
     controller_flown,
     impossible_inertia,
     initial_of,
@@ -107,7 +108,7 @@ def result_of(
 
 def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
     """Return flight -> offset of each clock in s and of each gyro axis in rad/s."""
-    table = np.asarray(fitted.point.offsets) * OFFSET_UNIT
+    table = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     return {
         flight.name: dict(zip(OFFSETS, table[:, number].tolist(), strict=True))
         for number, flight in enumerate(job.fitted)
@@ -208,6 +209,7 @@ def _flight(
         split="holdout" if flight in job.held_out else "fit",
         duration=flight.duration,
         time_offset=offsets_of(job, fitted).get(flight.name, 0.0),
+        conditions=conditions_of(job, fitted)[flight.name],
         rmse_initial=initial,
         rmse_best=best,
     )

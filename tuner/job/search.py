@@ -190,7 +190,7 @@ class _Attempt:
             findings=(
                 *self.findings,
                 *end_findings(job, progress.feedback, scales),
-                *offset_findings(job, np.asarray(point.offsets) * OFFSET_UNIT),
+                *offset_findings(job, np.asarray(point.offsets)[: len(OFFSETS)] * OFFSET_UNIT),
             ),
         )
 
@@ -228,7 +228,7 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     What enters below the reference does so on the flight controller's clock, which then is the
     simulation's own.
     """
-    free = np.ones((len(OFFSETS), len(job.fitted)), bool)
+    free = np.ones((len(job.objective.of_flight), len(job.fitted)), bool)
     free[: len(CLOCKS), list(job.offset_is_fixed)] = False
     fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
-from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
 from tuner.search.fitted import Fitted
-from tuner.search.normal_equations import OFFSET_SD
 from tuner.search.optimiser import Free
 from tuner.selection.candidates import (
     Groups,

@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
+import numpy as np
 from jax import Array
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 
-from tuner.objective.segments import Segments
+from tuner.coefficients import REGISTRY, recording_offsets
+from tuner.objective.segments import OFFSETS, Segments
 
 OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
+(OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in recording_offsets().values()}
+"""Prior standard deviation of what each flight has of its own, in the search's coordinates."""
+
+
+def units_of(names: Sequence[str]) -> NDArray[np.float64]:
+    """Return how much of each quantity of a flight is one in the search's coordinate."""
+    return np.array(
+        [OFFSET_UNIT if name in OFFSETS else REGISTRY[name].prior_sd / OFFSET_SD for name in names]
+    )
 
 
 class Point(eqx.Module):
@@ -20,7 +34,8 @@ class Point(eqx.Module):
     coefficients
         (K,) search vector of the `Space`.
     offsets
-        (offsets, N) of `OFFSETS`, a column for each flight, in units of `OFFSET_UNIT`.
+        (offsets, N) of `OFFSETS`, then of the objective's conditions, a column for each flight, in
+        the units of `units_of`.
     """
 
     coefficients: Float[Array, " K"]
@@ -95,8 +110,8 @@ class Jacobian(eqx.Module):
     residuals
         Channel -> (n, k, F), in unscaled standard deviations.
     columns
-        Channel -> (Q, n, k, F): derivatives by the search vector, then by each offset in units of
-        `OFFSET_UNIT`, then by the start in the segments' standard deviations.
+        Channel -> (Q, n, k, F): derivatives by the search vector, then by each offset and condition
+        in the units of `units_of`, then by the start in the segments' standard deviations.
     crash_time
         (F,) s.
     """

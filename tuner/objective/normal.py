@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -53,6 +54,13 @@ class Objective(eqx.Module):
     limits: Limits = eqx.field(static=True)
     memory: int = eqx.field(static=True, default=MEMORY)
     """bytes that derivatives may take while they are computed: segments beyond take turns."""
+    conditions: tuple[str, ...] = eqx.field(static=True, default=())
+    """What surrounds each flight and is estimated with it, of `tuner.coefficients.conditions`."""
+
+    @property
+    def of_flight(self) -> tuple[str, ...]:
+        """What each flight has of its own, in the order of a point's rows."""
+        return (*OFFSETS, *self.conditions)
 
     @property
     def flights(self) -> int:
@@ -61,12 +69,18 @@ class Objective(eqx.Module):
 
     def start(self, vector: np.ndarray[Any, Any]) -> Point:
         """Return a point with a search vector and no offset."""
-        return Point(jnp.asarray(vector), jnp.zeros((len(OFFSETS), self.flights)))
+        return Point(jnp.asarray(vector), jnp.zeros((len(self.of_flight), self.flights)))
 
     @property
     def simulator(self) -> Simulator:
         """The static half, by which compiled functions are kept."""
-        return Simulator(self.schedule, padded_size(self.samples), self.limits, self.memory)
+        return Simulator(
+            self.schedule,
+            padded_size(self.samples),
+            self.limits,
+            self.memory,
+            self.conditions,
+        )
 
     @property
     def tunable(self) -> Tunable:
@@ -128,6 +142,24 @@ class Objective(eqx.Module):
             ),
         )
         return by_segment
+
+
+def with_conditions(
+    objective: Objective, point: Point, names: Sequence[str]
+) -> tuple[Objective, Point]:
+    """Return a problem in which more surrounds each flight, and its point, where that is nothing.
+
+    Parameters
+    ----------
+    objective, point
+        The problem, and where it stands.
+    names
+        Of `tuner.coefficients.conditions`.
+    """
+    added = tuple(name for name in names if name not in objective.conditions)
+    wider = replace(objective, conditions=(*objective.conditions, *added))
+    nothing = jnp.zeros((len(added), objective.flights))
+    return wider, Point(point.coefficients, jnp.concatenate([point.offsets, nothing]))
 
 
 def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:

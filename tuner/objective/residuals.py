@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
-from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.environment import Environment
 from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
+from sim_jax.vector import Vec3
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import moved, spun_up, trimmed
@@ -43,6 +47,7 @@ def fly(
     horizon: Int[Array, ""] | None,
     limits: Limits,
     states: Float[Array, "L F"] | None = None,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
 ) -> Trace:
     """Simulate every segment up to a horizon in samples.
 
@@ -52,6 +57,8 @@ def fly(
         As of `sim_jax.rollout.rollout`.
     states
         How far the starts lie from the recorded ones, in the segments' standard deviations.
+    conditions
+        Name, of `tuner.coefficients.conditions` -> what surrounds each segment, in its unit.
     """
     start, inlet = segments.start, segments.inlet
     markers = markers_of(model.vehicle)
@@ -69,7 +76,7 @@ def fly(
         inlet,
         start,
         samples=samples,
-        environment=environment_of(model, segments),
+        environment=environment_of(model, segments, conditions),
         horizon=horizon,
         limits=limits,
     )
@@ -89,12 +96,30 @@ def fly(
     )
 
 
-def environment_of(model: Model, segments: Segments) -> Environment:
-    """Return what surrounds the segments as far as it acts on a model; nothing if nothing does."""
+def environment_of(
+    model: Model, segments: Segments, conditions: Mapping[str, Float[Array, " F"]]
+) -> Environment:
+    """Return what surrounds the segments, as far as it acts on a model."""
+    log_voltage = None
     volts, reference = segments.log_voltage, model.reference_voltage
-    if "battery_exponent" not in model.vehicle.effects or volts is None or reference is None:
-        return NOTHING_AROUND
-    return Environment(log_voltage=relative_log_voltage(volts, reference))
+    acts = "battery_exponent" in model.vehicle.effects
+    if acts and volts is not None and reference is not None:
+        log_voltage = relative_log_voltage(volts, reference)
+    decline = conditions.get("battery_decline")
+    return Environment(
+        wind=_wind(conditions),
+        log_voltage=log_voltage,
+        battery_decline=decline,
+        begin=None if decline is None else segments.begin,
+    )
+
+
+def _wind(conditions: Mapping[str, Float[Array, " F"]]) -> Vec3 | None:
+    known = [conditions[name] for name in ("wind_x", "wind_y") if name in conditions]
+    if not known:
+        return None
+    calm = jnp.zeros_like(known[0])
+    return Vec3(conditions.get("wind_x", calm), conditions.get("wind_y", calm), calm)
 
 
 def residuals(

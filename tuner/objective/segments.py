@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim_jax.inlet import Inlet
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from tuner.coefficients import of_scope
+from tuner.coefficients import recording_offsets
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
@@ -26,7 +26,7 @@ from tuner.objective.windows import Window, windows_of
 from tuner.padding import padded_size
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
-CLOCKS = tuple(name for name, row in of_scope("flight").items() if row.unit == "s")
+CLOCKS = tuple(name for name, row in recording_offsets().items() if row.unit == "s")
 CLOCK_OF = {
     "position": 0,
     "attitude": 0,
@@ -36,7 +36,7 @@ CLOCK_OF = {
 }
 
 #: What a recording may get wrong by a constant: its clocks, in s, and its gyro, in rad/s.
-OFFSETS = tuple(of_scope("flight"))
+OFFSETS = tuple(recording_offsets())
 
 
 class Measured(eqx.Module):

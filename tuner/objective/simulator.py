@@ -16,7 +16,13 @@ from jax import Array
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
-from tuner.objective.criterion import OFFSET_UNIT, Jacobian, SegmentData, SegmentSums
+from tuner.objective.criterion import (
+    OFFSET_UNIT,
+    Jacobian,
+    SegmentData,
+    SegmentSums,
+    units_of,
+)
 from tuner.objective.initial_conditions import eliminated
 from tuner.objective.loss import count, gauss_newton, robust_loss
 from tuner.objective.residuals import Trace, fly, residuals
@@ -37,6 +43,8 @@ class Simulator:
     """Samples of a log, those that pad it included."""
     limits: Limits
     memory: int = MEMORY
+    conditions: tuple[str, ...] = ()
+    """What surrounds each flight and enters its simulation, behind the offsets."""
 
     def segments_at_once(self, data: SegmentData, moving: int) -> int:
         """Return how many segments a device flies at a time: what fits its cache and the memory.
@@ -44,7 +52,7 @@ class Simulator:
         ``moving`` is how many parameters it differentiates by; zero if it does not.
         """
         starts = 0 if data.states is None else len(data.states)
-        columns = moving + starts if moving else 1
+        columns = moving + len(self.conditions) + starts if moving else 1
         recorded = sum(
             m.values.shape[0] * m.values.shape[1] for m in data.segments.measured.values()
         )
@@ -60,9 +68,20 @@ class Simulator:
         segments: Segments,
         coefficients: Array,
         horizon: Array | None,
+        *,
         states: Array | None = None,
+        conditions: Array | None = None,
     ) -> Trace:
-        """Simulate some segments with a search vector (K,) up to a horizon in samples, or whole."""
+        """Simulate some segments with a search vector (K,) up to a horizon in samples, or whole.
+
+        What surrounds them are (conditions, F) in the units of `units_of`.
+        """
+        surroundings = {}
+        if conditions is not None:
+            units = units_of(self.conditions)
+            surroundings = {
+                name: conditions[row] * units[row] for row, name in enumerate(self.conditions)
+            }
         return fly(
             model.at(coefficients),
             segments,
@@ -71,13 +90,26 @@ class Simulator:
             horizon=horizon,
             limits=self.limits,
             states=states,
+            conditions=surroundings,
         )
+
+    def conditions_in(self, offsets: Array) -> Array | None:
+        """Return what surrounds the segments, (conditions, F), of their rows of a point."""
+        return offsets[len(OFFSETS) :] if self.conditions else None
 
     def compared(
         self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
     ) -> tuple[Trace, dict[str, Array]]:
         """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
-        trace = self.fly(model, data.segments, coefficients, horizon, data.states)
+        conditions = self.conditions_in(data.offsets)
+        trace = self.fly(
+            model,
+            data.segments,
+            coefficients,
+            horizon,
+            states=data.states,
+            conditions=conditions,
+        )
         return trace, self.residuals(data, horizon, trace, data.offsets)
 
     def residuals(
@@ -87,7 +119,7 @@ class Simulator:
         return residuals(
             trace,
             data.segments,
-            offsets * OFFSET_UNIT,
+            offsets[: len(OFFSETS)] * OFFSET_UNIT,
             data.reference_offset,
             rate=float(self.schedule.log_rate),
             horizon=horizon,
@@ -115,7 +147,7 @@ class Simulator:
         scaled = {name: e / data.scale[name] for name, e in errors.items()}
         loss = robust_loss(scaled, huber)
         segments = jnp.shape(data.offsets)[-1]
-        size = len(coefficients) + len(OFFSETS)
+        size = len(coefficients) + len(data.offsets)
         gradient, hessian, states = (
             jnp.zeros((size, segments)),
             jnp.zeros((size, size, segments)),
@@ -144,14 +176,17 @@ class Simulator:
     ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
         """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 
-        An offset does not enter the simulation, so that its column costs an interpolation. Compiled
-        by name, so that all that builds on it is traced only once.
+        An offset does not enter the simulation, so that its column costs an interpolation; what
+        surrounds a flight does. Compiled by name, so that what builds on it is traced only once.
         """
-        offsets = data.offsets
+        offsets = data.offsets[: len(OFFSETS)]
         trace, moved = _jacobian_forward(
-            lambda vector, starts: self.fly(model, data.segments, vector, horizon, starts),
+            lambda vector, states, conditions: self.fly(
+                model, data.segments, vector, horizon, states=states, conditions=conditions
+            ),
             coefficients,
             data.states,
+            self.conditions_in(data.offsets),
         )
 
         def compare(flown: Trace, late: Array) -> dict[str, Array]:
@@ -173,20 +208,33 @@ class Simulator:
 
 
 def _jacobian_forward(
-    simulate: Callable[[Array, Array | None], Trace], vector: Array, states: Array | None
+    simulate: Callable[[Array, Array | None, Array | None], Trace],
+    vector: Array,
+    states: Array | None,
+    conditions: Array | None,
 ) -> tuple[Trace, Trace]:
-    """Return a simulation and its derivatives, first by a vector (K,), then by starts (L, F).
+    """Return a simulation and its derivatives by a vector (K,), conditions and starts (rows, F).
 
-    All segments' starts move at once: a segment depends on its own alone.
+    All segments' starts, or conditions, move at once: a segment depends on its own alone.
     """
-    basis = jnp.eye(len(vector) + (0 if states is None else len(states)), dtype=vector.dtype)
+    count, rows = len(vector), 0 if conditions is None else len(conditions)
+    basis = jnp.eye(count + rows + (0 if states is None else len(states)), dtype=vector.dtype)
 
     def push(direction: Array) -> tuple[Trace, Trace]:
-        if states is None:
-            flown, moved = jax.jvp(lambda v: simulate(v, None), (vector,), (direction,))
+        if states is None and conditions is None:
+            flown, moved = jax.jvp(lambda v: simulate(v, None, None), (vector,), (direction,))
             return flown, moved
-        turned = direction[len(vector) :, None] * jnp.ones_like(states)
-        flown, moved = jax.jvp(simulate, (vector, states), (direction[: len(vector)], turned))
+
+        def turned(values: Array | None, first: int) -> Array | None:
+            if values is None:
+                return None
+            return direction[first : first + len(values), None] * jnp.ones_like(values)
+
+        flown, moved = jax.jvp(
+            simulate,
+            (vector, states, conditions),
+            (direction[:count], turned(states, count + rows), turned(conditions, count)),
+        )
         return flown, moved
 
     pushed: tuple[Trace, Trace] = jax.vmap(push, out_axes=(None, 0))(basis)

@@ -136,8 +136,10 @@ def _offsets_that_matter(stage: Stage, progress: Progress) -> tuple[Point, NDArr
     if not stage.prunes:
         return points, np.ones(points.offsets.shape[1:], bool)
     best = int(np.argmin(progress.losses))
-    kept = np.abs(points.offsets[best]) * OFFSET_UNIT >= NO_OFFSET[:, None]
-    return Point(points.coefficients, points.offsets * kept), np.asarray(kept)
+    kept = np.ones(points.offsets.shape[1:], bool)  # what surrounds a flight is no clock
+    offsets = np.asarray(points.offsets[best])[: len(NO_OFFSET)]
+    kept[: len(NO_OFFSET)] = np.abs(offsets) * OFFSET_UNIT >= NO_OFFSET[:, None]
+    return Point(points.coefficients, points.offsets * kept), kept
 
 
 def _advanced(problem: StageProblem, progress: Progress, iterate: Iterate) -> Progress:

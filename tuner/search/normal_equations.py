@@ -27,12 +27,9 @@ from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 
-from tuner.coefficients import of_scope
 from tuner.coefficients.space import Coordinates, Space
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
 
-(OFFSET_SD,) = {row.prior_sd / OFFSET_UNIT for row in of_scope("flight").values()}
-"""Prior standard deviation of an offset, in its unit of 10 ms or 0.01 rad/s."""
 RIDGE = 1e-13
 """Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""
 

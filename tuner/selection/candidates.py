@@ -8,7 +8,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 
-from tuner.coefficients import COEFFICIENTS, term_groups
+from tuner.coefficients import COEFFICIENTS, conditions, term_groups
 from tuner.coefficients.space import Space, extended
 from tuner.config import JobFile, VehicleFile, values_of
 from tuner.objective.criterion import Point
@@ -31,12 +31,16 @@ def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups
 
 
 def groups_named(terms: Sequence[str], space: Space) -> Groups:
-    """Return the groups, or coefficients, that a job file names and that are not free yet."""
+    """Return the groups, or coefficients, that a job file names and that are not free yet.
+
+    What surrounds a flight is none of them: it is estimated from the start of the search on.
+    """
     groups = term_groups()
     named: dict[str, tuple[str, ...]] = {}
-    taken = set(space.free)
+    taken = {*space.free, *conditions()}
     for term in terms:
-        names = tuple(name for name in groups.get(term, (term,)) if name not in taken)
+        members = groups.get(term, (term,) if term in COEFFICIENTS else ())
+        names = tuple(name for name in members if name not in taken)
         if names:
             named[term] = names
             taken.update(names)

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.criterion import Criterion, Jacobian, Point
+from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
-from tuner.search.normal_equations import OFFSET_SD
 
 Array = NDArray[np.float64]
 

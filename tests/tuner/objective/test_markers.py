@@ -1,6 +1,5 @@
 """Markers beside the centre of mass and off its axes: recorded so, mapped back, and estimated."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -19,8 +18,6 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.coefficients import COEFFICIENTS
-from tuner.exporters import targets
-from tuner.exporters.target import registered
 from tuner.coefficients.coefficient import NotCarried
 from tuner.model import model_of
 from tuner.objective.criterion import Point

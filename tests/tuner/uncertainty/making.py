@@ -120,6 +120,7 @@ def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
         objective.segments,
         point.coefficients,
         jnp.asarray(objective.samples),
+        conditions=objective.simulator.conditions_in(jnp.asarray(point.offsets)),
     )
     return {name: np.asarray(series) for name, series in trace.channels.items()}
 
