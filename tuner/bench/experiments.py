@@ -12,10 +12,13 @@ import numpy as np
 
 from tuner.bench.bifilar import bifilar
 from tuner.bench.columns import open_table, read_columns
+from tuner.bench.flown import attitude_of, is_table, steady_flight
 from tuner.bench.hovers import hover_weights, yaw_spin
 from tuner.bench.laws import GRAVITY
 from tuner.bench.measurement import Array, Measurement
 from tuner.bench.plan import (
+    FASTEST_SPIN,
+    SLOWEST_SPIN,
     Bifilar,
     Experiment,
     HoverWeights,
@@ -89,17 +92,10 @@ def measure(  # noqa: PLR0911 (one return a kind)
         case StepResponse():
             path, samples = _read(folder, experiment.recording, ("command", "rotor_speed"))
             return step_response(name, path, samples)
-        case HoverWeights(mass_error=mass_error, rotor_speed_error=speed_error):
-            hovers = [(point.mass, point.rotor_speed) for point in experiment.points]
-            return hover_weights(
-                name,
-                hovers,
-                rotors=len(vehicle.rotors),
-                mass_error=mass_error,
-                rotor_speed_error=speed_error,
-            )
+        case HoverWeights():
+            return _hover_weights(name, experiment, vehicle, folder)
         case YawSpin():
-            return _yaw_spin(name, experiment, vehicle)
+            return _yaw_spin(name, experiment, vehicle, folder)
         case Propeller():
             return _propeller(name, experiment, folder)
 
@@ -119,7 +115,11 @@ def _read(
 
 def _bifilar(name: str, given: Bifilar, vehicle: VehicleFile, folder: Path) -> Measurement:
     path = folder / Path(given.recording).expanduser()
-    if "qw" in open_table(path).columns:
+    if not is_table(path):
+        time, quaternion = attitude_of(path)
+        angle = angle_of_attitude(str(path), quaternion, given.axis)
+        samples = {"time": time, "angle": angle}
+    elif "qw" in open_table(path).columns:
         samples = read_columns(path, ATTITUDE)
         quaternion = np.column_stack([samples.pop(part) for part in ATTITUDE])
         samples["angle"] = angle_of_attitude(str(path), quaternion, given.axis)
@@ -165,17 +165,56 @@ def _thrust_stand(name: str, given: ThrustStand, vehicle: VehicleFile, folder: P
     return measurement
 
 
-def _yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile) -> Measurement:
+def _hover_weights(
+    name: str, given: HoverWeights, vehicle: VehicleFile, folder: Path
+) -> Measurement:
+    hovers, curves = [], []
+    for point in given.points:
+        speed = point.rotor_speed
+        if point.recording is not None:
+            flight = steady_flight(folder / Path(point.recording).expanduser())
+            # thrust goes with the square
+            speed = float(np.sqrt(np.mean(flight.rotor_speed**2)))
+            curves.append(flight.curve)
+        assert speed is not None
+        hovers.append((point.mass, speed))
+    measurement = hover_weights(
+        name,
+        hovers,
+        rotors=len(vehicle.rotors),
+        mass_error=given.mass_error,
+        rotor_speed_error=given.rotor_speed_error,
+    )
+    return replace(measurement, curves=(*measurement.curves, *curves))
+
+
+def _yaw_spin(name: str, given: YawSpin, vehicle: VehicleFile, folder: Path) -> Measurement:
     if not vehicle.is_quad:
         raise ConfigError(name, "needs a vehicle of four rotors", "leave it out")
-    return yaw_spin(
+    spins: list[tuple[float, float, float | None]] = []
+    curves = []
+    for point in given.points:
+        if point.recording is None:
+            assert point.yaw_rate is not None
+            assert point.rotor_speed_slow is not None
+            spins.append((point.yaw_rate, point.rotor_speed_slow, point.rotor_speed_fast))
+            continue
+        path = folder / Path(point.recording).expanduser()
+        flight = steady_flight(path)
+        if not SLOWEST_SPIN <= abs(flight.yaw_rate) <= FASTEST_SPIN:
+            raise RecordingError(path, "does not yaw, or has no body rate", "spin it steadily")
+        pairs = sorted((flight.rotor_speed[:2].mean(), flight.rotor_speed[2:].mean()))
+        spins.append((flight.yaw_rate, float(pairs[0]), float(pairs[1])))
+        curves.append(flight.curve)
+    measurement = yaw_spin(
         name,
-        [(p.yaw_rate, p.rotor_speed_slow, p.rotor_speed_fast) for p in given.points],
+        spins,
         mass=vehicle.mass,
         radius=rotor_radius(vehicle),
         motor_constant=vehicle.aerodynamics.motor_constant,
         rotor_speed_error=given.rotor_speed_error,
     )
+    return replace(measurement, curves=(*measurement.curves, *curves))
 
 
 def _propeller(name: str, given: Propeller, folder: Path) -> Measurement:

@@ -18,6 +18,8 @@ Length = Annotated[Number, Ge(0.005), Le(20)]
 """m."""
 RotorCount = Annotated[Whole, Ge(1), Le(8)]
 Text = Annotated[str, Len(1, 1000)]
+SLOWEST_SPIN, FASTEST_SPIN = 0.2, 50.0
+"""rad/s of yaw within which a spin says something."""
 
 
 class Bifilar(Section):
@@ -94,10 +96,17 @@ class StepResponse(Section):
 
 
 class HoverPoint(Section):
-    """A steady hover: what was carried, kg, and the rotors' mean speed, rad/s."""
+    """A steady hover: what was carried, kg, and the rotors' mean speed, rad/s, or a recording."""
 
     mass: Mass
-    rotor_speed: RotorSpeed
+    rotor_speed: RotorSpeed | None = None
+    recording: Text | None = None
+
+    @model_validator(mode="after")
+    def _has_one_source(self) -> Self:
+        if (self.rotor_speed is None) == (self.recording is None):
+            raise ValueError("Input should have either rotor_speed or recording")
+        return self
 
 
 class HoverWeights(Section):
@@ -120,16 +129,22 @@ class HoverWeights(Section):
 class SpinPoint(Section):
     """A steady level spin: yaw rate and rotor speeds of both pairs, rad/s.
 
-    Without ``rotor_speed_fast`` the fast pair follows from the weight.
+    Without ``rotor_speed_fast`` the fast pair follows from the weight. A ``recording`` has all.
     """
 
-    yaw_rate: Number
-    rotor_speed_slow: RotorSpeed
+    yaw_rate: Number | None = None
+    rotor_speed_slow: RotorSpeed | None = None
     rotor_speed_fast: RotorSpeed | None = None
+    recording: Text | None = None
 
     @model_validator(mode="after")
-    def _turns(self) -> Self:
-        if not 0.2 <= abs(self.yaw_rate) <= 50:
+    def _has_one_source(self) -> Self:
+        numbers = (self.yaw_rate, self.rotor_speed_slow)
+        if self.recording is None and None in numbers:
+            raise ValueError("Input should have yaw_rate and rotor_speed_slow, or recording")
+        if self.recording is not None and (*numbers, self.rotor_speed_fast) != (None,) * 3:
+            raise ValueError("Input should have numbers or recording, not both")
+        if self.yaw_rate is not None and not SLOWEST_SPIN <= abs(self.yaw_rate) <= FASTEST_SPIN:
             raise ValueError("Input should have a yaw_rate of 0.2 to 50 rad/s")
         return self
 

@@ -178,3 +178,46 @@ def test_a_conflict_is_named_in_the_result(tmp_path, capsys):
     assert "standard errors from what all other experiments say" in capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "result.json").read_text())
     assert {f["subject"] for f in written["findings"]} == {"thrust_stand", "hover_weights"}
+
+
+def flown(path, speeds, yaw_rate, seconds=20.0):
+    """Write a flight as a table: a start, a steady part, a landing."""
+    random = np.random.default_rng(0)
+    time = np.arange(0, seconds, 0.02)
+    throttle = np.clip(np.minimum(time, seconds - time) / 2.0, 0.1, 1.0)
+    columns = {"time": time, "x": 0 * time, "y": 0 * time, "z": 1 + 0 * time}
+    half = 0.5 * yaw_rate * time
+    columns |= {"qw": np.cos(half), "qx": 0 * time, "qy": 0 * time, "qz": np.sin(half)}
+    columns |= {"wx": 0 * time, "wy": 0 * time, "wz": yaw_rate + 0 * time}
+    for rotor, speed in enumerate(speeds):
+        series = speed * throttle + random.normal(0, 2.0, len(time))
+        columns[f"rotor_speed_{rotor + 1}"] = series
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, delimiter=",", header=",".join(columns), comments="")
+
+
+def test_hovers_and_spins_are_taken_from_recordings(tmp_path):
+    flown(tmp_path / "hover.csv", (616, 616, 616, 616), 0.0)
+    flown(tmp_path / "spin.csv", (599, 599, 632, 632), 2.0)
+    hover = HOVER | {"points": [{"mass": 2.243, "recording": "hover.csv"}]}
+    spin = SPIN | {"points": [{"recording": "spin.csv"}]}
+    assert run(tmp_path, {"experiments": [hover, spin]}, "--out", str(tmp_path / "out")) == 0
+    best = {n: c.best for n, c in read_run(tmp_path / "out").result.coefficients.items()}
+    assert best["motor_constant"] == pytest.approx(1.45e-5, rel=0.005)
+    ratio = best["rotor_drag_coefficient"] / (best["moment_constant"] * best["motor_constant"])
+    assert ratio == pytest.approx(33.0 / (2.0 * 0.0625), rel=0.02)
+    assert "Steady part of hover.csv" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("points", "expected"),
+    [
+        ([{"mass": 2.2}], "either rotor_speed or recording"),
+        ([{"mass": 2.2, "recording": "gone.csv"}], "does not exist"),
+        ([{"mass": 2.2, "recording": "short.csv"}], "is nowhere steady for 3 s"),
+    ],
+)
+def test_a_hover_that_is_none_is_one_line(tmp_path, capsys, points, expected):
+    flown(tmp_path / "short.csv", (616, 616, 616, 616), 0.0, seconds=5.0)
+    assert run(tmp_path, {"experiments": [HOVER | {"points": points}]}) == 2
+    assert expected in capsys.readouterr().err
