@@ -50,6 +50,7 @@ def fit(
     seed: int | None = None,
     topics: Named | None = None,
     namespace: str | None = None,
+    bench: Named | None = None,
     out: Named | None = None,
     resume: bool = False,
     force: bool = False,
@@ -77,6 +78,8 @@ def fit(
         Of the search.
     topics, namespace
         As of `load_flight`.
+    bench
+        Result folder of ``tune bench``: the search starts from its vehicle, with its prior.
     out
         Result folder; None makes one under ``runs/``.
     resume
@@ -112,6 +115,7 @@ def fit(
         seed=seed,
         topics=topics,
         namespace=namespace,
+        bench=None if bench is None else str(bench),
     )
     folder, _ = run(
         options,
