@@ -42,6 +42,8 @@ class Airframe:
         rad/s per V, unloaded; None if not known.
     hover_throttle
         Command in hover, 0..1; None if not known.
+    rotor_height
+        m of the rotors above the centre of mass.
     """
 
     mass: float
@@ -51,6 +53,7 @@ class Airframe:
     cells: int | None = None
     motor_kv: float | None = None
     hover_throttle: float | None = None
+    rotor_height: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Estimate:
 
 
 KNOWN: Mapping[str, Airframe] = {
-    "hovergames": Airframe(2.243, 0.5, 11 * INCH, 4.7 * INCH, 4, 920 * math.pi / 30, 0.54),
+    "hovergames": Airframe(2.243, 0.5, 11 * INCH, 4.7 * INCH, 4, 920 * math.pi / 30, 0.54, 0.06),
     "crazyflie": Airframe(0.030, 0.092, 1.85 * INCH, 1.0 * INCH, 1, 14000 * math.pi / 30, 0.86),
 }
 """Vehicles whose coefficients are known, by the name of their shipped file."""

@@ -83,11 +83,12 @@ def test_bad_input_is_one_line_and_nothing_is_asked(
 
 def test_a_terminal_is_asked_for_what_was_not_given(tmp_path, monkeypatch, capsys):
     answers = {"Mass": "2.243", "Distance": "0.5", "Cells": "", "kV": "", "Throttle": "0.54"}
-    answers["Propeller"] = "11x4.7"
+    answers |= {"Propeller": "11x4.7", "Height": "0.06"}
     monkeypatch.setattr("builtins.input", lambda question: answers[question.split()[0].strip(",")])
     monkeypatch.setattr("sys.stdin.isatty", lambda: True)
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     out = tmp_path / "quad.yaml"
     assert main(["new-vehicle", "--out", str(out)]) == 0
     assert read_vehicle(out).mass == 2.243
+    assert {rotor.position[2] for rotor in read_vehicle(out).rotors} == {0.06}
     assert "written to" in capsys.readouterr().out

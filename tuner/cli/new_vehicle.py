@@ -23,6 +23,7 @@ RANGES = {
     "--cells": (1.0, 24.0, "cells"),
     "--motor-kv": (30.0, 40000.0, "rpm/V"),
     "--hover-throttle": (0.05, 0.95, "of full command"),
+    "--rotor-height": (-1.0, 1.0, "m"),
 }
 QUESTIONS = {
     "--mass": "Mass, ready to fly [kg]: ",
@@ -30,6 +31,7 @@ QUESTIONS = {
     "--cells": "Cells of the battery in series (empty if not known): ",
     "--motor-kv": "kV of the motors [rpm/V] (empty if not known): ",
     "--hover-throttle": "Throttle in hover, 0 to 1 (empty if not known): ",
+    "--rotor-height": "Height of the rotors above the centre of mass [m] (empty: 0): ",
 }
 
 
@@ -43,6 +45,7 @@ def new_vehicle(
     cells: int | None = None,
     motor_kv: Annotated[float | None, Parameter(name="--motor-kv")] = None,
     hover_throttle: float | None = None,
+    rotor_height: float | None = None,
     like: Literal["hovergames", "crazyflie"] | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -68,6 +71,8 @@ def new_vehicle(
         Speed per voltage, unloaded, rpm/V.
     hover_throttle
         Command in hover, 0 to 1, from any log.
+    rotor_height
+        Of the rotors above the centre of mass, m. Default: 0.
     like
         Scale from this known vehicle, and take from it what is not given.
     """
@@ -80,7 +85,8 @@ def new_vehicle(
         raise InputError("--layout", "the simulated mixer is that of the X", remedy)
     asking = like is None and sys.stdin.isatty() and sys.stdout.isatty()
     given = {"--mass": mass, "--wheelbase": wheelbase, "--cells": cells,
-             "--motor-kv": motor_kv, "--hover-throttle": hover_throttle}  # fmt: skip
+             "--motor-kv": motor_kv, "--hover-throttle": hover_throttle,
+             "--rotor-height": rotor_height}  # fmt: skip
     if asking:
         for option, question in QUESTIONS.items():
             if given[option] is None:
@@ -127,6 +133,7 @@ def _airframe(
         cells=None if cell_count is None else int(cell_count),
         motor_kv=kv * math.pi / 30 if kv is not None else drive.motor_kv if drive else None,
         hover_throttle=numbers.get("--hover-throttle", drive.hover_throttle if drive else None),
+        rotor_height=numbers.get("--rotor-height", known.rotor_height if known else 0.0),
     )
 
 

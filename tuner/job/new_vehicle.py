@@ -68,7 +68,7 @@ def _vehicle(
 ) -> VehicleFile:
     side = airframe.wheelbase / 2 / math.sqrt(2)
     rotors = [
-        {"position": [round(x * side, 5), round(y * side, 5), 0.0], "spin": spin}
+        {"position": [round(x * side, 5), round(y * side, 5), airframe.rotor_height], "spin": spin}
         for (x, y), spin in zip(SIDES, SPINS, strict=True)
     ]
     full = estimates["input_scaling"].value + estimates["zero_position_armed"].value
