@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -74,8 +73,14 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
     effects = {row.name: values[row.name] for row in rows if row.is_effect}
     if not effects:
         return changed
-    vehicle = replace(changed.vehicle, effects=changed.vehicle.effects | effects)
-    return replace(changed, vehicle=vehicle)
+    before = changed.vehicle.effects
+    with_effects: Model = eqx.tree_at(
+        lambda tree: tree.vehicle.effects,
+        changed,
+        before | effects,
+        is_leaf=lambda node: node is before,
+    )
+    return with_effects
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:
