@@ -17,29 +17,36 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from tuner.coefficients import COEFFICIENTS
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
+from tuner.model import with_coefficients
 from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
+from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.selection.candidates import (
     Groups,
     candidate_groups,
-    columns_of,
     groups_named,
     start_of,
     with_terms,
 )
 from tuner.selection.linear import Linear, linear_at
-from tuner.selection.score import Score, best_first, score
+from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.wording.phrases import listed
 
-MAX_ROUNDS = 6
-"""Of additions; each round adds all that one linear forward selection finds."""
-FAR = 0.2
-"""Of the round's first gain: groups that gain less wait until the fit is closer."""
+MAX_ROUNDS = 4
+"""Of additions; each round adds all that gain by more than chance, and prunes."""
+FILLED_UP_TO = 8
+"""A space is filled up to a multiple of so many coefficients, so that programs are shared."""
+WORTH_FITTING = (
+    SelectionCode.PREDICTS_FLIGHTS,
+    SelectionCode.PREDICTS_SECTIONS,
+    SelectionCode.NOT_PREDICTED,
+)
 LONGEST_STEP = 1.0
 """Standard deviations of a prior that a coefficient may move when a flight is left out."""
 
@@ -139,56 +146,32 @@ class _State:
 
     Attributes
     ----------
-    job, fitted
-        The fit.
+    fitted
+        The fit; coefficients that only fill its space up stay at their neutral values.
     added
         Groups in it.
     linear
-        The loss about it, by its coefficients and, at their neutral values, all other candidates.
-    model, columns
-        Columns of ``linear``: of its coefficients, and of each candidate group.
+        The loss about it, by the base model's coefficients and all candidates.
     """
 
-    job: Job
     fitted: Fitted
     added: Groups
     linear: Linear
-    model: NDArray[np.intp]
-    columns: Mapping[str, NDArray[np.intp]]
 
-    def predictions(self, scale: Mapping[str, Array]) -> NDArray[np.float64]:
-        """Return the loss (N,) of each flight with the coefficients that the others ask for.
-
-        One linear step leads from the joint fit to the fit without the flight; there the flight is
-        simulated. Its own offsets follow.
-
-        Parameters
-        ----------
-        scale
-            Channel -> (N,) factor on the standard deviations.
-        """
-        objective, fitted = self.fitted.objective, self.fitted
-        criterion = _with_scale(fitted.criterion, scale)
-        space, flight = objective.space, np.asarray(objective.segments.flight)
-        movable, losses = _offsets_fitted(fitted), []
-        for number in range(objective.flights):
-            change = self.linear.step(self.model, inside=self.linear.flight != number)
-            far = LONGEST_STEP * space.prior_sd
-            scaled = self.linear.scaled[self.model] + np.clip(change[self.model], -far, far)
-            vector = space.at_share((scaled - space.lower) / space.width)
-            point = Point(jnp.asarray(vector), fitted.point.offsets)
-            sums = objective.sums(point, criterion)
-            inside = flight == number
-            losses.append(
-                float(np.asarray(sums.loss)[inside].sum())
-                - _gain_of_offsets(sums, inside, len(space), movable[:, number])
-            )
-        return np.array(losses)
+    @property
+    def vector(self) -> dict[str, float]:
+        """Coefficient -> number of the search vector."""
+        names, numbers = self.fitted.objective.space.names, self.fitted.point.coefficients
+        return dict(zip(names, np.asarray(numbers).tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class _Selection:
-    """A forward selection over some groups."""
+    """A forward selection over some groups, each round pruned backwards.
+
+    Base model and all candidates make up one space, and all terms are computed whichever are in
+    the model: fits with different terms then share their compiled programs.
+    """
 
     job: Job
     fitted: Fitted
@@ -197,102 +180,164 @@ class _Selection:
     on_message: Callable[[str], None]
 
     def run(self) -> Selected:
-        """Add groups until none earns its place, then take away those that no longer do."""
-        state, dropped = self._seen(self.job, self.fitted, {}), dict[str, SelectionCode]()
+        """Add groups until none earns its place."""
+        state = self._seen(self.fitted, {})
+        dropped: dict[str, SelectionCode] = {}
         for _ in range(MAX_ROUNDS):
-            chosen = self._chosen(state, dropped)
-            if not chosen:
+            wanted = self._wanted(state, dropped)
+            if not wanted:
                 break
-            state = self._grown(state, chosen, dropped)
-        for _ in range(MAX_ROUNDS):
-            scores = self._scores_inside(state)
-            idle = [name for name, found in scores.items() if not found.earns_place]
-            if not idle:
+            grown = self._grown(state, wanted, dropped)
+            if grown is None:
+                continue
+            if set(grown.added) <= set(state.added):
                 break
-            least = min(idle, key=lambda name: scores[name].gain_holdout)
-            dropped[least] = scores[least].reason
-            kept = {name: names for name, names in state.added.items() if name != least}
-            state = self._refitted(state, kept)
-        return Selected(state.job, state.fitted, self._rows(state, dropped))
-
-    def _chosen(self, state: _State, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
-        """Return the groups that a linear forward selection adds, those of large gain."""
-        left = {
-            name: columns
-            for name, columns in state.columns.items()
-            if name not in state.added and name not in dropped
-        }
-        chosen = best_first(state.linear, state.model, left, candidates=len(self.candidates))
-        most = max((found.gain_holdout for found in chosen.values()), default=0.0)
-        return {name: found for name, found in chosen.items() if found.gain_holdout > FAR * most}
-
-    def _grown(
-        self, state: _State, chosen: Mapping[str, Score], dropped: dict[str, SelectionCode]
-    ) -> _State:
-        """Return the state with groups added that predict flights left out, once refitted."""
-        best = max(chosen, key=lambda name: chosen[name].gain_holdout)
-        for names in dict.fromkeys([tuple(chosen), (best,)]):
-            self.on_message(f"Fitting again with {listed(names)}.")
-            trial = self._refitted(state, {**state.added, **{n: self.candidates[n] for n in names}})
-            by_flight = chosen[best].reason is SelectionCode.PREDICTS_FLIGHTS
-            if _predicts_better(trial, state, by_flight=by_flight):
-                return trial
-        dropped[best] = SelectionCode.WORSE_AFTER_REFIT
-        return state
-
-    def _refitted(self, state: _State, groups: Groups) -> _State:
-        """Return the fit with exactly these groups, from where the last one ended."""
-        names = [name for names in groups.values() for name in names]
-        job, fitted = _extended(self.job, self.fitted, names)
-        before = dict(
-            zip(state.job.space.names, np.asarray(state.fitted.point.coefficients), strict=True)
-        )
-        start = np.asarray(fitted.point.coefficients)
-        vector = [before.get(name, start[i]) for i, name in enumerate(job.space.names)]
+            state = grown
+        job, fitted = _extended(self.job, self.fitted, _names(state.added))
+        vector = [state.vector[name] for name in job.space.names]
         fitted = replace(
             state.fitted,
             objective=fitted.objective,
             outcomes=fitted.outcomes,
             point=Point(jnp.asarray(vector), state.fitted.point.offsets),
         )
-        new = [name for name in groups if name not in state.added]
-        title = f"with {', '.join(new)}" if new else "with fewer terms"
-        fitted = _polished(job, fitted, title, self.on_progress)
-        return self._seen(job, fitted, groups)
+        return Selected(job, fitted if state.added else self.fitted, self._rows(state, dropped))
 
-    def _seen(self, job: Job, fitted: Fitted, added: Groups) -> _State:
-        """Return a fit as all candidates see it."""
-        names = [
-            name for group, names in self.candidates.items() if group not in added for name in names
-        ]
-        objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
-        return _State(
-            job=job,
-            fitted=fitted,
-            added=added,
-            linear=linear_at(
-                objective, point, fitted.criterion, offsets_fitted=_offsets_fitted(fitted)
-            ),
-            model=np.arange(len(job.space)),
-            columns={
-                group: columns_of(objective.space, names)
-                for group, names in self.candidates.items()
-            },
+    def _wanted(self, state: _State, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
+        """Return the groups to fit next: all that gain by more than chance, if one predicts.
+
+        As long as terms are missing, those that are there stand in for them and even what is true
+        may seem not to predict; fitted with all others, each has to.
+        """
+        scores = {
+            group: found
+            for group, found in self._scores_outside(state).items()
+            if group not in dropped and found.reason in WORTH_FITTING
+        }
+        return scores if any(found.earns_place for found in scores.values()) else {}
+
+    def _grown(
+        self, state: _State, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
+    ) -> _State | None:
+        """Return the fit with the groups that hold their places in it, if it predicts better."""
+        best = max(wanted, key=lambda name: wanted[name].gain_holdout)
+        for names in dict.fromkeys([tuple(wanted), (best,)]):
+            self.on_message(f"Fitting again with {listed(names)}.")
+            groups = {**state.added, **{name: self.candidates[name] for name in names}}
+            trial = self._pruned(self._refitted(state, groups))
+            by_flight = wanted[best].reason is SelectionCode.PREDICTS_FLIGHTS
+            if trial.added and self._predicts_better(trial, state, by_flight=by_flight):
+                return trial
+        dropped[best] = SelectionCode.WORSE_AFTER_REFIT
+        return None
+
+    def _pruned(self, state: _State) -> _State:
+        """Return the fit without the groups that do not hold their places beside the others."""
+        kept, taken = surviving(
+            state.linear,
+            self._columns(self.job.space.names),
+            {group: self._columns(names) for group, names in state.added.items()},
+            candidates=len(self.candidates),
+            neutral=self._neutral,
         )
+        if not taken or not kept:
+            return state if kept else replace(state, added={})
+        self.on_message(f"Fitting again without {listed(tuple(taken))}.")
+        return self._pruned(self._refitted(state, {name: self.candidates[name] for name in kept}))
+
+    def _refitted(self, state: _State, groups: Groups) -> _State:
+        """Return the fit with exactly these groups, from where the last one ended."""
+        wanted = _names(groups)
+        spare = [name for name in _names(self.candidates) if name not in wanted]
+        free = [*self.job.space.names, *wanted]
+        filled = [*wanted, *spare[: -len(free) % FILLED_UP_TO]]
+        objective, point = with_terms(
+            self._objective, self.fitted.point, filled, self.job.settings.job
+        )
+        start, names = np.asarray(point.coefficients), objective.space.names
+        vector = [
+            state.vector.get(name, start[i]) if name in free else start[i]
+            for i, name in enumerate(names)
+        ]
+        new = [group for group in groups if group not in state.added]
+        fitted = polished(
+            self.job,
+            replace(
+                state.fitted,
+                objective=objective,
+                point=Point(jnp.asarray(vector), state.fitted.point.offsets),
+            ),
+            free=Free(np.array([name in free for name in names]), free_offsets(self.job)),
+            title=f"with {len(new)} terms more" if new else f"with {len(groups)} terms",
+            on_progress=lambda progress: self.on_progress(
+                replace(self.job, space=objective.space), progress
+            ),
+        )
+        return self._seen(fitted, groups)
+
+    def _seen(self, fitted: Fitted, added: Groups) -> _State:
+        """Return a fit as all candidates see it."""
+        objective, point = with_terms(
+            self._objective, self.fitted.point, _names(self.candidates), self.job.settings.job
+        )
+        own = dict(
+            zip(fitted.objective.space.names, np.asarray(fitted.point.coefficients), strict=True)
+        )
+        start = np.asarray(point.coefficients)
+        vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
+        at = Point(jnp.asarray(vector), fitted.point.offsets)
+        offsets_fitted = _offsets_fitted(fitted)
+        return _State(
+            fitted, added, linear_at(objective, at, fitted.criterion, offsets_fitted=offsets_fitted)
+        )
+
+    @property
+    def _objective(self) -> Objective:
+        """The base problem with all candidates in the model, at their neutral values."""
+        objective = self.fitted.objective
+        neutral = start_of(_names(self.candidates))
+        values = {name: jnp.asarray(value) for name, value in neutral.items()}
+        return replace(objective, model=with_coefficients(objective.model, values))
+
+    @property
+    def _space(self) -> tuple[str, ...]:
+        """The coefficients of every `Linear`."""
+        return (*self.job.space.names, *_names(self.candidates))
+
+    @property
+    def _neutral(self) -> NDArray[np.float64]:
+        """Scaled neutral values (K,) of the candidates; zero for the base model's coefficients."""
+        neutral = start_of(_names(self.candidates))
+        scales = [COEFFICIENTS[name].scale for name in neutral]
+        scaled = [
+            np.log(value) if scale == "log" else value
+            for value, scale in zip(neutral.values(), scales, strict=True)
+        ]
+        return np.array([0.0] * len(self.job.space) + scaled)
+
+    def _columns(self, names: Sequence[str]) -> NDArray[np.intp]:
+        return np.array([self._space.index(name) for name in names], np.intp)
+
+    def _scores_outside(self, state: _State) -> dict[str, Score]:
+        """Return what each group that is not in the model is worth beside it."""
+        model = self._columns([*self.job.space.names, *_names(state.added)])
+        return {
+            group: score(state.linear, model, self._columns(names), candidates=len(self.candidates))
+            for group, names in self.candidates.items()
+            if group not in state.added
+        }
 
     def _scores_inside(self, state: _State) -> dict[str, Score]:
         """Return what each group in the model is worth beside the others in it."""
         scores = {}
         for group, names in state.added.items():
-            columns = state.columns[group]
-            neutral = np.zeros(len(state.linear.scaled))
-            neutral[columns] = [
-                state.job.space.parameters[column].scaled(value)
-                for column, value in zip(columns, start_of(names).values(), strict=True)
-            ]
-            rest = np.setdiff1d(state.model, columns)
+            others = _names({g: n for g, n in state.added.items() if g != group})
             scores[group] = score(
-                state.linear, rest, columns, candidates=len(self.candidates), neutral=neutral
+                state.linear,
+                self._columns([*self.job.space.names, *others]),
+                self._columns(names),
+                candidates=len(self.candidates),
+                neutral=self._neutral,
             )
         return scores
 
@@ -300,14 +345,6 @@ class _Selection:
         self, state: _State, dropped: Mapping[str, SelectionCode]
     ) -> tuple[SelectionRow, ...]:
         """Return the table: what is in the model first, by what it predicts."""
-        inside = self._scores_inside(state)
-        beside = {
-            group: score(
-                state.linear, state.model, state.columns[group], candidates=len(self.candidates)
-            )
-            for group in self.candidates
-            if group not in state.added
-        }
         rows = [
             SelectionRow(
                 group=group,
@@ -316,25 +353,64 @@ class _Selection:
                 gain_holdout=found.gain_holdout,
                 scatter=found.scatter,
                 kept=group in state.added,
-                reason=dropped.get(group, found.reason),
+                reason=found.reason if group in state.added else dropped.get(group, found.reason),
             )
-            for group, found in {**inside, **beside}.items()
+            for group, found in {
+                **self._scores_inside(state),
+                **self._scores_outside(state),
+            }.items()
         ]
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
 
+    def _predicts_better(self, trial: _State, state: _State, *, by_flight: bool) -> bool:
+        """Return whether a refit predicts flights left out better than the fit before it.
 
-def _predicts_better(trial: _State, state: _State, *, by_flight: bool) -> bool:
-    """Return whether a refit predicts flights left out better than the fit before it.
+        By more than the standard error over the flights, or, where only sections of flights can
+        show it, not worse by as much.
+        """
+        scale = state.fitted.criterion.scale
+        gains = self._predictions(state, scale) - self._predictions(trial, scale)
+        if len(gains) < 2:
+            return bool(gains.sum() > 0.0)
+        scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
+        return bool(gains.sum() > (scatter if by_flight else -scatter))
 
-    By more than the standard error over the flights, or, where only sections of flights can show
-    it, not worse by as much.
-    """
-    scale = state.fitted.criterion.scale
-    gains = state.predictions(scale) - trial.predictions(scale)
-    if len(gains) < 2:
-        return bool(gains.sum() > 0.0)
-    scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
-    return bool(gains.sum() > (scatter if by_flight else -scatter))
+    def _predictions(self, state: _State, scale: Mapping[str, Array]) -> NDArray[np.float64]:
+        """Return the loss (N,) of each flight with the coefficients that the others ask for.
+
+        One linear step leads from the joint fit to the fit without the flight; there the flight is
+        simulated. Its own offsets follow.
+
+        Parameters
+        ----------
+        state
+            The joint fit.
+        scale
+            Channel -> (N,) factor on the standard deviations.
+        """
+        fitted, linear = state.fitted, state.linear
+        objective, criterion = fitted.objective, _with_scale(fitted.criterion, scale)
+        space, flight = objective.space, np.asarray(objective.segments.flight)
+        model = self._columns([*self.job.space.names, *_names(state.added)])
+        own = self._columns(space.names)
+        movable, losses = _offsets_fitted(fitted), []
+        for number in range(objective.flights):
+            change = linear.step(model, inside=linear.flight != number)[own]
+            far = LONGEST_STEP * space.prior_sd
+            scaled = linear.scaled[own] + np.clip(change, -far, far)
+            vector = space.at_share((scaled - space.lower) / space.width)
+            sums = objective.sums(Point(jnp.asarray(vector), fitted.point.offsets), criterion)
+            inside = flight == number
+            losses.append(
+                float(np.asarray(sums.loss)[inside].sum())
+                - _gain_of_offsets(sums, inside, len(space), movable[:, number])
+            )
+        return np.array(losses)
+
+
+def _names(groups: Groups) -> tuple[str, ...]:
+    """Return the coefficients of some groups."""
+    return tuple(name for names in groups.values() for name in names)
 
 
 def _with_scale(criterion: Criterion, scale: Mapping[str, Array]) -> Criterion:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
-import numpy as np
 
 from tuner.coefficients import COEFFICIENTS, conditions, term_groups
 from tuner.coefficients.space import Space, extended
@@ -70,8 +69,3 @@ def with_terms(
         ),
         point.offsets,
     )
-
-
-def columns_of(space: Space, names: Sequence[str]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Return the numbers of some parameters in a space."""
-    return np.array([space.names.index(name) for name in names], np.intp)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +59,7 @@ def score(
     *,
     candidates: int,
     neutral: NDArray[np.float64] | None = None,
+    gone: Columns | None = None,
 ) -> Score:
     """Return what a group is worth beside a model.
 
@@ -73,22 +74,25 @@ def score(
     candidates
         Among how many groups it was picked: the level of significance is shared by them.
     neutral
-        (K,) scaled neutral values of the group, where the point holds fitted ones; by default the
-        point is at the neutral values.
+        (K,) scaled neutral values, where the point holds fitted ones; by default the group is at
+        its neutral values there.
+    gone
+        Columns of coefficients that go to their neutral values with the group and without it.
     """
-    both = np.concatenate([model, group])
-    without = None
-    if neutral is not None:
-        without = np.zeros(len(linear.scaled))
-        without[group] = (neutral - linear.scaled)[group]
+    columns = (model, np.concatenate([model, group]))
+    to_neutral = np.zeros(len(linear.scaled)) if neutral is None else neutral - linear.scaled
+    begin = np.zeros(len(linear.scaled))
+    if gone is not None:
+        begin[gone] = to_neutral[gone]
+    without = begin.copy()
+    without[group] = to_neutral[group]
     everything = np.ones(len(linear.flight), bool)
-    with_group = linear.step(both, inside=everything)
-    alone = linear.step(model, inside=everything, from_=without)
+    alone, with_group = _steps(linear, columns, (without, begin), everything)
     fit = _Gain.of(linear, alone, with_group, everything)
-    held_out = _held_out(linear, model, both, linear.flight, without)
+    held_out = _held_out(linear, columns, (without, begin), linear.flight)
     reason = SelectionCode.PREDICTS_FLIGHTS
     if not held_out.is_sure and held_out.share > -held_out.scatter:  # no flight contradicts it
-        by_section = _held_out(linear, model, both, linear.section, without)
+        by_section = _held_out(linear, columns, (without, begin), linear.section)
         if by_section.is_sure:
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
     chance = _chance(linear, model, group, (alone, with_group))
@@ -103,31 +107,46 @@ def score(
     return Score(fit.share, held_out.share, held_out.scatter, chance, reason)
 
 
-def best_first(
+def surviving(
     linear: Linear,
     model: Columns,
     groups: Mapping[str, Columns],
     *,
     candidates: int,
-) -> dict[str, Score]:
-    """Return the groups that a linear forward selection adds, in that order, with their scores.
+    neutral: NDArray[np.float64],
+) -> tuple[dict[str, Score], dict[str, Score]]:
+    """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
-    Each is scored beside the model and the groups added before it.
+    The group that predicts least is taken away first, then all others are scored without it.
+
+    Parameters
+    ----------
+    linear, candidates, neutral
+        As of `score`; the point is the fit with all groups.
+    model
+        Columns of the coefficients that stay.
+    groups
+        Group -> columns.
     """
-    added: dict[str, Score] = {}
-    columns, left = model, dict(groups)
-    while left:
-        scores = {
-            name: score(linear, columns, group, candidates=candidates)
-            for name, group in left.items()
-        }
-        worthy = {name: found for name, found in scores.items() if found.earns_place}
-        if not worthy:
-            break
-        best = max(worthy, key=lambda name: worthy[name].gain_holdout)
-        added[best] = worthy[best]
-        columns = np.concatenate([columns, left.pop(best)])
-    return added
+    left, taken = dict(groups), dict[str, Score]()
+    while True:
+        gone = _joined([groups[name] for name in taken])
+        scores = {}
+        for name, columns in left.items():
+            others = _joined([model, *(c for other, c in left.items() if other != name)])
+            scores[name] = score(
+                linear, others, columns, candidates=candidates, neutral=neutral, gone=gone
+            )
+        idle = [name for name, found in scores.items() if not found.earns_place]
+        if not idle:
+            return scores, taken
+        least = min(idle, key=lambda name: scores[name].gain_holdout)
+        taken[least] = scores[least]
+        del left[least]
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    return np.concatenate([np.empty(0, np.intp), *parts])
 
 
 @dataclass(frozen=True)
@@ -168,22 +187,32 @@ class _Gain:
         return self.share > max(SURE * self.scatter, MATERIAL)
 
 
+def _steps(
+    linear: Linear,
+    columns: tuple[Columns, Columns],
+    begin: tuple[NDArray[np.float64], NDArray[np.float64]],
+    inside: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the changes (K,) that fit some stretches, without and with a group."""
+    without, with_group = (
+        linear.step(free, inside=inside, from_=change)
+        for free, change in zip(columns, begin, strict=True)
+    )
+    return without, with_group
+
+
 def _held_out(
     linear: Linear,
-    model: Columns,
-    both: Columns,
+    columns: tuple[Columns, Columns],
+    begin: tuple[NDArray[np.float64], NDArray[np.float64]],
     by: NDArray[np.intp],
-    without: NDArray[np.float64] | None,
 ) -> _Gain:
     """Return the gain in each fold's stretches of linear fits to the other folds' stretches."""
-    folds = []
-    if len(np.unique(by)) > 1:
-        for out in linear.folds(by):
-            alone = linear.step(model, inside=~out, from_=without)
-            with_group = linear.step(both, inside=~out)
-            folds.append(_Gain.of(linear, alone, with_group, out))
-    if not folds:
+    if len(np.unique(by)) < 2:
         return _Gain(np.zeros(len(by)), linear.loss)
+    folds = [
+        _Gain.of(linear, *_steps(linear, columns, begin, ~out), out) for out in linear.folds(by)
+    ]
     return _Gain(
         np.sum([fold.of_stretch for fold in folds], axis=0),
         float(sum(fold.loss_without for fold in folds)),

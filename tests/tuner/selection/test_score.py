@@ -1,10 +1,12 @@
 """What a group is worth, on losses that are quadratic by construction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tuner.selection.linear import Linear
-from tuner.selection.score import best_first, score
+from tuner.selection.score import score, surviving
 from tuner.selection.table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
@@ -41,18 +43,42 @@ def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS):
     )
 
 
-def test_a_term_of_the_truth_earns_its_place_and_the_other_does_not():
-    found = best_first(linear_fit(0.5), MODEL, {"first": FIRST, "second": SECOND}, candidates=2)
-    assert list(found) == ["first"]
-    assert found["first"].reason is SelectionCode.PREDICTS_FLIGHTS
-    assert found["first"].gain_fit == pytest.approx(found["first"].gain_holdout, rel=0.05)
+def moved_to_minimum(linear, free):
+    """Return the same loss about the minimum over some columns."""
+    change = linear.step(free, inside=np.ones(len(linear.flight), bool))
+    return replace(
+        linear,
+        scaled=change,
+        score=linear.score + linear.hessian @ change,
+        pull=linear.pull + linear.prior @ change,
+        loss=linear.loss + linear.change_of_loss(change).sum(),
+    )
+
+
+def test_a_term_of_the_truth_earns_its_place():
+    first = score(linear_fit(0.5), MODEL, FIRST, candidates=2)
+    assert first.reason is SelectionCode.PREDICTS_FLIGHTS
+    assert first.gain_fit == pytest.approx(first.gain_holdout, rel=0.05)
 
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("correlated", [False, True])
 def test_noise_buys_no_term_even_where_it_is_correlated_in_time(seed, correlated):
     linear = linear_fit(0.0, seed=seed, correlated=correlated)
-    assert not best_first(linear, MODEL, {"first": FIRST, "second": SECOND}, candidates=2)
+    for group in (FIRST, SECOND):
+        assert not score(linear, MODEL, group, candidates=2).earns_place
+
+
+def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both():
+    linear = moved_to_minimum(linear_fit(0.5), np.concatenate([MODEL, FIRST, SECOND]))
+    kept, taken = surviving(
+        linear,
+        MODEL,
+        {"first": FIRST, "second": SECOND},
+        candidates=2,
+        neutral=np.zeros(4),
+    )
+    assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
 def test_what_the_flights_disagree_about_lowers_the_loss_and_is_not_added():
@@ -75,19 +101,7 @@ def test_a_term_that_a_coefficient_of_the_model_copies_is_not_distinguished():
 def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     before = linear_fit(0.5)
     added = score(before, MODEL, FIRST, candidates=1)
-    everything = np.ones(len(before.flight), bool)
-    both = np.concatenate([MODEL, FIRST])
-    change = before.step(both, inside=everything)
-    after = Linear(
-        scaled=change,
-        hessian=before.hessian,
-        score=before.score + before.hessian @ change,
-        prior=before.prior,
-        pull=before.pull + before.prior @ change,
-        flight=before.flight,
-        section=before.section,
-        loss=before.loss + before.change_of_loss(change).sum(),
-    )
+    after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
     inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
     assert inside.gain_fit == pytest.approx(added.gain_fit, rel=1e-6)
     assert inside.gain_holdout == pytest.approx(added.gain_holdout, rel=1e-6)
