@@ -1,9 +1,9 @@
 """Which terms beyond the base model a job's fit holds, and the fit with them.
 
-Forward selection: one Jacobian scores all candidate groups at the fitted point, those that predict
-what is left out of the fit are added, all is fitted again, and each flight is predicted by a fit to
-the others; groups that do not lower that loss by more than its scatter are dropped. At the end each
-group in the model has to earn its place beside the others once more.
+One Jacobian scores all candidate groups at the fitted point. If one of them predicts what is left
+out of the fit, all that gain by more than chance are fitted together; backward elimination takes
+away those that do not hold their places beside the others. The rest stays if each flight, predicted
+by a fit to the others, is then met better by more than the scatter.
 """
 
 from __future__ import annotations
