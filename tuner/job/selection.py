@@ -18,6 +18,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.job.extension import extended, refitted_with
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
@@ -97,47 +98,12 @@ def _as_named(
     if not groups:
         return Selected(job, fitted)
     on_message(f"Fitting again with {listed(tuple(groups))}, which the job file names.")
-    job, fitted = _refitted(job, fitted, groups, on_progress)
+    job, fitted = refitted_with(job, fitted, groups, on_progress)
     rows = tuple(
         SelectionRow(group=group, names=names, kept=True, reason=SelectionCode.ASKED_FOR)
         for group, names in groups.items()
     )
     return Selected(job, fitted, rows)
-
-
-def _refitted(
-    job: Job, fitted: Fitted, groups: Groups, on_progress: OnProgress
-) -> tuple[Job, Fitted]:
-    """Return job and fit with groups freed from their neutral values on, and all polished."""
-    job, fitted = _extended(job, fitted, [name for names in groups.values() for name in names])
-    return job, _polished(job, fitted, f"with {', '.join(groups)}", on_progress)
-
-
-def _extended(job: Job, fitted: Fitted, names: Sequence[str]) -> tuple[Job, Fitted]:
-    """Return job and fit with some coefficients free, at their neutral values."""
-    objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
-    added = np.asarray(point.coefficients)[len(job.space) :]
-    outcomes = tuple(
-        replace(
-            outcome,
-            vector=np.concatenate([outcome.vector, added]),
-            start=np.concatenate([outcome.start, added]),
-        )
-        for outcome in fitted.outcomes
-    )
-    return (
-        replace(
-            job, space=objective.space, objective=replace(job.objective, space=objective.space)
-        ),
-        replace(fitted, objective=objective, point=point, outcomes=outcomes),
-    )
-
-
-def _polished(job: Job, fitted: Fitted, title: str, on_progress: OnProgress) -> Fitted:
-    free = Free(np.ones(len(job.space), bool), free_offsets(job))
-    return polished(
-        job, fitted, free=free, title=title, on_progress=lambda progress: on_progress(job, progress)
-    )
 
 
 @dataclass(frozen=True)
@@ -193,7 +159,7 @@ class _Selection:
             if set(grown.added) <= set(state.added):
                 break
             state = grown
-        job, fitted = _extended(self.job, self.fitted, _names(state.added))
+        job, fitted = extended(self.job, self.fitted, _names(state.added))
         vector = [state.vector[name] for name in job.space.names]
         fitted = replace(
             state.fitted,
