@@ -106,10 +106,10 @@ def test_order_of_each_step_under_a_moment(advance: Step, order: int) -> None:
         return Wrench(vec(0.0, 0.0, 20.0), vec(0.0, 0.06, 0.0))
 
     def at(step: Step, count: int) -> Motion:
-        def step(motion: Motion, _: None) -> tuple[Motion, None]:
+        def advanced(motion: Motion, _: None) -> tuple[Motion, None]:
             return step(BODY, motion, push, 1.0 / count), None
 
-        motion: Motion = jax.lax.scan(step, still, length=count)[0]
+        motion: Motion = jax.lax.scan(advanced, still, length=count)[0]
         return motion
 
     exact = at(step_rk4, 2000)
