@@ -18,7 +18,7 @@ from tests.sim_jax.support import quaternion, vec, vehicle
 from tuner.coefficients import REGISTRY
 
 CRAFT = vehicle()
-EFFECTS = [row for row in REGISTRY.values() if row.is_effect]
+EFFECTS = [row for row in REGISTRY.values() if row.is_effect and row.scope == "vehicle"]
 IN_WRENCH = [row for row in EFFECTS if row.name not in ("battery_exponent", "time_constant_slope")]
 SPEEDS = tuple(jnp.asarray(speed) for speed in (590.0, 610.0, 600.0, 630.0))
 ACCELERATIONS = tuple(jnp.asarray(change) for change in (40.0, -20.0, 10.0, 90.0))
