@@ -31,7 +31,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-MOST_MEMORY = 900 * 2**20
+MOST_MEMORY = 800 * 2**20
 """bytes of a test process at the end of a test beyond which its compiled programs are dropped."""
 
 
