@@ -110,11 +110,11 @@ def ini_target(monkeypatch):
 
 
 def effects_that_do_nothing():
-    """Return the effects of the registry that change neither motion nor rotor speed of a flight.
+    """Return the vehicle's effects that change neither motion nor rotor speed of a flight.
 
     The first flight of a batch has all at their neutral values, each other one moves one of them.
     """
-    rows = [row for row in REGISTRY.values() if row.is_effect]
+    rows = [row for row in REGISTRY.values() if row.is_effect and row.scope == "vehicle"]
     effects = {
         row.name: row.neutral + row.step * jnp.eye(len(rows) + 1)[number]
         for number, row in enumerate(rows, start=1)
