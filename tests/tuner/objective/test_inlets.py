@@ -22,7 +22,8 @@ def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():
 def test_every_inlet_of_the_simulator_is_fed_by_one_class():
     feeds = [inlet.feeds for inlet in INLETS.values()]
     assert len(set(feeds)) == len(feeds)
-    assert set(feeds) == set(Inlet.__subclasses__()) - {MixedInlet}
+    own = {kind for kind in Inlet.__subclasses__() if kind.__module__ == Inlet.__module__}
+    assert set(feeds) == own - {MixedInlet}  # a test may have brought one of its own
 
 
 @pytest.mark.parametrize("inlet", INLETS.values(), ids=lambda inlet: inlet.name)
