@@ -76,7 +76,7 @@ def _shared(simulator: Simulator) -> Callable[..., Gradients]:
         vectors: Array, data: SegmentData, model: Tunable, horizon: Array, huber: Array
     ) -> Gradients:
         def loss(vector: Array) -> Array:
-            trace = simulator.fly(model, data.segments, vector, None, data.states)
+            trace = simulator.fly(model, data.segments, vector, None, states=data.states)
             errors = simulator.residuals(data, horizon, trace, data.offsets)
             scaled = {name: error / data.scale[name] for name, error in errors.items()}
             return jnp.sum(robust_loss(scaled, huber))
