@@ -18,6 +18,8 @@ class Code(StrEnum):
 
     RECORDING = "recording"  # names: topic, what reading the recording doubted
     SALVAGED = "salvaged"  # those of `tuner.flights.damage.Damage`; names: its cause and subject
+    LEFT_OUT = "left_out"  # names: what the flight lacks, what to do
+    FLIGHT_WORSE = "flight_worse"  # before, after; names: position or attitude, its unit
     MISSING_SIGNALS = "missing_signals"  # names: the signals
     POSE_GAP = "pose_gap"  # seconds
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal

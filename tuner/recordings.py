@@ -11,10 +11,12 @@ from dataclasses import dataclass, field, replace
 
 from tuner.config import Settings, TrajectorySettings, check_mixer
 from tuner.config.job import InletName
-from tuner.errors import InputError, did_you_mean
+from tuner.errors import InputError, RecordingError, did_you_mean
+from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.windows import require_windows
 from tuner.simulation.trajectory import with_named_reference
 from tuner.yaml_files.section import build
 
@@ -49,6 +51,8 @@ def read_recordings(
 ) -> tuple[Recording, ...]:
     """Read every mission of the settled files, and assign it what the job file says of it.
 
+    A flight that cannot be simulated is left out (`read_usable` names it), if others are left.
+
     Parameters
     ----------
     settings
@@ -59,8 +63,33 @@ def read_recordings(
     Raises
     ------
     InputError
-        A file cannot be read, a flight does not hold what its inlet needs, its side-car names an
+        A file cannot be read, no flight holds what its inlet needs, a side-car names an
         impossible trajectory, or a held-out flight does not exist.
+    """
+    recordings, _ = read_usable(settings, holdout=holdout)
+    return recordings
+
+
+def read_usable(
+    settings: Settings, *, holdout: Sequence[str] | None = None
+) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
+    """Read every mission of the settled files that can be simulated, and name the others.
+
+    Parameters
+    ----------
+    settings, holdout
+        As of `read_recordings`.
+
+    Returns
+    -------
+    tuple
+        The recordings, and a finding for each flight that is left out because it does not hold
+        what its inlet needs.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings`.
     """
     job = settings.job
     flights = [
@@ -72,8 +101,24 @@ def read_recordings(
     for name in job.holdout:
         if name not in names:
             raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
-    return recordings_of(
-        settings, (_with_reference(flight, settings) for flight in flights), holdout=holdout
+    recordings: list[Recording] = []
+    left_out: list[tuple[Flight, RecordingError]] = []
+    for flight in flights:
+        try:
+            (recording,) = recordings_of(
+                settings, [_with_reference(flight, settings)], holdout=holdout
+            )
+        except RecordingError as error:
+            left_out.append((flight, error))
+        else:
+            recordings.append(recording)
+    held_out = job.holdout if holdout is None else holdout
+    none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
+    if left_out and (not recordings or none_to_fit):
+        raise left_out[0][1]
+    return tuple(recordings), tuple(
+        Finding(Code.LEFT_OUT, "warning", flight.name, names=(error.what, error.remedy))
+        for flight, error in left_out
     )
 
 
@@ -92,7 +137,7 @@ def recordings_of(
     Raises
     ------
     RecordingError
-        A flight does not hold what its inlet needs.
+        A flight does not hold what its inlet needs, or hardly ever all of it together.
     ConfigError
         The vehicle has rotors that the mixer above an inlet cannot fly.
     """
@@ -121,6 +166,8 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
     chosen = inlet_for(flight, inlet)
+    if not INLETS[chosen].closed_loop:
+        require_windows(flight, job.search.window, INLETS[chosen].fed)
     if INLETS[chosen].has_mixer:
         check_mixer(settings.vehicle)
     return Recording(flight, chosen, None if offset == "free" else float(offset), holdout)

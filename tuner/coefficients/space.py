@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -204,6 +204,8 @@ def space_of(
     controller: ControllerFile,
     job: JobFile,
     joint_prior: JointPrior | None = None,
+    *,
+    bypassed: Collection[str] = (),
 ) -> Space:
     """Return what a job fits.
 
@@ -215,6 +217,8 @@ def space_of(
         Which are free, between which bounds, with which priors and ties.
     joint_prior
         What ground measurements say.
+    bypassed
+        Coefficients that do not act on the job's flights: they stay as they are.
 
     Raises
     ------
@@ -222,7 +226,7 @@ def space_of(
         Nothing is free, bounds exclude or pin the start, a tie names a fixed coefficient, or a free
         coefficient belongs to something that does not fly.
     """
-    free = _free_names(job)
+    free = _free_names(job, bypassed)
     values = initial_values(vehicle, controller, free)
     for name in free:
         if name not in values:
@@ -233,7 +237,8 @@ def space_of(
                 f"give {section}.{key} in the vehicle file, or fix it",
             )
     groups: dict[str, tuple[str, ...]] = {name: (name,) for name in free}
-    for group in job.ties:
+    for ties in job.ties:
+        group = tuple(name for name in ties if name not in bypassed)
         tied = [name for name in group if name in free]
         if not tied:
             continue
@@ -249,12 +254,14 @@ def space_of(
     return Space(parameters, {n: v for n, v in values.items() if n not in free}, joint_prior)
 
 
-def _free_names(job: JobFile) -> tuple[str, ...]:
-    if job.free is not None:
-        return tuple(name for name in COEFFICIENTS if name in job.free)
-    free = tuple(n for n, row in COEFFICIENTS.items() if row.free and n not in job.fixed)
+def _free_names(job: JobFile, bypassed: Collection[str]) -> tuple[str, ...]:
+    wanted = {n for n, row in COEFFICIENTS.items() if row.free} - set(job.fixed)
+    wanted = wanted if job.free is None else set(job.free)
+    free = tuple(name for name in COEFFICIENTS if name in wanted and name not in bypassed)
     if not free:
-        raise ConfigError("fixed", "leaves no coefficient free", "free at least one")
+        key = "fixed" if job.free is None else "free"
+        what = "leaves no coefficient that acts on these flights free"
+        raise ConfigError(key, what, "free at least one")
     return free
 
 

@@ -124,7 +124,8 @@ class _Group:
         self._windowed = not INLETS[inlet].closed_loop
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self._windowed:
-            self._windows = [windows_of(flight, seconds) for flight in flights]
+            fed = INLETS[inlet].fed
+            self._windows = [windows_of(flight, seconds, fed=fed) for flight in flights]
             self._segments = window_segments(
                 flights,
                 inlets=[inlet] * len(flights),

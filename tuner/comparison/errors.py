@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.flights.flight import Array, Flight
 from tuner.result import RMSE_UNITS, AxesRmse
+
+Pose = Literal["position", "attitude"]
 
 #: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
 CLEARANCE = 0.3
@@ -78,6 +81,14 @@ class FlightErrors:
     def rmse(self) -> AxesRmse:
         """The thesis's six; None throughout for a crash."""
         return rmse_of([self])
+
+    def length(self, signal: Pose) -> float:
+        """Return the RMSE over a signal's axes together, m or degrees; infinite for a crash."""
+        rmse = self.rmse
+        axes = ("x", "y", "z") if signal == "position" else ("roll", "pitch", "yaw")
+        values = [getattr(rmse, axis) for axis in axes]
+        known = [value for value in values if value is not None]
+        return float(np.linalg.norm(known)) if known else np.inf
 
 
 def rmse_of(flights: Sequence[FlightErrors]) -> AxesRmse:

@@ -22,6 +22,9 @@ class Honest:
     ----------
     floor
         In the signal's unit.
+    share
+        Share of the column's median that the floor is at least: small rotors turn, and change,
+        several times faster than large ones.
     curvature
         Largest second derivative in time of honest motion, unit/s^2.
     jump
@@ -29,8 +32,14 @@ class Honest:
     """
 
     floor: float
+    share: float = 0.0
     curvature: float = 0.0
     jump: float = np.inf
+
+    def floor_of(self, values: Array) -> float:
+        """Return the floor for (n,) values of one column."""
+        level = float(np.median(np.abs(values))) if self.share and len(values) else 0.0
+        return max(self.floor, self.share * level)
 
 
 #: Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the
@@ -38,7 +47,7 @@ class Honest:
 HONEST: Mapping[str, Honest] = {
     "position": Honest(floor=0.02, curvature=30.0, jump=0.08),
     "attitude": Honest(floor=0.03, curvature=100.0, jump=0.15),
-    "rotor_speed": Honest(floor=30.0),
+    "rotor_speed": Honest(floor=30.0, share=0.05),
 }
 
 #: Seconds after which a pose that jumped away is not expected back.
@@ -72,7 +81,7 @@ def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_
     excess = np.maximum(np.maximum(low - values, values - high), 0.0)
     rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
     apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
-    bound = honest.floor + 2 * honest.curvature * apart**2
+    bound = honest.floor_of(values) + 2 * honest.curvature * apart**2
     usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
     return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ MOVES = {"x": 0.2, "y": 0.2, "roll": 1.0, "pitch": 1.0}
 """m and degrees of spread below which an axis is not excited."""
 TURNS = 0.5
 """rad/s of yaw rate below which yaw is not excited."""
+NAMED = 3
+"""Flights that a finding names one by one, at most."""
 GAP = 0.25
 """s without a pose inside a mission that a user should know of."""
 
@@ -40,12 +43,25 @@ def check(job: Job) -> tuple[Finding, ...]:
         ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
     """
     return (
-        *_recordings(job),
-        *_sparse_inputs(job),
+        *said_once((*_recordings(job), *_sparse_inputs(job))),
         *_excitation(job),
         *_bounds(job),
         *_starts_on_bounds(job),
         *_information(job),
+    )
+
+
+def said_once(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings with those that hold for several flights alike as one of all of these."""
+    subjects: dict[tuple[object, ...], list[Finding]] = {}
+    for finding in findings:
+        alike = (finding.code, finding.level, finding.names, tuple(finding.numbers.items()))
+        subjects.setdefault(alike, []).append(finding)
+    return tuple(
+        replace(same[0], subject=", ".join(finding.subject for finding in same))
+        if len(same) <= NAMED
+        else replace(same[0], subject=f"{len(same)} flights")
+        for same in subjects.values()
     )
 
 
@@ -72,14 +88,24 @@ def _is_number(value: object) -> bool:
 
 
 def _sparse_inputs(job: Job) -> Iterator[Finding]:
-    """Warn of inputs that were recorded less often than the loop that computes them ran."""
+    """Warn of inputs that were recorded less often than the loop that computes them ran.
+
+    How often that was, only a controller file of this vehicle says.
+    """
+    origin = job.settings.origin
+    if _is_default(origin, "controller") and not _is_default(origin, "vehicle"):
+        return
     for flight, inlet in zip(job.fitted, job.inlets, strict=True):
         signal, *_ = INLETS[inlet].needs
         rate = INLETS[inlet].update_rate(job.objective.schedule)
         if rate is not None and sparse([flight], signal, rate):
-            recorded = 1.0 / float(np.median(np.diff(flight.series[signal].time)))
+            recorded = round(1.0 / float(np.median(np.diff(flight.series[signal].time))))
             numbers = {"recorded": recorded, "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
+
+
+def _is_default(origin: Mapping[str, str], setting: str) -> bool:
+    return origin.get(setting, "").startswith("default")
 
 
 def _excitation(job: Job) -> Iterator[Finding]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.comparison.errors import FlightErrors, Pose
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -18,6 +19,10 @@ UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""
 STEPS_MATTER = 1e-4
 """s of a lag: the shipped recordings, flown at 4 kHz, are met best by one 0.14 ms too short."""
+WORSE = 0.01
+"""Share by which a flight may be met worse than before the fit without a word."""
+MET_BY: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
+"""What a flight is judged by, with its unit."""
 ODD = 3.0
 """A flight this many times further off than the middle one is the odd one out."""
 
@@ -111,6 +116,28 @@ def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
         and source.flights is not None
         and abs(source.deviation) > CONFLICT
     )
+
+
+def flights_worse(
+    initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
+) -> tuple[Finding, ...]:
+    """Return which flights the fitted coefficients meet worse than the initial ones did.
+
+    Parameters
+    ----------
+    initial, best
+        Flight -> errors of a simulation with the initial, and with the fitted coefficients.
+    """
+    findings = []
+    for flight in best:
+        for what, unit in MET_BY.items():
+            before, after = initial[flight].length(what), best[flight].length(what)
+            if after > (1.0 + WORSE) * before:
+                numbers = {"before": before, "after": after}
+                findings.append(
+                    Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
+                )
+    return tuple(findings)
 
 
 def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:

@@ -17,7 +17,7 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, segments_of, window_segments
@@ -121,7 +121,13 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     job = settings.job
     channels = [name for name in CHANNELS if job.channels.get(name, True)]
     noise = noise_of(fitted, channels)
-    space = space_of(settings.vehicle, settings.controller, job, settings.bench)
+    space = space_of(
+        settings.vehicle,
+        settings.controller,
+        job,
+        settings.bench,
+        bypassed=bypassed_by(inlets),
+    )
     if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
         require_voltage(fitted)
     schedule = schedule_of(settings.controller)

@@ -22,7 +22,7 @@ from tuner.job.best_fit import validate, vehicle_fitted
 from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate
 from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.findings import finer_than_steps, ground_conflicts
+from tuner.job.findings import finer_than_steps, flights_worse, ground_conflicts
 from tuner.job.folder import folder_for
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
@@ -30,7 +30,7 @@ from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
 from tuner.job.selection import with_terms_selected
-from tuner.recordings import read_recordings
+from tuner.recordings import read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
@@ -85,8 +85,9 @@ def run(
     settings = settle(options)
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
-    job = job_of(settings, read_recordings(settings))
-    findings = check(job)
+    recordings, left_out = read_usable(settings)
+    job = job_of(settings, recordings)
+    findings = (*left_out, *check(job))
     _report(findings, listener, force=force)
 
     make_folder(folder)
@@ -109,12 +110,13 @@ def run(
     sources = sources_of(fitted, uncertainty, examination.information.total[:count, :count])
     conflicts = ground_conflicts(sources)
     _report(conflicts, listener, force=True)
-    findings = (*fitted.findings, *finer_than_steps(uncertainty), *conflicts)
-    fitted = replace(fitted, findings=findings)
-
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
     initial, best = validate(job, fitted, vehicle)
+    worse = flights_worse(initial, best)
+    _report(worse, listener, force=True)
+    findings = (*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts)
+    fitted = replace(fitted, findings=findings)
     result = result_of(
         job,
         fitted,

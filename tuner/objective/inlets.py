@@ -8,7 +8,7 @@ out. An inlet is added by one more class; `INLETS` lists them.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import ClassVar
 
@@ -51,10 +51,17 @@ class RecordedInlet(ABC):
     closed_loop: ClassVar[bool] = False
     """Whether the position controller is simulated: it keeps a whole flight to its path, and the
     recording's clock is the reference's rather than the flight controller's."""
+    bypasses: ClassVar[tuple[str, ...]] = ()
+    """Coefficients of the stages upstream, of which the simulation then says nothing."""
     has_mixer: ClassVar[bool] = False
     """Whether the mixer, which is that of a quad X, is simulated."""
     remedy: ClassVar[str] = "use inlet: auto"
     """What to do where a signal is missing."""
+
+    @property
+    def fed(self) -> tuple[str, ...]:
+        """Signals without which a stretch of a flight cannot be simulated."""
+        return () if self.closed_loop else self.needs
 
     def can_be_fed(self, flight: Flight) -> bool:
         """Return whether a flight holds every column of what the inlet needs."""
@@ -149,6 +156,7 @@ class RecordedBodyRate(RecordedInlet):
     name = "body_rate"
     feeds = BodyRateInlet
     needs = ("rate_setpoint", "thrust_setpoint")
+    bypasses = ("estimate_latency",)
     ignores = ("trim",)
     has_mixer = True
 
@@ -169,6 +177,7 @@ class RecordedCommand(RecordedInlet):
     feeds = ActuatorInlet
     needs = ("command",)
     silences = ("command",)
+    bypasses = ("estimate_latency", "gyro_cutoff")
     ignores = ("rate_integral",)
 
     def update_rate(self, schedule: Schedule) -> float:
@@ -193,6 +202,19 @@ class RecordedRotorSpeed(RecordedInlet):
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
     silences = ("command", "rotor_speed")
+    bypasses = (
+        "estimate_latency",
+        "gyro_cutoff",
+        "actuator_latency",
+        "input_scaling",
+        "zero_position_armed",
+        "input_offset",
+        "quadratic",
+        "time_constant_up",
+        "time_constant_down",
+        "time_constant_slope",
+        "battery_exponent",
+    )
     ignores = ("rotor_speed", "rate_integral")
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
@@ -243,6 +265,11 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
             flight.path, f"holds no {missing} for the {inlet.name} inlet", inlet.remedy
         )
     return inlet.name
+
+
+def bypassed_by(names: Collection[InletName]) -> frozenset[str]:
+    """Return the coefficients that act on no flight that enters through one of some inlets."""
+    return frozenset.intersection(*(frozenset(INLETS[name].bypasses) for name in names))
 
 
 def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:

@@ -161,7 +161,9 @@ def window_segments(
         As of `segments_of`.
     """
     cut = [
-        (number, window) for number, f in enumerate(flights) for window in windows_of(f, seconds)
+        (number, window)
+        for number, (flight, name) in enumerate(zip(flights, inlets, strict=True))
+        for window in windows_of(flight, seconds, fed=INLETS[name].fed)
     ]
     pieces = [window.flight for _, window in cut]
     start = start_of([piece.initial for piece in pieces], resting=False)

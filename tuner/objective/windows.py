@@ -6,7 +6,7 @@ enough for a fit to find its way from almost anywhere, and a window needs no gen
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +21,10 @@ BEHIND = 0.1
 """s of a recording after a window that may help as well."""
 FEWEST = 8
 """Poses that a stretch must hold to be a window."""
+UNFED = 0.25
+"""Share of a window for which what is fed in may be unknown at a time, if not two samples."""
+MOSTLY = 0.5
+"""Share of a flight that must make windows: less of it is no flight to judge a vehicle by."""
 
 
 @dataclass(frozen=True)
@@ -39,39 +43,104 @@ class Window:
     begin: float
 
 
-def windows_of(flight: Flight, seconds: float) -> tuple[Window, ...]:
+def windows_of(flight: Flight, seconds: float, *, fed: Collection[str] = ()) -> tuple[Window, ...]:
     """Cut a flight into windows of so many s, one behind the other.
 
-    A stretch with hardly a pose in it is left out, and so is a rest shorter than half a window.
+    A stretch with hardly a pose in it is left out, and so are one in which a signal that is fed in
+    is unknown for long, and a rest shorter than half a window.
+
+    Parameters
+    ----------
+    flight
+        What is cut.
+    seconds
+        s, length of a window.
+    fed
+        Signals that are fed into the simulation.
 
     Raises
     ------
     RecordingError
-        No stretch of the flight holds enough poses.
+        No stretch of the flight holds enough poses and enough of what is fed in.
     """
-    count = max(1, round(seconds * flight.rate))
-    windows = []
-    for first in range(0, len(flight.time) - count // 2, count):
-        last = min(first + count, len(flight.time) - 1)
-        window = _window(flight, first, last)
-        if window is not None:
-            windows.append(window)
+    stretches = _stretches(flight, seconds)
+    windows = [
+        window
+        for first, last in stretches
+        if _is_fed(flight, first, last, fed)
+        and (window := _window(flight, first, last)) is not None
+    ]
     if not windows:
-        raise RecordingError(
-            flight.path, f"holds no {seconds:g} s with poses throughout", "record motion capture"
-        )
+        if any(_is_fed(flight, first, last, ()) for first, last in stretches):
+            what = " and ".join(name.replace("_", " ") for name in fed)
+            remedy = "inspect the recording: most of that column may be corrupt"
+        else:
+            what, remedy = "poses", "record motion capture"
+        raise RecordingError(flight.path, f"holds no {seconds:g} s with {what} throughout", remedy)
     return tuple(windows)
+
+
+def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> None:
+    """Refuse a flight most of which makes no windows.
+
+    Parameters
+    ----------
+    flight, seconds, fed
+        As of `windows_of`.
+
+    Raises
+    ------
+    RecordingError
+        Names what is missing, and in how much of the flight.
+    """
+    stretches = _stretches(flight, seconds)
+    for what, names in ((" and ".join(fed), fed), ("pose", ())):
+        usable = sum(_is_fed(flight, first, last, names) for first, last in stretches)
+        if usable < MOSTLY * len(stretches):
+            lacking = 100.0 * (1.0 - usable / len(stretches))
+            raise RecordingError(
+                flight.path,
+                f"lacks a continuous {what.replace('_', ' ')} in {lacking:.0f} % of its mission",
+                "inspect the recording: samples outside their range are dropped",
+            )
+
+
+def _stretches(flight: Flight, seconds: float) -> list[tuple[int, int]]:
+    """Return the first and last tick of every stretch that may become a window."""
+    count = max(1, round(seconds * flight.rate))
+    return [
+        (first, min(first + count, len(flight.time) - 1))
+        for first in range(0, len(flight.time) - count // 2, count)
+    ]
+
+
+def _is_fed(flight: Flight, first: int, last: int, fed: Collection[str]) -> bool:
+    """Return whether a stretch has poses, and its signals are never unknown for long."""
+    begin, end = float(flight.time[first]), float(flight.time[last])
+    pose = flight.series.get("position")
+    if pose is None or "attitude" not in flight.series:
+        return False
+    inside = pose.time[(pose.time >= begin) & (pose.time <= end)]
+    if len(inside) < FEWEST or np.diff(inside).max() > 0.5 * (end - begin):
+        return False
+    for name in fed:
+        series = flight.series.get(name)
+        if series is None:
+            return False
+        for column in series.values.T:
+            known = series.time[np.isfinite(column)]
+            if len(known) < 2:
+                return False
+            longest = max(UNFED * (end - begin), 2.0 * float(np.median(np.diff(known))))
+            known = known[(known > begin) & (known < end)]
+            if np.diff(known, prepend=begin, append=end).max() > longest:
+                return False
+    return True
 
 
 def _window(flight: Flight, first: int, last: int) -> Window | None:
     begin, end = float(flight.time[first]), float(flight.time[last])
     series = _around(flight.series, begin, end)
-    position = series.get("position")
-    if position is None or "attitude" not in series:
-        return None
-    inside = (position.time >= 0) & (position.time <= end - begin)
-    if inside.sum() < FEWEST or np.diff(position.time[inside]).max() > 0.5 * (end - begin):
-        return None
     stretch = replace(
         flight,
         time=flight.time[first : last + 1] - begin,

@@ -13,6 +13,13 @@ from tuner.wording.phrases import as_sentence, listed
 #: Code -> what was noticed and what to do about it: text with the finding's numbers in braces,
 #: ``names`` for its names, ``first`` and ``second`` for one of them, ``subject`` for its subject.
 TEXTS: Mapping[Code, tuple[str, str]] = {
+    Code.FLIGHT_WORSE: (
+        (
+            "The fitted coefficients meet the {first} of this flight worse than the initial ones "
+            "did: RMSE {after:.3g} {unit}, before {before:.3g} {unit}."
+        ),
+        "Look at its figures and at inspect: it may have been flown, or recorded, otherwise.",
+    ),
     Code.MISSING_SIGNALS: (
         "The recording holds no {names}, and position alone says little about the rotors.",
         "Record them.",
@@ -156,7 +163,7 @@ def _values(finding: Finding) -> dict[str, object]:
         values |= {"names": listed(names), "first": names[0]}
         values["coefficients"] = listed(finding.names)
     seconds = finding.numbers.get("seconds", 0.0)
-    values["unit"] = finding.names[0] if finding.names else ""
+    values["unit"] = finding.names[-1] if finding.names else ""
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
     changed = finding.numbers.get("changed")
     lower = "ended lower, and its result was kept" if changed else "ended no lower"
@@ -166,6 +173,11 @@ def _values(finding: Finding) -> dict[str, object]:
 def _recording(finding: Finding) -> str:
     topic, text = finding.names
     return f"{topic}: {text}." if topic else as_sentence(text)
+
+
+def _left_out(finding: Finding) -> str:
+    what, _ = finding.names
+    return f"The flight is left out: it {what}."
 
 
 def _salvaged(finding: Finding) -> str:
@@ -200,12 +212,14 @@ def _flight_unmatched(finding: Finding) -> str:
 
 SENTENCES: Mapping[Code, Callable[[Finding], str]] = {
     Code.RECORDING: _recording,
+    Code.LEFT_OUT: _left_out,
     Code.SALVAGED: _salvaged,
     Code.SATURATION_FEEDBACK: _saturation_feedback,
     Code.FLIGHT_UNMATCHED: _flight_unmatched,
 }
 REMEDIES: Mapping[Code, Callable[[Finding], str]] = {
     Code.RECORDING: lambda _: "",
+    Code.LEFT_OUT: lambda finding: as_sentence(finding.names[1]),
     Code.SALVAGED: lambda _: "Record the flight again if what was lost matters.",
     Code.SATURATION_FEEDBACK: _saturation_remedy,
     Code.FLIGHT_UNMATCHED: lambda _: (

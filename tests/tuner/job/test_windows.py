@@ -25,7 +25,7 @@ def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
     start = with_values(
         updated, {name: values_of(updated)[name] * WRONG.get(name, 1.0) for name in free}
     )
-    settings = settle(Options([str(bag)], vehicle=start))
+    settings = settle(Options([str(bag)], vehicle=start, controller="hovergames"))
     job = JobFile(free=free, inlet=inlet, search=Search(method=method, window=0.5))
     settings = replace(settings, job=job)
     return job_of(settings, recordings_of(settings, [flight]))
@@ -101,6 +101,10 @@ def test_commands_recorded_too_seldom_are_reported(flight, bag, updated, full_fl
     (sparse,) = (finding for finding in seldom if finding.code == Code.SPARSE_INPUT)
     assert sparse.numbers["recorded"] == pytest.approx(100, abs=1)
     assert sparse.numbers["needed"] == 400
+    unknown = job_through("actuator", flight, bag, updated)
+    origin = dict(unknown.settings.origin) | {"controller": "default (hovergames.yaml)"}
+    unknown = replace(unknown, settings=replace(unknown.settings, origin=origin))
+    assert not any(finding.code == Code.SPARSE_INPUT for finding in check(unknown))
     full = check(job_through("actuator", full_flight, full_bag, updated))
     assert not any(finding.code == Code.SPARSE_INPUT for finding in full)
 

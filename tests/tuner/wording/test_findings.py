@@ -15,6 +15,12 @@ MADE = {
         {"salvaged": 70, "bytes_lost": 12, "occurrences": 1, "start": 20.0},
         ("end_missing", ""),
     ),
+    Code.LEFT_OUT: Finding(
+        Code.LEFT_OUT, "warning", "a", names=("holds no command", "inspect the recording")
+    ),
+    Code.FLIGHT_WORSE: Finding(
+        Code.FLIGHT_WORSE, "warning", "a", {"before": 29.0, "after": 40.0}, ("attitude", "degrees")
+    ),
     Code.MISSING_SIGNALS: Finding(
         Code.MISSING_SIGNALS, "warning", "a", names=("rotor_speed", "command")
     ),

@@ -1,0 +1,123 @@
+"""Flights as real loggers leave them: what cannot be used is named, and no line is said in vain."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sim_jax.schedule import Schedule
+from tests.tuner.comparison.test_errors import errors
+from tuner import recordings as recordings_module
+from tuner.coefficients.space import space_of
+from tuner.config import ControllerFile, JobFile, Options, settle
+from tuner.config.job import Search
+from tuner.errors import ConfigError, RecordingError
+from tuner.findings import Code, Finding
+from tuner.flights.flight import Series
+from tuner.flights.outliers import HONEST, sticking_out
+from tuner.job.check import said_once
+from tuner.job.findings import flights_worse
+from tuner.objective.inlets import INLETS, bypassed_by
+from tuner.objective.segments import window_segments
+from tuner.objective.windows import windows_of
+from tuner.recordings import read_usable, recordings_of
+
+
+def without_commands(flight, begin, end):
+    """Return a flight whose commands between two times were dropped as corrupt."""
+    command = flight.series["command"]
+    kept = (command.time < begin) | (command.time > end)
+    series = dict(flight.series) | {"command": Series(command.time[kept], command.values[kept])}
+    return replace(flight, series=series)
+
+
+def settings_for(bag, **job):
+    settings = settle(Options([str(bag)]))
+    return replace(settings, job=JobFile(inlet="actuator", search=Search(window=0.5), **job))
+
+
+def test_windows_without_what_is_fed_in_are_left_out(flight):
+    gap = without_commands(flight, 3.1, 4.9)
+    assert {round(window.begin) for window in windows_of(gap, 1.0)} >= {3, 4}
+    begins = [round(window.begin) for window in windows_of(gap, 1.0, fed=("command",))]
+    assert not {3, 4} & set(begins)
+    assert {2, 5} <= set(begins)
+    segments = window_segments(
+        [gap], inlets=["actuator"], seconds=1.0, schedule=Schedule(), lag=0.02, noise={}
+    )
+    assert segments.count == len(begins)
+
+
+def test_a_flight_without_any_command_is_refused_in_one_line(flight):
+    bare = without_commands(flight, -5.0, 50.0)
+    with pytest.raises(RecordingError, match="no 1 s with command throughout"):
+        windows_of(bare, 1.0, fed=("command",))
+
+
+def test_a_flight_most_of_whose_commands_are_corrupt_is_left_out_by_name(flight, bag, monkeypatch):
+    corrupt = replace(without_commands(flight, 2.0, 11.0), name="corrupt")
+    monkeypatch.setattr(recordings_module, "load_flights", lambda *_, **__: [flight, corrupt])
+    settings = settings_for(bag)
+    usable, (left_out,) = read_usable(settings)
+    assert [recording.flight.name for recording in usable] == [flight.name]
+    assert (left_out.code, left_out.subject) == (Code.LEFT_OUT, "corrupt")
+    assert "lacks a continuous command in 75 %" in left_out.names[0]
+    with pytest.raises(RecordingError, match="lacks a continuous command"):
+        recordings_of(settings, [corrupt])
+    # nothing is left to fit: the reason is the error
+    holding = replace(settings, job=settings.job.replace(holdout=(flight.name,)))
+    with pytest.raises(RecordingError, match="lacks a continuous command"):
+        read_usable(holding)
+
+
+def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated):
+    names = space_of(
+        updated, ControllerFile(), JobFile(), bypassed=bypassed_by(["rotor_speed"])
+    ).names
+    assert {"inertia_xx", "motor_constant", "moment_constant"} <= set(names)
+    assert not set(names) & set(INLETS["rotor_speed"].bypasses)
+    assert bypassed_by(["rotor_speed", "reference"]) == frozenset()
+    assert bypassed_by(["rotor_speed", "actuator"]) == {"estimate_latency", "gyro_cutoff"}
+    with pytest.raises(ConfigError, match="leaves no coefficient that acts"):
+        space_of(
+            updated,
+            ControllerFile(),
+            JobFile(free=("input_scaling",)),
+            bypassed=bypassed_by(["rotor_speed"]),
+        )
+
+
+def test_rotors_of_a_small_drone_change_quickly_without_being_outliers():
+    time = np.arange(400) * 0.01
+    generator = np.random.default_rng(1)
+    speed = 2000.0 + 40.0 * np.sin(2 * np.pi * 1.0 * time) + generator.normal(0.0, 2.0, 400)
+    speed[::40] += 80.0  # one sample of a correction
+    speed[205] += 900.0
+    assert np.flatnonzero(sticking_out(time, speed, HONEST["rotor_speed"])).tolist() == [205]
+    large = 0.3 * speed  # the same of a rotor at 600 rad/s
+    large[205] -= 270.0 - 60.0
+    assert np.flatnonzero(sticking_out(time, large, HONEST["rotor_speed"])).tolist() == [205]
+
+
+def test_what_holds_for_many_flights_is_said_once():
+    same = [
+        Finding(Code.MISSING_SIGNALS, "warning", name, names=("rotor_speed",)) for name in "abcdefg"
+    ]
+    other = Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.4})
+    assert [finding.subject for finding in said_once([*same, other])] == ["7 flights", "a"]
+    assert [finding.subject for finding in said_once(same[:2])] == ["a, b"]
+
+
+def test_a_flight_that_a_fit_left_worse_is_named():
+    before = {"f": errors([[0.1, 0, 0]] * 9, [[29, 0, 0]] * 9)}
+    after = {"f": errors([[0.05, 0, 0]] * 9, [[40, 0, 0]] * 9)}
+    (worse,) = flights_worse(before, after)
+    assert (worse.code, worse.subject, worse.names[0]) == (Code.FLIGHT_WORSE, "f", "attitude")
+    assert worse.numbers == {"before": pytest.approx(29.0), "after": pytest.approx(40.0)}
+    assert flights_worse(after, after) == ()
+    crashed = {"f": errors([[0.1, 0, 0]] * 9, [[0, 0, 0]] * 9, crash_time=1.0)}
+    assert {finding.names[0] for finding in flights_worse(before, crashed)} == {
+        "position",
+        "attitude",
+    }
+    assert flights_worse(crashed, crashed) == ()
