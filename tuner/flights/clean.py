@@ -26,6 +26,8 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "lap": (-1e6, 1e6),
     "command": (-0.02, 1.02),
     "thrust_setpoint": (-0.02, 1.02),
+    "commanded_thrust": (-1e4, 1e4),
+    "commanded_torque": (-1e4, 1e4),
     "rotor_speed": (0.0, 20_000.0),
     "battery_voltage": (0.0, 100.0),
 }

@@ -10,6 +10,8 @@ from tuner.flights.flight import Array
 
 #: A stamp this part of a period off its tick still belongs to that tick.
 ON_TICK = 0.2
+#: No clock drifts faster, in s/s: such stamps have another rate.
+FASTEST_DRIFT = 0.01
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
     middle = np.array([np.median(tick[block]) for block in blocks]) / rate
     low = np.array([np.quantile(late[block], 0.1) for block in blocks])
     drift = float(np.polyfit(middle, low, 1)[0]) if len(blocks) > 2 else 0.0
+    if abs(drift) > FASTEST_DRIFT:
+        return None
     if abs(drift) * (time[-1] - time[0]) < 1e-3:
         drift = 0.0
     steady = late - drift * tick / rate

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +17,11 @@ from tuner.flights.formats import open_recording
 from tuner.flights.frames import correct_frames
 from tuner.flights.locate import Place, choose_map, locate, require_pose
 from tuner.flights.mission import Mission, find_missions
-from tuner.flights.recording import Recording, Samples
+from tuner.flights.recording import Contents, Recording, Samples
 from tuner.flights.sidecar import Sidecar, sidecar_path
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
+from tuner.wording.phrases import listed
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,98 @@ class Content:
     damage: tuple[Damage, ...]
 
 
+@dataclass(frozen=True)
+class Signals:
+    """The signals of a recording, cleaned, before a pose is asked for.
+
+    Attributes
+    ----------
+    recording, topic_map, places, epoch, notes, damage
+        As of `Content`.
+    contents
+        The messages.
+    raw
+        Signal -> its values as recorded.
+    series
+        Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
+    """
+
+    recording: Recording
+    topic_map: TopicMap
+    places: Mapping[str, Place]
+    contents: Contents
+    raw: Mapping[str, Raw]
+    series: Mapping[str, Series]
+    epoch: int
+    notes: tuple[Note, ...]
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Signal -> topic."""
+        return {signal: data.topic for signal, data in self.raw.items()}
+
+    @property
+    def damage(self) -> tuple[Damage, ...]:
+        """What the file has lost, from the recorder's clock to that of the stamps."""
+        first = "position" if "position" in self.raw else min(self.raw, default=None)
+        if first is None:
+            return self.contents.damage
+        arrival = self.contents.samples[self.raw[first].topic].receive
+        stamps = float(np.median(self.raw[first].time))
+        later = stamps - float(np.median(arrival)) - self.epoch
+        return tuple(part.later(later * 1e-9) for part in self.contents.damage)
+
+
+def read_signals(
+    path: Path,
+    settings: Settings,
+    sidecar: Sidecar,
+    given: TopicMap | None,
+    *,
+    with_pose: bool,
+) -> Signals:
+    """Read and clean all signals that a topic map finds in a recording.
+
+    Parameters
+    ----------
+    path, settings, sidecar, given
+        As of `read_content`.
+    with_pose
+        Whether a recording without a pose is an error.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or holds no pose though one is asked for.
+    ConfigError
+        The topic map is wrong.
+    """
+    recording = open_recording(path, given.messages if given is not None else ())
+    namespace = settings.namespace or sidecar.namespace
+    candidates = [given] if given is not None else list(shipped_maps())
+    candidates = [candidate.under(namespace) for candidate in candidates]
+    if all(candidate.format != recording.format for candidate in candidates):
+        raise RecordingError(
+            path,
+            f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
+            f"'{candidates[0].format}'",
+            "give a map for this format",
+        )
+    chosen = choose_map(recording, candidates)
+    places, passed_over = locate(recording, chosen, strict=given is not None)
+    if with_pose:
+        require_pose(recording, chosen, places)
+    raw, contents, noticed = extract(recording, places, chosen.time)
+    notes = [
+        Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
+        *passed_over,
+        *contents.notes,
+        *noticed,
+    ]
+    series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
+    return Signals(recording, chosen, places, contents, raw, series, epoch, (*notes, *dropped))
+
+
 def read_content(
     path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
 ) -> Content:
@@ -101,49 +194,20 @@ def read_content(
     ConfigError
         The topic map is wrong.
     """
-    recording = open_recording(path, given.messages if given is not None else ())
-    namespace = settings.namespace or sidecar.namespace
-    candidates = [given] if given is not None else list(shipped_maps())
-    candidates = [candidate.under(namespace) for candidate in candidates]
-    if all(candidate.format != recording.format for candidate in candidates):
-        raise RecordingError(
-            path,
-            f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
-            f"'{candidates[0].format}'",
-            "give a map for this format",
-        )
-    chosen = choose_map(recording, candidates)
-    places, notes = locate(recording, chosen, strict=given is not None)
-    require_pose(recording, chosen, places)
-    raw, contents, noticed = extract(recording, places, chosen.time)
-    all_notes = [
-        Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
-        *notes,
-        *contents.notes,
-        *noticed,
-    ]
-    series, epoch = _clean(path, raw, all_notes)
-    # From the recorder's clock to that of the stamps, in which the series are.
-    arrival = contents.samples[raw["position"].topic].receive
-    later = float(np.median(raw["position"].time)) - float(np.median(arrival)) - epoch
-    damage = tuple(part.later(later * 1e-9) for part in contents.damage)
-    topics_of = {signal: data.topic for signal, data in raw.items()}
-    series, noticed = align_pose(series, topics_of)
-    all_notes.extend(noticed)
-    series, noticed = correct_frames(series, topics_of)
-    all_notes.extend(noticed)
-    all_notes.extend(_unmeasured(series, topics_of))
-    missions = _missions(series, sidecar)
+    signals = read_signals(path, settings, sidecar, given, with_pose=True)
+    topics = signals.topics
+    series, shifted = align_pose(signals.series, topics)
+    series, turned = correct_frames(series, topics)
     return Content(
-        recording,
-        chosen,
-        places,
-        contents.samples,
+        signals.recording,
+        signals.topic_map,
+        signals.places,
+        signals.contents.samples,
         series,
-        epoch,
-        missions,
-        tuple(all_notes),
-        damage,
+        signals.epoch,
+        _missions(series, sidecar),
+        (*signals.notes, *shifted, *turned, *_unmeasured(series, topics)),
+        signals.damage,
     )
 
 
@@ -163,21 +227,33 @@ def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | No
 
 
 def _clean(
-    path: Path, raw: Mapping[str, Raw], all_notes: list[Note]
-) -> tuple[dict[str, Series], int]:
-    epoch = int(raw["position"].time.min()) if "position" in raw else 0
+    path: Path, raw: Mapping[str, Raw], *, with_pose: bool
+) -> tuple[dict[str, Series], int, list[Note]]:
+    first = [raw["position"]] if "position" in raw else list(raw.values())
+    epoch = min((int(data.time.min()) for data in first), default=0)
     series = {}
+    notes: dict[tuple[str, str, str], list[tuple[str, Note]]] = {}
     for signal, data in raw.items():
         seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
         time, values, dropped = clean(signal, data.topic, seconds, data.values)
-        all_notes.extend(dropped)
+        for note in dropped:  # signals of one message lack the same samples
+            alike = (note.topic, note.kind, note.text.replace(f" {signal} ", " {} "))
+            notes.setdefault(alike, []).append((signal, note))
         if len(time):
             series[signal] = Series(time, values)
-    for needed in ("position", "attitude"):
+    for needed in ("position", "attitude") if with_pose else ():
         if needed not in series:
             where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
             raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
-    return series, epoch
+    return series, epoch, [_of_all(alike[2], found) for alike, found in notes.items()]
+
+
+def _of_all(text: str, found: Sequence[tuple[str, Note]]) -> Note:
+    """Return one note of all signals that it concerns."""
+    _, first = found[0]
+    if len(found) == 1:
+        return first
+    return replace(first, text=text.replace("{}", listed([signal for signal, _ in found]), 1))
 
 
 def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:

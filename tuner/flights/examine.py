@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -12,9 +13,17 @@ import numpy as np
 from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.clock import fit_grid
-from tuner.flights.content import Content, Settings, given_map, read_content
-from tuner.flights.flight import SIGNALS, Array, Series
+from tuner.flights.content import (
+    Content,
+    Settings,
+    Signals,
+    given_map,
+    read_content,
+    read_signals,
+)
+from tuner.flights.flight import SIGNALS, Array, Note, Series
 from tuner.flights.formats import open_recording
+from tuner.flights.inertial import flying, is_inertial
 from tuner.flights.informs import informed, inlets
 from tuner.flights.inspection import (
     Inspection,
@@ -22,9 +31,10 @@ from tuner.flights.inspection import (
     SignalReport,
     TopicReport,
 )
+from tuner.flights.locate import Place
 from tuner.flights.mission import yaw_spin
 from tuner.flights.motion import RATE, derivative, rotate, smooth
-from tuner.flights.recording import Recording, Samples
+from tuner.flights.recording import Recording, Samples, Topic
 from tuner.flights.resample import resample
 from tuner.flights.sidecar import Sidecar, read_sidecar
 from tuner.flights.sync import pose_offset
@@ -53,10 +63,45 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
         try:
             content = read_content(path, settings, sidecar, given)
         except RecordingError as err:
+            with contextlib.suppress(RecordingError):
+                signals = read_signals(path, settings, sidecar, given, with_pose=False)
+                if is_inertial(signals):
+                    return _without_pose(signals)
             # Its topics are listed nevertheless, so that the user sees what to map.
             recording = open_recording(path, given.messages if given else ())
             return _without_flight(recording, err)
     return _with_flight(content, sidecar)
+
+
+def _without_pose(signals: Signals) -> Inspection:
+    """Return what a recording of gyro, accelerometer and motor commands alone holds."""
+    samples = signals.contents.samples
+    times = [s.receive for s in samples.values() if len(s.receive)]
+    first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+    measured = {name: _measured(series) for name, series in signals.series.items()}
+    flown = sum(end - begin for begin, end in flying(signals))
+    text = (
+        f"no pose was recorded: the {flown:.1f} s with turning motors are fitted without motion "
+        "capture, by body rate and specific force"
+    )
+    return Inspection(
+        path=str(signals.recording.path),
+        format=signals.recording.format,
+        size=_size(signals.recording.path),
+        started=_date(first),
+        duration=(last - first) * 1e-9,
+        topic_map=signals.topic_map.name,
+        problem=None if flown else "nothing flies in it: the motors only idle",
+        topics=_topics(signals.recording, signals.places, samples),
+        signals=_signals(signals.series, signals.places),
+        missions=(),
+        inlets=inlets(measured, trajectory=False),
+        coefficients=(),
+        clock={},
+        battery=_battery(signals.series),
+        notes=tuple(dataclasses.asdict(note) for note in (Note("info", "", text), *signals.notes)),
+        damage=signals.damage,
+    )
 
 
 def _without_flight(recording: Recording, problem: RecordingError) -> Inspection:
@@ -89,7 +134,6 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
     measured = {name: _measured(series) for name, series in content.series.items()}
-    voltage = content.series.get("battery_voltage")
     return Inspection(
         path=str(recording.path),
         format=recording.format,
@@ -98,23 +142,13 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
         duration=(last - first) * 1e-9,
         topic_map=content.topic_map.name,
         problem=None if missions else "nothing flies in it: no mission was found",
-        topics=tuple(_topic(content, t.name, t.type, t.count) for t in recording.topics),
-        signals=tuple(
-            SignalReport(
-                name,
-                content.places[name].topic,
-                SIGNALS[name][1],
-                len(series.time),
-                _rate(series.time),
-                measured[name],
-            )
-            for name, series in content.series.items()
-        ),
+        topics=_topics(recording, content.places, content.samples),
+        signals=_signals(content.series, content.places),
         missions=missions,
         inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
         coefficients=informed(content.series, measured, missions),
         clock=_clock(content),
-        battery=((float(voltage.values[0, 0]), float(voltage.values[-1, 0])) if voltage else None),
+        battery=_battery(content.series),
         notes=tuple(dataclasses.asdict(note) for note in content.notes),
         damage=content.damage,
     )
@@ -139,9 +173,38 @@ def _measured(series: Series) -> tuple[int, ...]:
     return tuple(int(i) for i in np.flatnonzero(np.isfinite(series.values).any(axis=0)))
 
 
-def _topic(content: Content, name: str, kind: str, count: int) -> TopicReport:
-    signals = tuple(s for s, place in content.places.items() if place.topic == name)
-    samples = content.samples.get(name)
+def _battery(series: Mapping[str, Series]) -> tuple[float, float] | None:
+    voltage = series.get("battery_voltage")
+    return None if voltage is None else (float(voltage.values[0, 0]), float(voltage.values[-1, 0]))
+
+
+def _signals(series: Mapping[str, Series], places: Mapping[str, Place]) -> tuple[SignalReport, ...]:
+    return tuple(
+        SignalReport(
+            name,
+            places[name].topic,
+            SIGNALS[name][1],
+            len(samples.time),
+            _rate(samples.time),
+            _measured(samples),
+        )
+        for name, samples in series.items()
+    )
+
+
+def _topics(
+    recording: Recording, places: Mapping[str, Place], samples: Mapping[str, Samples]
+) -> tuple[TopicReport, ...]:
+    return tuple(
+        _topic(
+            topic, samples.get(topic.name), [s for s, p in places.items() if p.topic == topic.name]
+        )
+        for topic in recording.topics
+    )
+
+
+def _topic(topic: Topic, samples: Samples | None, held: Sequence[str]) -> TopicReport:
+    name, kind, count, signals = topic.name, topic.type, topic.count, tuple(held)
     if samples is None or len(samples.receive) < 2:
         return TopicReport(name, kind, count, None, None, None, None, signals)
     time = _seconds(samples)

@@ -12,7 +12,7 @@ from tuner.flights.formats import is_tabular
 from tuner.flights.locate import Place
 from tuner.flights.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
 from tuner.flights.stamps import believe
-from tuner.flights.units import to_enu_flu, to_si
+from tuner.flights.units import ATTITUDES, quaternion_of, to_enu_flu, to_si
 
 #: Signals for which the time of recording is as good as a stamp.
 UNHURRIED = {"lap", "battery_voltage"}
@@ -76,9 +76,11 @@ def extract(
 def _values(samples: Samples, signal: str, place: Place) -> Array:
     columns, _, _ = SIGNALS[signal]
     fields: Sequence[str] = place.fields
-    if place.source.quaternion == "xyzw" and columns == 4 and "attitude" in signal:
+    if place.source.quaternion == "xyzw" and signal in ATTITUDES:
         fields = (fields[3], *fields[:3])
     values = to_si(np.column_stack([samples.fields[name] for name in fields]), place.unit)
+    if place.source.quaternion == "rpy" and signal in ATTITUDES:
+        values = quaternion_of(values)
     if place.source.rotor is not None:
         rotor = samples.fields[place.source.rotor]
         spread = np.full((len(values), columns), np.nan)

@@ -26,6 +26,8 @@ SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
     "attitude_setpoint": (4, "", "hold"),
     "rate_setpoint": (3, "rad/s", "hold"),
     "thrust_setpoint": (1, "", "hold"),
+    "commanded_thrust": (1, "N", "hold"),
+    "commanded_torque": (3, "N m", "hold"),
     "reference_position": (3, "m", "hold"),
     "reference_velocity": (3, "m/s", "hold"),
     "reference_acceleration": (3, "m/s^2", "hold"),

@@ -74,6 +74,17 @@ def _open_ulog(path: Path, _: tuple[Path, ...]) -> Recording:
     return ULogRecording(path)
 
 
+def _is_micro_sd(head: Head) -> bool:
+    """Return whether a file begins as a log of version 1 or 2: a byte 0xBC is that of any text."""
+    return head.start[:1] == b"\xbc" and head.start[1:3] in (b"\x01\x00", b"\x02\x00")
+
+
+def _open_micro_sd(path: Path, _: tuple[Path, ...]) -> Recording:
+    from tuner.flights.micro_sd import MicroSdRecording  # noqa: PLC0415
+
+    return MicroSdRecording(path)
+
+
 def _is_table(head: Head) -> bool:
     """Return whether a file is Parquet, or text with a separator in its first line."""
     line, _, _ = head.start.partition(b"\n")
@@ -92,6 +103,7 @@ def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:
 READERS: tuple[Reader, ...] = (
     Reader("ros", "ROS 1 .bag, ROS 2 folders, .db3 and .mcap", _is_ros, _open_ros),
     Reader("ulog", "PX4 .ulg", lambda head: head.start.startswith(b"ULog"), _open_ulog),
+    Reader("micro_sd", "Crazyflie micro-SD logs", _is_micro_sd, _open_micro_sd),
     Reader("table", ".csv and .parquet", _is_table, _open_table, tabular=True),
 )
 

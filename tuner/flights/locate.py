@@ -100,7 +100,9 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         return "" if wild else f"it is not known where {topic} ({kind}) holds the {signal}"
     missing = recording.lacking(topic, fields)
     if missing:
-        absent = is_tabular(recording.format) and len(missing) == len(fields)
+        # nobody expects a table, or any topic whatsoever, to hold all that a map knows
+        anywhere = is_tabular(recording.format) or source.topic == "*"
+        absent = anywhere and len(missing) == len(fields)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
         hint = f", did you mean '{near[0]}'?" if near else ""
         what = f"{topic} has no field" if topic else "there is no column"

@@ -130,7 +130,7 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
     if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
     ground = _ground(time, height, grounded)
-    return _stretches(time, ~grounded & (height > ground + CLEAR))
+    return stretches(time, ~grounded & (height > ground + CLEAR))
 
 
 def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -175,7 +175,7 @@ def _runs(height: Array, where: NDArray[np.intp]) -> list[Array]:
     return np.split(height[where], np.flatnonzero(np.diff(where) > 1) + 1)
 
 
-def _stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
+def stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """Return the stretches in which a condition holds, breaks of a moment bridged."""
     index = np.flatnonzero(up)
     if len(index) == 0:

@@ -14,7 +14,7 @@ from tuner.flights import formats as recording_formats
 from tuner.flights.flight import SIGNALS
 from tuner.flights.formats import is_tabular
 from tuner.flights.recording import Clock
-from tuner.flights.units import UNITS
+from tuner.flights.units import ATTITUDES, UNITS
 from tuner.yaml_files.section import Section, Whole, read_model, refuse
 from tuner.yaml_files.shipped import configs_folder, find_config
 
@@ -45,7 +45,8 @@ class Source(Section):
         Axes of the recorded numbers: ``enu_flu`` as ROS has them, ``ned_frd`` as PX4 has them;
         None is the usual one of the message type.
     quaternion
-        Order of the recorded quaternion, as `fields` lists it.
+        Order of the recorded quaternion, as `fields` lists it; ``rpy`` for an attitude that was
+        recorded as roll, pitch and yaw, turned about z first, then y, then x.
     stamp
         ``header`` prefers the time in the message, ``receive`` the time of recording.
     """
@@ -55,7 +56,7 @@ class Source(Section):
     rotor: str | None = None
     unit: str | None = None
     frame: Literal["enu_flu", "ned_frd"] | None = None
-    quaternion: Literal["wxyz", "xyzw"] = "wxyz"
+    quaternion: Literal["wxyz", "xyzw", "rpy"] = "wxyz"
     stamp: Literal["header", "receive"] = "header"
 
     @model_validator(mode="before")
@@ -130,9 +131,11 @@ class TopicMap(Section):
                 raise refuse(f"unknown signal '{name}'", did_you_mean(name, SIGNALS))
             columns = SIGNALS[name][0]
             for source in sources:
-                count = columns if source.fields is None else len(source.fields)
-                if source.rotor is None and count != columns:
-                    raise refuse(f"signal '{name}' has {count} fields", f"name all {columns}")
+                angles = source.quaternion == "rpy" and name in ATTITUDES
+                wanted = 3 if angles else columns
+                count = wanted if source.fields is None else len(source.fields)
+                if source.rotor is None and count != wanted:
+                    raise refuse(f"signal '{name}' has {count} fields", f"name all {wanted}")
         return self
 
     def under(self, namespace: str) -> TopicMap:

@@ -33,7 +33,9 @@ WORLD = {
     "reference_velocity",
     "reference_acceleration",
 }
-BODY = {"body_rate", "acceleration", "rate_setpoint"}
+BODY = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
+#: Signals that are quaternions.
+ATTITUDES = {"attitude", "attitude_setpoint"}
 
 
 def to_si(values: Array, unit: str) -> Array:
@@ -54,9 +56,22 @@ def to_enu_flu(values: Array, signal: str) -> Array:
     if signal in BODY:
         forward, right, down = values.T
         return np.column_stack([forward, -right, -down])
-    if signal in ("attitude", "attitude_setpoint"):
+    if signal in ATTITUDES:
         w, x, y, z = values.T
         return np.column_stack([w + z, x + y, x - y, w - z]) / math.sqrt(2)
     if signal == "thrust_setpoint":  # PX4's thrust points down
         return -values
     return values
+
+
+def quaternion_of(angles: Array) -> Array:
+    """Return (n, 4) quaternions of (n, 3) roll, pitch and yaw in rad, turned about z, y, then x."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(0.5 * angles.T), np.sin(0.5 * angles.T)
+    return np.column_stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )

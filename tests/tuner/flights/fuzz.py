@@ -26,6 +26,7 @@ import numpy as np
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from tests.tuner.flights import making
+from tests.tuner.flights.micro_sd import log_of
 from tuner.errors import InputError
 from tuner.flights import inspect_recordings, load_flights
 
@@ -97,6 +98,17 @@ def _ulog(folder: Path) -> Path:
     return making.to_ulog(making.px4_messages(bag), folder / "base.ulg", boot=boot)
 
 
+def _micro_sd(folder: Path) -> Path:
+    time = np.arange(750) / 250
+    x, y, z = np.sin(time), np.cos(time), 1 + 0.1 * time
+    columns = {
+        f"stateEstimateZ.{a}": ("h", 1000 * v) for a, v in zip("xyz", (x, y, z), strict=True)
+    }
+    columns |= {f"ctrlLee.rpy{a}": ("f", 0.1 * v) for a, v in zip("xyz", (x, y, x), strict=True)}
+    columns |= {f"motor.m{i}": ("H", 3e4 + 1e3 * x) for i in range(1, 5)}
+    return log_of(time, columns, folder / "base")
+
+
 FORMATS: dict[str, Callable[[Path], Path]] = {
     "bag": _short_bag,
     "bag-bz2": _packed("bz2"),
@@ -105,6 +117,7 @@ FORMATS: dict[str, Callable[[Path], Path]] = {
     "mcap": _ros2(StoragePlugin.MCAP, CompressionMode.NONE),
     "mcap-zstd": _ros2(StoragePlugin.MCAP, CompressionMode.STORAGE),
     "ulog": _ulog,
+    "micro_sd": _micro_sd,
     "csv": _csv,
     "parquet": _parquet,
 }

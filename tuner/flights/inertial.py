@@ -1,0 +1,87 @@
+"""Flights without motion capture: gyro, accelerometer and motor commands, and nothing else.
+
+A pose is what a simulation is held against; without one, body rate and specific force remain, which
+need none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tuner.disk import readable
+from tuner.errors import RecordingError
+from tuner.flights.content import Settings, Signals, given_map, read_signals
+from tuner.flights.flight import Note, Series
+from tuner.flights.mission import IDLE, SHORTEST, stretches
+from tuner.flights.sidecar import read_sidecar
+
+#: What a recording must hold.
+NEEDS = ("body_rate", "acceleration", "command")
+
+
+@dataclass(frozen=True)
+class InertialFlight:
+    """What gyro, accelerometer and motor commands say of one flight.
+
+    Attributes
+    ----------
+    name, path
+        Where it comes from.
+    series
+        `NEEDS`, and the battery's voltage where it was recorded; in s since the first sample.
+    flying
+        Stretches, in s, in which the motors turn faster than idle.
+    notes
+        What was dropped, repaired or doubted.
+    """
+
+    name: str
+    path: str
+    series: Mapping[str, Series]
+    flying: tuple[tuple[float, float], ...]
+    notes: tuple[Note, ...]
+
+
+def is_inertial(signals: Signals) -> bool:
+    """Return whether a recording lacks a pose, but has what a flight can be judged by without."""
+    has_pose = {"position", "attitude"} <= set(signals.series)
+    return not has_pose and set(NEEDS) <= set(signals.series)
+
+
+def flying(signals: Signals) -> tuple[tuple[float, float], ...]:
+    """Return the stretches, in s, in which the motors turn faster than idle."""
+    commands = signals.series["command"]
+    turns = np.asarray(commands.values.mean(axis=1) > IDLE, dtype=np.bool_)
+    runs = stretches(commands.time, turns)
+    return tuple((begin, end) for begin, end in runs if end - begin >= SHORTEST)
+
+
+def read_inertial(
+    path: Path, *, topics: str | Path | None = None, namespace: str = ""
+) -> InertialFlight | None:
+    """Read a recording that holds no pose; None of one that does, or that lacks `NEEDS`.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or nothing flies in it.
+    ConfigError
+        The topic map or the side-car is wrong.
+    """
+    settings, sidecar = Settings(topics, namespace), read_sidecar(path)
+    with readable(path):
+        given = given_map(path, settings, sidecar)
+        signals = read_signals(path, settings, sidecar, given, with_pose=False)
+    if not is_inertial(signals):
+        return None
+    runs = flying(signals)
+    if not runs:
+        raise RecordingError(path, "nothing flies in it: the motors only idle", "inspect it")
+    kept = {
+        name: signals.series[name] for name in (*NEEDS, "battery_voltage") if name in signals.series
+    }
+    return InertialFlight(path.stem, str(path), kept, runs, signals.notes)
