@@ -26,6 +26,10 @@ class InputError(Exception):
         self.remedy = remedy
         super().__init__(" ".join(f"{where}: {what}; {remedy}".split()))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """Survive the way from another process."""
+        return type(self), (self.where, self.what, self.remedy)
+
 
 class ConfigError(InputError):
     """A vehicle, controller or job file cannot be used."""

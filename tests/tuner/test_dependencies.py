@@ -23,7 +23,10 @@ USES = {
     None: ("sim_jax", "tuner", "examples"),
     "test": ("tests",),
     "bench": ("benchmarks",),
+    "cluster": ("tuner/engine",),
 }
+#: Folders inside others of which only an extra is asked.
+APART = {ROOT / folder for name in ("cluster",) for folder in USES[name]}
 
 
 def normalised(name: str) -> str:
@@ -60,6 +63,7 @@ def imported(*folders: str) -> set[str]:
         module.split(".")[0]
         for folder in folders
         for path in (ROOT / folder).rglob("*.py")
+        if ROOT / folder in APART or not APART & set(path.parents)
         for module in modules(
             ast.parse(path.read_text(encoding="utf-8")), by_name=folder != "tests"
         )

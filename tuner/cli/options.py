@@ -62,6 +62,16 @@ Topics = Annotated[
 Namespace = Annotated[
     str | None, Parameter(help="Expect this prefix before the topics that the topic map names.")
 ]
+Workers = Annotated[
+    int | None,
+    Parameter(help="Compute what is independent in this many local processes, a core each."),
+]
+Cluster = Annotated[
+    str | None,
+    Parameter(
+        help="Compute what is independent on a Dask cluster: a cluster file, or tcp://HOST:8786."
+    ),
+]
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.", negative=())]
 
 

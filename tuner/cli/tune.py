@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from tuner.cli.options import (
     TYPED,
+    Cluster,
     ControllerChoice,
     Flights,
     JobChoice,
@@ -18,6 +19,7 @@ from tuner.cli.options import (
     Quiet,
     Topics,
     VehicleChoice,
+    Workers,
 )
 
 Method = Annotated[
@@ -45,6 +47,9 @@ def tune(
     force: Annotated[bool, Parameter(negative=())] = False,
     cross_validate: Annotated[bool, Parameter(negative=())] = False,
     seed: int | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
+    dry_run: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
 ) -> None:
     """Fit the coefficients, validate them on held-out flights, and write the report.
@@ -70,7 +75,14 @@ def tune(
         Also fit without each flight in turn, and tabulate how well the other flights predict it.
     seed
         Start the random numbers from this seed. Default: the job file's, else 0.
+    dry_run
+        Print the job script that would bring the cluster file's workers, and do nothing.
     """
+    from tuner.engine.choose import engine_for, job_script_for
+
+    if dry_run:
+        print(job_script_for(cluster))
+        return
     from tuner.cli.progress import listening
     from tuner.cli.results import print_run
     from tuner.runtime import configure
@@ -94,7 +106,7 @@ def tune(
         seed=seed,
         bench=bench,
     )
-    with listening(quiet=quiet) as listener:
+    with engine_for(workers, cluster), listening(quiet=quiet) as listener:
         folder, result = run(
             options,
             out=out,

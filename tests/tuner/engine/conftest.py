@@ -1,0 +1,10 @@
+import pytest
+
+from tuner.engine import HERE, engine_for, using
+
+
+@pytest.fixture(scope="session")
+def two_workers():
+    """Two local workers, started once for all tests that ask for them."""
+    with engine_for(2) as engine, using(HERE):
+        yield engine

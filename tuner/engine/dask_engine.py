@@ -1,0 +1,152 @@
+"""Dask as the engine: its clusters, scheduler and retries; here are only the ends of its wires.
+
+A task that a lost worker had is computed again by another, at most as often as Dask's setting
+``distributed.scheduler.allowed-failures`` says, three times. What a client's end needs beside that:
+reports and log lines come back over Dask's events, and what goes wrong becomes one line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+import uuid
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, Executor, Future
+from typing import Any, TypeVar
+
+from distributed import Client, Event, KilledWorker
+from distributed.comm import CommClosedError
+
+from tuner.engine.cluster_file import ClusterFile
+from tuner.engine.clusters import cluster_of, connected
+from tuner.engine.engine import Engine, Report, Task
+from tuner.engine.store import Store
+from tuner.engine.worker import SetUp, Shared, run_task, stop_name
+from tuner.errors import InputError
+from tuner.runtime import cache_folder, configure
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class EngineError(InputError):
+    """What computes elsewhere is gone or cannot go on."""
+
+
+class OnDask(Engine):
+    """Computes tasks in the workers of a Dask cluster.
+
+    Parameters
+    ----------
+    client
+        Connected.
+    at_once
+        Workers that there are or will be.
+    store
+        Through which shared values travel.
+    devices
+        Of each worker.
+    """
+
+    def __init__(self, client: Client, at_once: int, store: Store, devices: int) -> None:
+        self.at_once = at_once
+        self.executor: Executor = client.get_executor(pure=False)
+        self._client, self._store, self._devices = client, store, devices
+        self._topic = f"tune-{uuid.uuid4().hex}"
+        self._listeners: dict[str, Report] = {}
+        client.subscribe_topic(self._topic, self._heard)
+
+    def submit(
+        self, function: Task[T, R], task: T, on_report: Report = lambda _: None
+    ) -> Future[R]:
+        """Have a worker compute a task."""
+        identity = uuid.uuid4().hex
+        self._listeners[identity] = on_report
+        outcome: Future[R] = Future()
+        with self._translated():
+            inner = self.executor.submit(
+                run_task, function, task, identity, self._topic, self._devices
+            )
+
+        def ended(inner: Future[R]) -> None:
+            self._listeners.pop(identity, None)
+            if outcome.cancelled():
+                return
+            try:
+                with self._translated():
+                    outcome.set_result(inner.result())
+            except BaseException as error:
+                outcome.set_exception(error)
+
+        def cancelled(outcome: Future[R]) -> None:
+            if outcome.cancelled():
+                with contextlib.suppress(OSError, TimeoutError, RuntimeError):
+                    Event(stop_name(identity), client=self._client).set()
+                inner.cancel()
+
+        inner.add_done_callback(ended)
+        outcome.add_done_callback(cancelled)
+        return outcome
+
+    def share(self, value: T) -> Callable[[], T]:
+        """Return what gives workers a value, through the store."""
+        return Shared(self._store.url, self._store.put(pickle.dumps(value, protocol=5)))
+
+    def _heard(self, event: tuple[float, Any]) -> None:
+        _, message = event
+        listener = self._listeners.get(message["task"])
+        if listener is None:
+            return
+        if "log" in message:
+            name, level, line = message["log"]
+            logging.getLogger(name).log(level, "%s", line)
+        else:
+            listener(message["report"])
+
+    @contextlib.contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Turn what Dask says of its own failures into one line."""
+        try:
+            yield
+        except KilledWorker as error:
+            raise EngineError(
+                "workers",
+                f"ended {error.allowed_failures + 1} times over the same task",
+                "give each more memory, as memory: 4GiB in the cluster file, or use fewer",
+            ) from None
+        except (CancelledError, CommClosedError, TimeoutError, OSError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and self._client.status == "running":
+                raise
+            raise EngineError(
+                "scheduler",
+                "does not answer any more",
+                "start it again; a search goes on with --out and --resume",
+            ) from None
+
+
+@contextlib.contextmanager
+def on_dask(file: ClusterFile) -> Iterator[Engine]:
+    """Start a cluster, or connect to one; end what was started.
+
+    Raises
+    ------
+    InputError
+        No scheduler answers, or what the file names is not there.
+    """
+    configure()
+    import jax  # noqa: PLC0415 (slow, and configured first)
+
+    devices = len(jax.devices("cpu"))
+    store = Store(file.store or str(cache_folder() / "shared"))
+    with contextlib.ExitStack() as stack:
+        cluster = stack.enter_context(cluster_of(file))
+        client = stack.enter_context(connected(cluster, file))
+        local = file.address is None and file.jobs is None and file.kubernetes is None
+        pool = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        client.register_plugin(
+            SetUp(devices, tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
+        )
+        at_once = file.workers if file.address is None else max(1, len(client.nthreads()))
+        yield OnDask(client, at_once, store, devices)

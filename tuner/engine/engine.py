@@ -1,0 +1,125 @@
+"""What an engine is: tasks in, results out, in order, wherever they are computed.
+
+A task is a module's function and one argument that can be pickled; it gives the same result
+wherever and however often it is computed, so that an engine may compute it again after losing a
+worker. While it works it may report, see `Report`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+Report = Callable[[Any], None]
+"""Takes what a task has to say while it works: dicts, lists, strings and numbers, as in JSON."""
+Task = Callable[[T, Report], R]
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+class Engine(ABC):
+    """Computes tasks.
+
+    Attributes
+    ----------
+    at_once
+        How many tasks are computed side by side.
+    """
+
+    at_once: int
+
+    @abstractmethod
+    def submit(self, function: Task[T, R], task: T, on_report: Report = _ignore) -> Future[R]:
+        """Have a task computed.
+
+        Parameters
+        ----------
+        function
+            Of a module, so that other processes find it by its name.
+        task
+            Its first argument; the second is where it reports.
+        on_report
+            Called with every report, possibly from another thread.
+
+        Returns
+        -------
+        Future
+            Its result or its error; to cancel it ends the task at its next report.
+        """
+
+    @abstractmethod
+    def share(self, value: T) -> Callable[[], T]:
+        """Return what gives tasks a value that many of them need: it travels once a process."""
+
+    def map(
+        self,
+        function: Task[T, R],
+        tasks: Sequence[T],
+        on_report: Callable[[int, Any], None] = _ignore,
+    ) -> list[R]:
+        """Return the results of tasks in their order; whatever goes wrong ends the others.
+
+        Parameters
+        ----------
+        function, tasks
+            As of `submit`.
+        on_report
+            Called with the number of a task and its report.
+        """
+
+        def listener(number: int) -> Report:
+            return lambda report: on_report(number, report)
+
+        futures: list[Future[R]] = []
+        try:
+            for number, task in enumerate(tasks):
+                futures.append(self.submit(function, task, listener(number)))
+            return [future.result() for future in futures]
+        except BaseException:
+            for future in futures:
+                future.cancel()
+            raise
+
+
+class Here(Engine):
+    """Computes each task when it is submitted, in this process, on all its devices."""
+
+    at_once = 1
+
+    def submit(self, function: Task[T, R], task: T, on_report: Report = _ignore) -> Future[R]:
+        """Compute a task; its error is raised at once."""
+        future: Future[R] = Future()
+        future.set_result(function(task, on_report))
+        return future
+
+    def share(self, value: T) -> Callable[[], T]:
+        """Return what returns the value itself."""
+        return lambda: value
+
+
+HERE = Here()
+_CURRENT: ContextVar[Engine] = ContextVar("ENGINE", default=HERE)
+
+
+def current() -> Engine:
+    """Return the engine in force: this process, unless `using` says otherwise."""
+    return _CURRENT.get()
+
+
+@contextmanager
+def using(engine: Engine) -> Iterator[Engine]:
+    """Have an engine compute what is asked for inside."""
+    token = _CURRENT.set(engine)
+    try:
+        yield engine
+    finally:
+        _CURRENT.reset(token)

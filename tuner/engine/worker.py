@@ -1,0 +1,163 @@
+"""In a worker: its cores and devices are set up, tasks report, shared values arrive."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pickle
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+from distributed import Event, Worker, WorkerPlugin, get_worker
+
+from tuner.engine.engine import HERE, Task, using
+from tuner.engine.store import Store
+from tuner.errors import InputError
+from tuner.runtime import configure
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Of linear algebra beside XLA: one, for every worker has its cores for itself."""
+
+
+class Stopped(Exception):  # noqa: N818 (no error: it was asked for)
+    """Whoever asked for a task wants it no longer."""
+
+
+@dataclass(frozen=True)
+class SetUp(WorkerPlugin):  # type: ignore[misc]
+    """What a worker does before its first task; a plugin of Dask's.
+
+    Attributes
+    ----------
+    devices
+        How many of XLA's devices share a batch: as many as where the job was started, for the last
+        bits of a result depend on it.
+    pool, cores
+        Numbers of the processor cores that workers on this machine share out, and how many each
+        takes; an empty pool leaves workers where their starter put them.
+    gpus
+        Of this machine.
+    """
+
+    devices: int
+    pool: tuple[int, ...] = ()
+    cores: int = 1
+    gpus: int = 0
+    name: str = "tune"
+
+    def setup(self, worker: Worker) -> None:
+        """Set a worker up."""
+        if self.pool:
+            first = self.cores * int(worker.name)
+            pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
+        if self.gpus:
+            os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
+        for name in THREADS:
+            os.environ.setdefault(name, "1")
+        flag = f"--xla_force_host_platform_device_count={self.devices}"
+        os.environ["XLA_FLAGS"] = " ".join([*_other_flags(), flag])
+        configure()
+
+
+def _other_flags() -> list[str]:
+    given = os.environ.get("XLA_FLAGS", "").split()
+    return [flag for flag in given if "host_platform_device_count" not in flag]
+
+
+def pin(cores: Collection[int]) -> None:
+    """Keep all threads of this process, those to come too, on some cores."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    for thread in Path("/proc/self/task").iterdir():
+        with contextlib.suppress(ProcessLookupError):  # it ended meanwhile
+            os.sched_setaffinity(int(thread.name), cores)
+
+
+def run_task(function: Task[T, R], task: T, identity: str, topic: str, devices: int) -> R:
+    """Compute a task in a worker, its reports and log lines sent where it was asked for.
+
+    Raises
+    ------
+    Stopped
+        It was cancelled: noticed when it reports.
+    """
+    worker, stop = get_worker(), Event(stop_name(identity))
+    _check_devices(devices)
+
+    def report(message: Any) -> None:
+        if stop.is_set():
+            raise Stopped
+        worker.log_event(topic, {"task": identity, "report": message})
+
+    def log(name: str, level: int, line: str) -> None:
+        worker.log_event(topic, {"task": identity, "log": [name, level, line]})
+
+    with using(HERE), _logging_to(log):
+        return function(task, report)
+
+
+def stop_name(identity: str) -> str:
+    """Return the name of the event that ends a task."""
+    return f"stop-{identity}"
+
+
+def _check_devices(wanted: int) -> None:
+    import jax  # noqa: PLC0415 (slow, and configured first)
+
+    there = len(jax.devices("cpu"))
+    if there != wanted:
+        raise InputError(
+            "--cluster",
+            f"its workers divide batches among {there} devices, this process among {wanted}, so "
+            "that the last digits would differ",
+            "restart its workers, or start from a machine like that which started them first",
+        )
+
+
+class _Lines(logging.Handler):
+    """Sends log records somewhere."""
+
+    def __init__(self, send: Callable[[str, int, str], None]) -> None:
+        super().__init__(logging.INFO)
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._send(record.name, record.levelno, record.getMessage())
+
+
+@contextlib.contextmanager
+def _logging_to(send: Callable[[str, int, str], None]) -> Iterator[None]:
+    logger, handler = logging.getLogger("tuner"), _Lines(send)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """A value that lies in a store, by its content.
+
+    Only this program's own processes write such values, and the digest comes with the task, over
+    Dask's channel: what a stranger puts into the store is never unpickled.
+    """
+
+    store: str
+    sha256: str
+
+    def __call__(self) -> Any:
+        """Return the value."""
+        return _arrived(self.store, self.sha256)
+
+
+@lru_cache(maxsize=2)
+def _arrived(store: str, sha256: str) -> Any:
+    return pickle.loads(Store(store).read(sha256))
