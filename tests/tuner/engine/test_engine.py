@@ -32,7 +32,7 @@ def test_results_come_in_the_order_of_the_tasks(engine):
 
 
 def test_what_the_user_did_wrong_arrives_as_it_was_raised(engine):
-    with pytest.raises(RecordingError, match="a.bag: is empty; record it again"):
+    with pytest.raises(RecordingError, match=r"a\.bag: is empty; record it again"):
         engine.map(tasks.refused, ["a.bag"])
 
 
