@@ -274,6 +274,7 @@ def simulate(
     rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
     precision: Precision = "float64",
+    forces: bool = False,
 ) -> tuple[Simulation, ...]:
     """Simulate a trajectory, as ``tune simulate`` does.
 
@@ -300,6 +301,8 @@ def simulate(
         makes every combination of several ranges.
     precision
         What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
+    forces
+        Whether each simulation has ``forces``: what acted along the flight, term by term.
 
     Returns
     -------
@@ -331,6 +334,7 @@ def simulate(
             rate=rate,
             grid=grid,
             precision=precision,
+            forces=forces,
         )
     )
 

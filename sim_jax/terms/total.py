@@ -1,4 +1,4 @@
-"""All terms, and their sum about the centre of mass."""
+"""All terms, their sum about the centre of mass, and each of them there."""
 
 from __future__ import annotations
 
@@ -49,4 +49,27 @@ def total_wrench(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: A
         force, moment = force + at_rotor, moment + arm.cross(at_rotor)
     for wrench in wrenches:
         force, moment = force + wrench.force, moment + wrench.moment
+    return Wrench(force, moment)
+
+
+def wrench_of_each_term(
+    vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air
+) -> dict[str, Wrench]:
+    """Return a term's name -> its force and moment about the centre of mass, body axes.
+
+    What a term does at the rotors is part of both. A term that does not act is left out; the others
+    add up to `total_wrench`.
+    """
+    acting = {term.__name__: term(vehicle, motion, rotor_speed, air) for term in TERMS}
+    return {
+        name: _about_center_of_mass(wrench, air)
+        for name, wrench in acting.items()
+        if wrench is not None
+    }
+
+
+def _about_center_of_mass(wrench: Wrench, air: Air) -> Wrench:
+    force, moment = wrench.force, wrench.moment
+    for arm, at_rotor in zip(air.arms, wrench.at_rotors, strict=False):
+        force, moment = force + at_rotor, moment + arm.cross(at_rotor)
     return Wrench(force, moment)

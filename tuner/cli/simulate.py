@@ -23,6 +23,7 @@ def simulate(
     rate: float = 100.0,
     sweep: Annotated[list[str] | None, Many] = None,
     precision: Literal["float32", "float64"] = "float64",
+    forces: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a vehicle and its controller on a trajectory, and write the flight.
@@ -51,6 +52,8 @@ def simulate(
         Vary a coefficient: NAME=LOW:HIGH:COUNT. Several of them give all combinations.
     precision
         Compute in this precision. float32 is twice as fast for many vehicles, and 0.02 mm off.
+    forces
+        Write force and moment of each term along the flights into this FILE.csv, too.
     """
     from tuner.cli.tables import print_flights
     from tuner.runtime import configure
@@ -75,7 +78,8 @@ def simulate(
         rate=rate,
         grid=grid_of(sweep or ()) or None,
         precision=precision,
+        forces=forces is not None,
     )
-    summaries = write_flights(flights, out)
+    summaries = write_flights(flights, out, forces=forces)
     if not quiet:
         print_flights(summaries, out)

@@ -11,7 +11,7 @@ the vehicle that flies.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,7 +39,12 @@ from tuner.objective.criterion import Criterion, Point, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import fly, simulated_at_stamps
+from tuner.objective.residuals import (
+    environment_of,
+    simulate_segments,
+    simulated_at_stamps,
+    trace_of,
+)
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
@@ -51,6 +56,7 @@ from tuner.objective.windows import Window, windows_of
 from tuner.padding import padded_size
 from tuner.recordings import Recording
 from tuner.search.continuation import FAR
+from tuner.simulation.forces import Forces, acting, in_order
 from tuner.simulation.table import roll_pitch_yaw
 
 POSE = ("position", "attitude")
@@ -60,6 +66,8 @@ BEYOND = 0.02
 """s simulated beyond a window, for stamps that are late."""
 LOOSE = 10.0
 """Multiple of the noise by which a simulation may miss before its start is doubted."""
+FORCES_RATE = 50.0
+"""Hz at which forces along a flight are kept: they are drawn, nothing is computed from them."""
 ROUNDS = 3
 """Steps towards the likeliest start."""
 
@@ -122,6 +130,8 @@ class _Group:
         self._schedule = schedule_of(controller)
         self._has_mixer = INLETS[inlet].has_mixer
         self._windowed = not INLETS[inlet].closed_loop
+        self._seconds = seconds
+        self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self._windowed:
             fed = INLETS[inlet].fed
@@ -157,7 +167,7 @@ class _Group:
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         owner = np.asarray(self._segments.flight)
-        simulated, crash_times = _poses_at_stamps(
+        simulated, acted, crash_times = _flown(
             model,
             self._segments,
             jnp.asarray(self._late),
@@ -166,6 +176,7 @@ class _Group:
             samples=self._samples,
             limits=self._limits,
             states=jnp.asarray(self._likeliest_starts(model)) if self._windowed else None,
+            stride=self._stride,
         )
         errors, first = {}, 0
         for recording, windows in zip(self._recordings, self._windows, strict=True):
@@ -181,7 +192,12 @@ class _Group:
             )
             crashed = not self._windowed and crash <= flight.duration
             errors[flight.name] = FlightErrors(
-                flight.name, position, attitude, laps_of(flight), crash if crashed else None
+                flight.name,
+                position,
+                attitude,
+                laps_of(flight),
+                crash if crashed else None,
+                self._forces(acted, first, windows, min(crash, flight.duration)),
             )
             first += len(windows)
         return errors
@@ -199,6 +215,27 @@ class _Group:
             recorded, flown = roll_pitch_yaw(recorded), roll_pitch_yaw(flown)
             return SignalErrors(time[used] + window.begin, recorded, short_way(flown - recorded))
         return SignalErrors(time[used] + window.begin, recorded, flown - recorded)
+
+    def _forces(
+        self, acted: Mapping[str, JaxArray], first: int, windows: Sequence[Window], end: float
+    ) -> Forces:
+        """Return what acted along the segments of a flight, behind each other, up to a time in s.
+
+        A window's last instants, which the next one begins with, are left out.
+        """
+        of_term = {name: np.asarray(values) for name, values in in_order(acted).items()}
+        count = len(next(iter(of_term.values())))
+        time = np.arange(count) * self._stride / self._schedule.log_rate
+        shown = time < (self._seconds if self._windowed else end)
+        segments = range(first, first + len(windows))
+        whole = Forces(
+            np.concatenate([time[shown] + window.begin for window in windows]),
+            {
+                name: np.concatenate([values[shown, :, segment] for segment in segments])
+                for name, values in of_term.items()
+            },
+        )
+        return whole.before(windows[0].flight.duration) if self._windowed else whole
 
     def _likeliest_starts(self, model: Model) -> Array:
         """Return the likeliest starts (L, F), in the segments' standard deviations."""
@@ -235,7 +272,7 @@ class _Group:
 
 
 @eqx.filter_jit
-def _poses_at_stamps(
+def _flown(
     model: Model,
     segments: Segments,
     late: Float[JaxArray, " F"],
@@ -245,14 +282,21 @@ def _poses_at_stamps(
     samples: int,
     limits: Limits,
     states: Float[JaxArray, "L F"] | None,
-) -> tuple[dict[str, Float[JaxArray, "n c F"]], Float[JaxArray, " F"]]:
+    stride: int,
+) -> tuple[
+    dict[str, Float[JaxArray, "n c F"]],
+    dict[str, Float[JaxArray, "m 6 F"]],
+    Float[JaxArray, " F"],
+]:
     """Return signal -> what the simulation has at the recorded stamps, and when it crashed in s.
+
+    Between the two, term -> what acted at every ``stride``-th sample.
 
     A stamp that is so late that it was taken before the simulation begins, or so early that it was
     taken behind its end, is compared with the simulation's first or last sample.
     """
     windowed = states is not None
-    trace = fly(
+    rollout = simulate_segments(
         model,
         segments,
         schedule,
@@ -262,7 +306,15 @@ def _poses_at_stamps(
         states=states,
         conditions=conditions,
     )
+    trace = trace_of(rollout, model, segments)
     rate = float(schedule.log_rate)
+    acted = acting(
+        model.vehicle,
+        rollout.log.motion,
+        rollout.log.rotor_speed,
+        environment_of(model, segments, conditions),
+        rate=rate,
+    )
     on_time = jnp.zeros((len(OFFSETS), segments.count))
     simulated = {}
     for signal in POSE:
@@ -276,4 +328,4 @@ def _poses_at_stamps(
             on_time[: len(CLOCKS)],
             rate=rate,
         )
-    return simulated, trace.crash_time
+    return simulated, {n: values[::stride] for n, values in acted.items()}, trace.crash_time

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.flights.flight import Array, Flight
 from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.simulation.forces import Forces
 
 Pose = Literal["position", "attitude"]
 
@@ -64,6 +65,8 @@ class FlightErrors:
         (k,) s at which laps were completed.
     crash_time
         s; None for a flight that did not crash.
+    forces
+        What acted along the simulation, term by term, until it crashed.
     """
 
     name: str
@@ -71,6 +74,7 @@ class FlightErrors:
     attitude: SignalErrors
     laps: Array
     crash_time: float | None
+    forces: Forces | None = None
 
     def between(self, start: float, end: float) -> FlightErrors:
         """Return the errors from ``start`` in s to before ``end``."""

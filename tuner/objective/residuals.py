@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
-from sim_jax.rollout import rollout
+from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
@@ -49,6 +49,49 @@ def fly(
     states: Float[Array, "L F"] | None = None,
     conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
 ) -> Trace:
+    """Simulate every segment, and keep what it is compared by; as `simulate_segments` takes it."""
+    flown = simulate_segments(
+        model,
+        segments,
+        schedule,
+        samples=samples,
+        horizon=horizon,
+        limits=limits,
+        states=states,
+        conditions=conditions,
+    )
+    return trace_of(flown, model, segments)
+
+
+def trace_of(flown: Rollout, model: Model, segments: Segments) -> Trace:
+    """Return what simulated segments are compared by."""
+    motion, markers = flown.log.motion, markers_of(model.vehicle)
+    position, attitude = motion.position, motion.attitude
+    if markers is not None:
+        position, attitude = markers.recorded(motion)
+    logged = {
+        "position": (position.x, position.y, position.z),
+        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
+        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
+        "rotor_speed": flown.log.rotor_speed,
+        "command": flown.log.command,
+    }
+    return Trace(
+        {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
+    )
+
+
+def simulate_segments(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    samples: int,
+    horizon: Int[Array, ""] | None,
+    limits: Limits,
+    states: Float[Array, "L F"] | None = None,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> Rollout:
     """Simulate every segment up to a horizon in samples.
 
     Parameters
@@ -69,7 +112,7 @@ def fly(
     if states is not None and segments.freedom is not None:
         start = moved(start, states * segments.freedom)
         inlet = trimmed(inlet, model.vehicle, states * segments.freedom)
-    flown = rollout(
+    return rollout(
         model.vehicle,
         model.controller,
         schedule,
@@ -79,20 +122,6 @@ def fly(
         environment=environment_of(model, segments, conditions),
         horizon=horizon,
         limits=limits,
-    )
-    motion = flown.log.motion
-    position, attitude = motion.position, motion.attitude
-    if markers is not None:
-        position, attitude = markers.recorded(motion)
-    logged = {
-        "position": (position.x, position.y, position.z),
-        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
-        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
-        "rotor_speed": flown.log.rotor_speed,
-        "command": flown.log.command,
-    }
-    return Trace(
-        {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
     )
 
 

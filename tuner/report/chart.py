@@ -15,6 +15,7 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY = "#8a8a8a"
 
 Scale = Literal["linear", "log"]
+Dash = Literal["solid", "dot", "dash"]
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Look:
     """How a line looks; colour alone never distinguishes two."""
 
     colour: str
-    dash: Literal["solid", "dot", "dash"] = "solid"
+    dash: Dash = "solid"
     width: float = 1.5
     marks: bool = False
 

@@ -18,20 +18,31 @@ TRACES_FILE = "traces.npz"
 POINTS = 1200
 """Points of a curve: as many as a wide screen has pixels."""
 
+FORCE_POINTS = 300
+"""Points of a force's curve, of which a flight has dozens."""
+
 
 def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErrors]]) -> None:
     """Write ``traces.npz`` of simulation -> flight -> errors, thinned to what a screen can show.
 
     Per flight: times in s, positions in m, roll, pitch and yaw in degrees; first what was
-    recorded, then, with its name behind, what each simulation had.
+    recorded, then, with its name behind, what each simulation had. Of the last simulation also
+    ``acting_time`` and, as ``acting_TERM``, the (n, 6) force and moment of each term.
     """
     arrays: dict[str, Array] = {}
+    last: Mapping[str, FlightErrors] = {}
     for suffix, flights in simulations.items():
+        last = flights
         for flight, errors in flights.items():
             for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
                 arrays[f"{flight}/{signal}_time"] = _thinned(of_signal.time)
                 arrays[f"{flight}/{signal}"] = _thinned(of_signal.recorded)
                 arrays[f"{flight}/{signal}_{suffix}"] = _thinned(of_signal.simulated)
+    for flight, errors in last.items():
+        if errors.forces is not None:
+            arrays[f"{flight}/acting_time"] = _thinned(errors.forces.time, FORCE_POINTS)
+            for term, acted in errors.forces.of_term.items():
+                arrays[f"{flight}/acting_{term}"] = _thinned(acted, FORCE_POINTS)
     with whole_file(folder / TRACES_FILE) as unfinished, unfinished.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
@@ -48,6 +59,6 @@ def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
     return traces
 
 
-def _thinned(values: Array) -> Array:
-    step = max(1, int(np.ceil(len(values) / POINTS)))
+def _thinned(values: Array, points: int = POINTS) -> Array:
+    step = max(1, int(np.ceil(len(values) / points)))
     return values[::step]

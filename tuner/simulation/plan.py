@@ -43,6 +43,7 @@ def fly(
     rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
     precision: Precision = "float64",
+    forces: bool = False,
 ) -> Iterator[Simulation]:
     """Fly a trajectory once, or with each vehicle of a grid.
 
@@ -62,6 +63,8 @@ def fly(
         Coefficient -> (B,) values.
     precision
         What to compute in.
+    forces
+        Whether to give what acted along each flight, term by term.
 
     Raises
     ------
@@ -89,4 +92,5 @@ def fly(
         rate=plan.rate,
         grid=grid,
         precision=plan.precision,
+        forces=forces,
     )

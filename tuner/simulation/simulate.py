@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.inlet import Inlet
@@ -21,6 +22,7 @@ from tuner.flights.flight import Array, Series
 from tuner.flights.resample import resample
 from tuner.model import Model, model_of, schedule_of, with_coefficients
 from tuner.parallel import in_pieces, over_devices, piece_that_fits
+from tuner.simulation.forces import Forces, forces_of
 from tuner.simulation.trajectory import Published, published
 
 #: Vehicles that fly at once; more take turns, so that memory stays bounded.
@@ -42,12 +44,15 @@ class Simulation:
         s at which the vehicle crashed and was frozen; None if it never did.
     coefficients
         What was varied for this flight: coefficient -> value.
+    forces
+        What acted until it crashed, term by term, if asked for.
     """
 
     time: Array
     signals: Mapping[str, Array]
     crash_time: float | None
     coefficients: Mapping[str, float]
+    forces: Forces | None = None
 
 
 def simulate(
@@ -59,6 +64,7 @@ def simulate(
     rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
     precision: Precision = "float64",
+    forces: bool = False,
 ) -> Iterator[Simulation]:
     """Fly a trajectory, starting at rest at its first point.
 
@@ -76,6 +82,8 @@ def simulate(
         Coefficient -> (B,) values of B vehicles; None flies the vehicle alone.
     precision
         What to compute in: single precision is twice as fast for many vehicles.
+    forces
+        Whether to give what acted along each flight, term by term.
 
     Yields
     ------
@@ -103,12 +111,14 @@ def simulate(
                 for name, values in logged.items()
             }
             signals["acceleration"] = _specific_force(clock, signals)
-            yield Simulation(
+            coefficients = {name: float(column[segment]) for name, column in columns.items()}
+            flight = Simulation(
                 time=clock,
                 signals=signals | sent,
                 crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
-                coefficients={name: float(column[segment]) for name, column in columns.items()},
+                coefficients=coefficients,
             )
+            yield _with_forces(flight, model) if forces else flight
 
 
 def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:
@@ -181,6 +191,14 @@ def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, 
         name: np.asarray(part.stacked(), dtype=np.float64).T[tick] for name, part in parts.items()
     }
     return sent | {"lap": reference.lap[tick, None].astype(np.float64)}
+
+
+def _with_forces(flight: Simulation, model: Model) -> Simulation:
+    """Return a simulation with what acted until it ended or crashed."""
+    values = {name: jnp.asarray(value) for name, value in flight.coefficients.items()}
+    forces = forces_of(with_coefficients(model, values).vehicle, flight.time, flight.signals)
+    crashed = flight.crash_time
+    return replace(flight, forces=forces if crashed is None else forces.before(crashed))
 
 
 def _specific_force(clock: Array, signals: Mapping[str, Array]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 from tuner.disk import check_file
 from tuner.errors import InputError
 from tuner.simulation.bag import write_bag
+from tuner.simulation.forces import forces_file
 from tuner.simulation.simulate import Simulation
 from tuner.simulation.table import write_csv
 
@@ -37,13 +39,24 @@ class Summary:
     tracking_rmse: tuple[float, float, float]
 
 
-def write_flights(simulations: Iterable[Simulation], path: Path) -> tuple[Summary, ...]:
+def write_flights(
+    simulations: Iterable[Simulation], path: Path, *, forces: Path | None = None
+) -> tuple[Summary, ...]:
     """Write flights as they come, as ``.csv`` or one of them as a ROS 1 ``.bag``.
+
+    Parameters
+    ----------
+    simulations
+        The flights, with their forces where ``forces`` is given.
+    path
+        Where they go.
+    forces
+        A ``.csv`` for what acted along them, term by term (`tuner.simulation.forces`).
 
     Raises
     ------
     InputError
-        The file's suffix is another, several flights are to go into one bag, or it cannot be
+        A file's suffix is another, several flights are to go into one bag, or it cannot be
         written.
     """
     writers: dict[str, Callable[[Iterator[Simulation], Path], None]] = {
@@ -53,14 +66,21 @@ def write_flights(simulations: Iterable[Simulation], path: Path) -> tuple[Summar
     if path.suffix not in writers:
         raise InputError(path, f"no flight is written as '{path.suffix}'", "name a .csv or a .bag")
     check_file(path)
+    if forces is not None:
+        if forces.suffix != ".csv" or forces == path:
+            raise InputError(forces, "forces are written as a .csv of their own", "name one")
+        check_file(forces)
     summaries: list[Summary] = []
+    with nullcontext() if forces is None else forces_file(forces) as append_forces:
 
-    def passing() -> Iterator[Simulation]:
-        for simulation in simulations:
-            summaries.append(summary_of(simulation))
-            yield simulation
+        def passing() -> Iterator[Simulation]:
+            for simulation in simulations:
+                summaries.append(summary_of(simulation))
+                if append_forces is not None and simulation.forces is not None:
+                    append_forces(simulation.forces, simulation.coefficients)
+                yield simulation
 
-    writers[path.suffix](passing(), path)
+        writers[path.suffix](passing(), path)
     return tuple(summaries)
 
 

@@ -63,6 +63,12 @@ def test_the_vehicle_that_flew_meets_its_recording(flight, updated):
         assert getattr(flown.rmse, axis) < 0.02, axis
     draggy = comparison.fly(with_values(updated, {"rotor_drag_coefficient": 8e-4}))["small_circle"]
     assert draggy.rmse.x > 100 * flown.rmse.x
+    thrust = flown.forces.of_term["thrust"][:, 2]
+    turned = np.interp(
+        flown.forces.time, flight.time, np.sum(flight.signals["rotor_speed"] ** 2, axis=1)
+    )
+    np.testing.assert_allclose(thrust, updated.aerodynamics.motor_constant * turned, rtol=0.02)
+    assert flown.forces.time[-1] == pytest.approx(flight.duration, abs=0.03)
 
 
 def test_angles_are_compared_the_short_way_round():
@@ -92,6 +98,7 @@ def test_a_vehicle_that_cannot_fly_crashes(flight, updated):
     crash = Comparison([Recording(flight)], ControllerFile()).fly(heavy)["small_circle"]
     assert 0 < crash.crash_time < 12
     assert crash.rmse.x is None
+    assert crash.crash_time - 0.03 < crash.forces.time[-1] < crash.crash_time
 
 
 def test_flights_of_different_length_fly_side_by_side(flight, updated):

@@ -94,6 +94,8 @@ def test_windows_are_compared_from_their_likeliest_starts(full_flight, full_bag,
     assert wrong.rmse.z > 3 * right.rmse.z
     assert right.position.time[-1] == pytest.approx(full_flight.duration, abs=0.6)
     assert np.all(np.diff(right.position.time) > 0)
+    assert np.all(np.diff(right.forces.time) > 0)
+    assert right.forces.of_term["thrust"].shape == (len(right.forces.time), 6)
 
 
 def test_commands_recorded_too_seldom_are_reported(flight, bag, updated, full_flight, full_bag):

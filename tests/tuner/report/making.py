@@ -30,6 +30,7 @@ from tuner.result import (
 )
 from tuner.search.iteration import Iteration
 from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.simulation.forces import Forces
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
@@ -82,7 +83,10 @@ def _errors(name: str, size: float) -> FlightErrors:
     error = size * np.column_stack([np.sin(time), np.cos(time), 0.1 * time])
     position = SignalErrors(time, recorded, error)
     attitude = SignalErrors(time, 10 * recorded, 10 * error)
-    return FlightErrors(name, position, attitude, np.array([2.0, 4.0]), None)
+    thrust, drag = np.zeros((300, 6)), np.zeros((300, 6))
+    thrust[:, 2], drag[:, 0], drag[:, 4] = 22.0, np.sin(time), 0.06 * np.sin(time)
+    forces = Forces(time, {"thrust": thrust, "rotor_drag": drag, "gravity": -thrust})
+    return FlightErrors(name, position, attitude, np.array([2.0, 4.0]), None, forces)
 
 
 def _knowledge(vehicle: VehicleFile, free: Sequence[str], undetermined: Direction) -> Knowledge:

@@ -16,6 +16,7 @@ from tuner.report.sections.effects import effects
 from tuner.report.sections.errors import errors
 from tuner.report.sections.findings import findings
 from tuner.report.sections.flights import flights
+from tuner.report.sections.forces import forces
 from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
@@ -34,6 +35,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     sources,
     errors,
     flights,
+    forces,
     effects,
     information,
     next_flight,
