@@ -21,7 +21,10 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 from hypothesis import settings
 
+from tests.demo import demo
 from tuner.runtime import cache_folder, set_environment
+
+__all__ = ["demo"]
 
 set_environment()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))

@@ -31,6 +31,7 @@ __all__ = [
     "export",
     "fit",
     "load_flight",
+    "read_run",
     "sensitivity",
     "simulate",
 ]

@@ -50,8 +50,10 @@ from tuner.uncertainty.verdict import (
 )
 from tuner.versions import PROGRAM, versions
 from tuner.wording.verdicts import judgement_in_words
+from tuner.yaml_files.document import commented, dump_yaml
 
 METRICS_FILE = "metrics.csv"
+CONTROLLER_FILE = "controller.yaml"
 
 
 def result_of(
@@ -216,11 +218,14 @@ def _flight(
 
 
 def write_folder(folder: Path, result: RunResult, vehicle: VehicleFile, job: Job) -> None:
-    """Write ``best_fit.yaml``, ``metrics.csv`` and, last, ``result.json``."""
+    """Write ``best_fit.yaml``, ``controller.yaml``, ``metrics.csv``, and last ``result.json``."""
+    settings = result.settings
     fitted = ", ".join(flight.name for flight in job.fitted)
     source = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", "flights": fitted}
     named = vehicle.replace(name=f"{job.settings.vehicle.name}_fitted", source=source)
     write_vehicle(named, folder / BEST_FIT_FILE, header=f"Fitted by tune to {fitted}.")
+    flown = commented("The controller as the fit flew it.") + dump_yaml(settings["controller"])
+    write_text(folder / CONTROLLER_FILE, flown)
     write_text(folder / METRICS_FILE, metrics(result))
     result.write(folder)
 

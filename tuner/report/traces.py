@@ -18,7 +18,7 @@ TRACES_FILE = "traces.npz"
 POINTS = 1200
 """Points of a curve: as many as a wide screen has pixels."""
 
-FORCE_POINTS = 300
+FORCE_POINTS = 400
 """Points of a force's curve, of which a flight has dozens."""
 
 

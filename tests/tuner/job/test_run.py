@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from tuner.comparison.comparison import Comparison
-from tuner.config import ControllerFile, Options, read_vehicle, values_of
+from tuner.config import ControllerFile, Options, read_controller, read_vehicle, values_of
 from tuner.errors import InputError
 from tuner.findings import Code
 from tuner.flights.load import load_flight
@@ -37,9 +37,8 @@ def truth():
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    bags = [str(path) for path in sorted(FLIGHTS.glob("*.bag"))]
-    return run(Options(bags), out=tmp_path_factory.mktemp("run") / "demo")
+def finished(demo):
+    return demo
 
 
 @pytest.mark.slow
@@ -91,6 +90,8 @@ def test_the_folder_holds_what_later_commands_read(finished):
     vehicle = read_vehicle(folder / "best_fit.yaml")
     for name, value in values_of(vehicle).items():
         assert value == result.coefficients[name].best
+    controller = ControllerFile.model_validate(result.settings["controller"])
+    assert read_controller(folder / "controller.yaml") == controller
     assert json.loads((folder / "result.json").read_text())["status"] == "converged"
     assert len((folder / "metrics.csv").read_text().splitlines()) == 1 + 6 * 5
     page = render(folder).read_text()

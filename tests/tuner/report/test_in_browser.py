@@ -17,7 +17,7 @@ from tests.tuner.report.browser import CHROMIUM, Reading, chromium, reading
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium or Chrome on the path")
 
-FIGURES = 8 + 4 + 1 + 1 + 1 + 2 + 3 + 1 + 2
+FIGURES = 8 + 2 + 1 + 1 + 1 + 2 + 3 + 1 + 2
 #: What the plotting library has put into its axes.
 MARKS = ".scatterlayer .trace path, .barlayer .point path, .heatmaplayer image"
 IMAGES = (

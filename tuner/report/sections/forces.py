@@ -1,4 +1,4 @@
-"""Force and moment of each term along the simulated flights, as in the thesis's Fig. 8.2."""
+"""Force and moment of each term along a simulated flight, as in the thesis's Fig. 8.2."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from tuner.report.section import Section
 
 PREFIX = "acting_"
 CLOCK = "time"
-MOST = 3
-"""Flights that are drawn."""
 AXES = ("forward", "left", "up")
 FAINTEST = 1e-9
 """N or N m below which a curve is no more than rounding."""
@@ -22,23 +20,22 @@ DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
 def forces(contents: Contents) -> Section | None:
-    """Return two charts a flight: forces and moments, along each body axis, of each term.
+    """Return two charts: forces and moments of each term, along each body axis.
 
-    Of the flights that accelerate most; their curves are many, and the others' much the same.
+    Of the flight that accelerates most: the others' curves are much the same.
     """
     flights = {name: _of_terms(arrays) for name, arrays in contents.traces.items()}
     flights = {name: of_term for name, of_term in flights.items() if CLOCK in of_term}
-    drawn = sorted(flights, key=lambda name: _pull(flights[name]), reverse=True)[:MOST]
-    charts = []
-    for name in drawn:
-        time, of_term = flights[name][CLOCK], dict(flights[name])
-        del of_term[CLOCK]
-        charts += [
-            _chart(name, "forces", "N", time, {n: v[:, :3] for n, v in of_term.items()}),
-            _chart(name, "moments", "N m", time, {n: v[:, 3:] for n, v in of_term.items()}),
-        ]
-    values = {"left_out": len(flights) - len(drawn)}
-    return Section("forces", "Forces and moments by term", values, charts) if charts else None
+    if not flights:
+        return None
+    name = max(flights, key=lambda name: _pull(flights[name]))
+    of_term = dict(flights[name])
+    time = of_term.pop(CLOCK)
+    charts = (
+        _chart(name, "forces", "N", time, {n: v[:, :3] for n, v in of_term.items()}),
+        _chart(name, "moments", "N m", time, {n: v[:, 3:] for n, v in of_term.items()}),
+    )
+    return Section("forces", "Forces and moments by term", {"flight": name}, charts)
 
 
 def _of_terms(arrays: Mapping[str, Array]) -> dict[str, Array]:

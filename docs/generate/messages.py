@@ -1,0 +1,190 @@
+"""Every line with which `tune` refuses an input, and every finding of a run, each with an anchor.
+
+The lines are read from the source: the text of each error that it raises, with … where a value
+stands.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+from docs.generate.text import GENERATED
+from tuner import __file__ as _package
+from tuner import errors
+from tuner.findings import Code
+from tuner.wording.findings import TEXTS
+
+PACKAGE = Path(_package).parent
+ERRORS = {name for name in vars(errors) if name.endswith("Error")}
+UNKNOWN = "…"
+
+#: Where a message comes from -> heading; the first that matches.
+TOPICS: Mapping[str, str] = {
+    "flights/": "Recordings",
+    "recording": "Recordings",
+    "bench/": "Ground measurements",
+    "exporters/": "Export",
+    "coefficients/": "Vehicle, controller and job files",
+    "config/": "Vehicle, controller and job files",
+    "yaml_files/": "Vehicle, controller and job files",
+    "validation": "Vehicle, controller and job files",
+    "simulation/": "Simulated flights",
+    "trajectory": "Simulated flights",
+    "cli/": "Options of the command line",
+    "disk": "Files and folders",
+    "files": "Files and folders",
+    "": "Jobs and results",
+}
+
+INTRO = """# Messages
+
+What `tune` says when an input cannot be used, and what it says of a run before you believe a
+number. … stands for a file, an option, a name or a number. A refusal is one line,
+`where: what; remedy`, exit status 2, and nothing was overwritten. For what to look at when no
+message appears, see [Troubleshooting](../how-to/troubleshooting.md).
+"""
+
+#: Findings whose sentences have parts that come and go.
+IN_OTHER_WORDS: Mapping[Code, str] = {
+    Code.RECORDING: "Reading the recording raised a doubt, which the line states.",
+    Code.LEFT_OUT: "The flight lacks what its inlet needs and is left out of the fit; the line "
+    "says what it lacks and what to do.",
+    Code.SALVAGED: "The recording is broken, and the flight is what was salvaged of it; the line "
+    "states what was lost. Record the flight again if that matters.",
+    Code.SATURATION_FEEDBACK: "Rotors were clipped at their lower limit, and the recordings agree "
+    "with a rate integrator that stops, or does not stop, then, other than the controller file has "
+    "it; it was simulated so. Set mixer.saturation_feedback in the controller file.",
+    Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
+    "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
+    "vehicle may differ.",
+}
+
+IN_ITS_OWN = "The line says what was noticed and what to do."
+
+FINDINGS = """## Findings of a run
+
+They stand on the terminal, at the top of the page and, as codes with numbers, in `result.json`
+(`findings`). A `failure` stops the run unless `--force`, a `warning` does not, an `info` explains.
+"""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One line's fixed words: what is wrong, and what to do."""
+
+    topic: str
+    what: str
+    remedy: str
+
+    @property
+    def anchor(self) -> str:
+        """The heading's address, of letters and digits alone."""
+        return re.sub(r"[^a-z0-9]+", "-", self.what.lower().replace(UNKNOWN, " ")).strip("-")
+
+
+def messages_page() -> str:
+    """Return the page."""
+    parts = [f"{GENERATED}{INTRO}"]
+    messages = known_messages()
+    seen: set[str] = set()
+    for topic in dict.fromkeys(TOPICS.values()):
+        parts.append(f"## {topic}\n")
+        for message in sorted((m for m in messages if m.topic == topic), key=lambda m: m.anchor):
+            anchor = "" if message.anchor in seen else f'<a id="{message.anchor}"></a>'
+            seen.add(message.anchor)
+            parts.append(f"- {anchor}**{_shown(message.what)}**; {_shown(message.remedy)}")
+        parts.append("")
+    parts.append(FINDINGS)
+    for code in Code:
+        text, remedy = TEXTS[code] if code in TEXTS else (IN_OTHER_WORDS.get(code, IN_ITS_OWN), "")
+        line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, f"{text} {remedy}".strip()))
+        parts.append(f'- <a id="{code}"></a>`{code}`: {line}')
+    return "\n".join(parts) + "\n"
+
+
+def _shown(text: str) -> str:
+    return re.sub(r"([<>*_|])", r"\\\1", text)
+
+
+def known_messages() -> list[Message]:
+    """Return the messages of all errors whose words stand in the source, each once."""
+    found = {message: None for _, messages in sites() for message in messages}
+    anchors: dict[tuple[str, str], Message] = {}
+    for message in found:
+        anchors.setdefault((message.what, message.remedy), message)
+    return list(anchors.values())
+
+
+def sites() -> Iterator[tuple[str, list[Message]]]:
+    """Yield where each error is raised, as ``file:line``, and the messages that it may have."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        place = path.relative_to(PACKAGE).as_posix()
+        topic = next(title for part, title in TOPICS.items() if part in place)
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for scope in ast.walk(tree):
+            if isinstance(scope, ast.FunctionDef):
+                for call in _errors_made(scope):
+                    what, remedy = call.args[-2:]
+                    wordings = _pairs(what, remedy, scope)
+                    messages = [Message(topic, a, b) for a, b in wordings if _says_something(a)]
+                    yield f"{place}:{call.lineno}", messages
+
+
+def _errors_made(scope: ast.FunctionDef) -> Iterator[ast.Call]:
+    inner = {id(n) for f in ast.walk(scope) if isinstance(f, ast.FunctionDef) and f is not scope
+             for n in ast.walk(f)}  # fmt: skip
+    for node in ast.walk(scope):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and id(node) not in inner:
+            made = node.func.id in ERRORS and len(node.args) == 3
+            refused = node.func.id == "refuse" and len(node.args) == 2
+            if made or refused:
+                yield node
+
+
+def _wordings(node: ast.expr, scope: ast.FunctionDef) -> list[str]:
+    """Return the texts that an expression may have, … where they are not known."""
+    texts = [UNKNOWN]
+    match node:
+        case ast.Constant(value=str(text)):
+            texts = [text]
+        case ast.JoinedStr(values=parts):
+            pieces = [_wordings(part, scope) for part in parts]
+            texts = ["".join(words) for words in product(*pieces)]
+        case ast.BinOp(op=ast.Add(), left=left, right=right):
+            texts = [a + b for a in _wordings(left, scope) for b in _wordings(right, scope)]
+        case ast.IfExp(body=body, orelse=orelse):
+            texts = _wordings(body, scope) + _wordings(orelse, scope)
+        case ast.Call(func=ast.Name(id="did_you_mean")):
+            texts = ["did you mean …?"]
+        case ast.Name(id=name):
+            texts = _assigned(name, scope) or texts
+    return texts
+
+
+def _pairs(what: ast.expr, remedy: ast.expr, scope: ast.FunctionDef) -> Iterable[tuple[str, str]]:
+    """Return what is wrong with what to do: side by side where both are assigned together."""
+    texts, remedies = _wordings(what, scope), _wordings(remedy, scope)
+    if len(texts) == len(remedies) > 1:
+        return zip(texts, remedies, strict=True)
+    return product(texts, remedies)
+
+
+def _assigned(name: str, scope: ast.FunctionDef) -> list[str]:
+    """Return the texts that a function gives a name."""
+    texts: list[str] = []
+    for node in ast.walk(scope):
+        if isinstance(node, ast.Assign) and any(
+            isinstance(target, ast.Name) and target.id == name for target in node.targets
+        ):
+            itself = any(isinstance(n, ast.Name) and n.id == name for n in ast.walk(node.value))
+            texts += [] if itself else _wordings(node.value, scope)
+    return texts
+
+
+def _says_something(text: str) -> bool:
+    return len(re.sub(r"[^a-z]", "", text.lower())) >= 4

@@ -1,0 +1,86 @@
+"""What the documents say is what there is: commands, links, generated pages, messages."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from docs.generate.messages import known_messages, sites
+from docs.generate.pages import PAGES as GENERATED
+from docs.generate.pages import REFERENCE, SCHEMA
+from tests.docs.pages import PAGES, ROOT, anchors, commands, links, name_of
+from tuner.cli.app import COMMANDS, app
+from tuner.findings import Code
+from tuner.result import RunResult
+
+EVERY_COMMAND = [(page, line) for page in PAGES for line in commands(page)]
+
+
+@pytest.mark.parametrize("name", GENERATED)
+def test_a_generated_page_is_what_the_code_says(name):
+    written = (REFERENCE / name).read_text(encoding="utf-8")
+    assert written == GENERATED[name](), "run `python -m docs.generate`"
+
+
+@pytest.mark.parametrize(("page", "line"), EVERY_COMMAND, ids=lambda x: getattr(x, "stem", None))
+def test_a_command_is_understood(page: Path, line: str):
+    words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
+    command, bound, _ = app.parse_args(words[1:], exit_on_error=False, print_error=False)
+    assert callable(command), page
+    assert bound.arguments
+
+
+def test_every_command_is_shown():
+    shown = {line.split()[1] for _, line in EVERY_COMMAND}
+    assert set(COMMANDS) <= shown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_links_lead_somewhere(page: Path):
+    for link in links(page):
+        if link.startswith("https://"):
+            continue
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place).resolve() if place else page
+        assert target.exists(), link
+        assert target.is_relative_to(ROOT)
+        if anchor:
+            assert anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_that_are_named_exist(page: Path):
+    named = re.findall(
+        r"`((?:tuner|sim_jax|tests|configs|examples|benchmarks|docs|reference_flights)/[\w./-]*)`",
+        page.read_text(encoding="utf-8"),
+    )
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_every_error_line_has_one_anchor():
+    page = (REFERENCE / "messages.md").read_text(encoding="utf-8")
+    counts = Counter(re.findall(r'<a id="([^"]+)">', page))
+    assert set(counts.values()) == {1}
+    assert {message.anchor for message in known_messages()} <= set(counts)
+    assert set(Code) <= set(counts)
+
+
+def test_the_words_of_nearly_every_error_are_known():
+    unknown = [place for place, messages in sites() if not messages]
+    total = sum(1 for _ in sites())
+    assert total > 150
+    assert len(unknown) < 0.1 * total, unknown
+
+
+def test_the_schema_of_the_result_knows_every_field():
+    schema = json.loads((REFERENCE / SCHEMA).read_text(encoding="utf-8"))
+    assert set(schema["properties"]) == set(RunResult.model_fields)
+    assert (
+        schema["properties"]["schema_version"]["default"]
+        == RunResult.model_fields["schema_version"].default
+    )

@@ -1,0 +1,56 @@
+"""The documentation as a site: it builds without a warning and is readable on a phone."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from tests.docs.pages import DOCS, ROOT
+
+pytestmark = pytest.mark.skipif(find_spec("mkdocs") is None, reason="needs the extra 'docs'")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)]
+    quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(
+        command, cwd=ROOT, env=quiet, check=False, capture_output=True, text=True
+    )
+    assert built.returncode == 0, built.stdout + built.stderr
+    return folder
+
+
+def test_every_page_is_built(site: Path):
+    for page in DOCS.rglob("*.md"):
+        assert (site / page.relative_to(DOCS).with_suffix(".html")).exists(), page
+
+
+def test_the_python_reference_has_its_signatures(site: Path):
+    page = (site / "reference" / "python.html").read_text(encoding="utf-8")
+    for name in ("tuner.api.fit", "tuner.api.load_flight", "tuner.result.CoefficientResult"):
+        assert f'id="{name}"' in page
+
+
+@pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
+def test_a_browser_shows_it_whole(site: Path, width: int):
+    browser = pytest.importorskip("tests.tuner.report.browser", reason="needs Playwright")
+    if browser.CHROMIUM is None:
+        pytest.skip("needs Chromium or Chrome on the path")
+    pages = ("index", "tutorials/first-fit", "explanations/model", "reference/messages")
+    with browser.chromium() as started:
+        for name in pages:
+            with browser.reading(started, site / f"{name}.html", width=width) as opened:
+                page = opened.page
+                assert page.locator("h1").first.is_visible(), name
+                assert page.evaluate("document.documentElement.scrollWidth") <= width, name
+                asked = {address.partition(":")[0] for address in opened.requests}
+                assert asked <= {"file", "data", "blob"}, name
+                broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
+                assert page.evaluate(broken) == 0, name

@@ -1,0 +1,91 @@
+"""The tutorials as a reader follows them: their commands run in order, their output is theirs."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands
+from tuner.cli import main
+
+pytestmark = pytest.mark.slow
+
+#: Commands that are not run, and why; `tests.docs.test_pages` holds that they are understood.
+NOT_RUN = {
+    "tune --flights lab/*.bag --bench runs/bench": "a lab's own flights",
+    "tune --flights nanobench/*.csv": "public flights that do not ship with the project",
+    "tune --flights reference_flights/*.bag --config runs/quad.job.yaml": "another fit as long as "
+    "the shared one; what its files hold is read instead",
+}
+SHARED = "tune --flights reference_flights/*.bag --out runs/first"
+"""The fit of ``make demo``, which is made once for all tests."""
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with what a reader has at the root of the project, who is there."""
+    for name in ("reference_flights", "examples", "configs", "docs"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / "runs").mkdir()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def words_of(command: str) -> list[str]:
+    """Return a command's arguments, patterns expanded as a shell does."""
+    words = []
+    for word in shlex.split(command, comments=True)[1:]:
+        found = sorted(map(str, Path().glob(word))) if "*" in word else []
+        words += found or [word]
+    return words
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_its_commands_run_and_print_what_it_shows(
+    page: Path, place: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for line in commands(page):
+        if line == SHARED:
+            shutil.copytree(request.getfixturevalue("demo")[0], place / "runs" / "first")
+        elif not any(line.startswith(start) for start in NOT_RUN):
+            assert main(words_of(line)) == 0, line
+    printed = capsys.readouterr().out
+    for block in blocks(page, "text"):
+        for shown in block.splitlines():
+            assert is_printed(shown, printed) or is_of_the_fit(shown, place), shown
+
+
+def is_printed(line: str, printed: str) -> bool:
+    """Return whether a line was printed, whatever its numbers, widths and line ends."""
+    return wording(line) in wording(printed)
+
+
+def is_of_the_fit(line: str, place: Path) -> bool:
+    """Return whether the shared fit's files hold every number of a line of its table."""
+    metrics = place / "runs" / "first" / "metrics.csv"
+    if "→" not in line or not metrics.exists():
+        return False
+    held = [float(cell) for cell in re.findall(r"[\d.]+(?:e-\d+)?", metrics.read_text())]
+    shown = [float(number) for number in re.findall(r"\d+\.\d+", line)]
+    return all(any(abs(value - known) < 5e-4 for known in held) for value in shown)
+
+
+def wording(text: str) -> str:
+    return re.sub(r"[\s\d.e+-]+", " ", text).strip()
+
+
+def test_the_python_of_the_reference_runs(place: Path, request: pytest.FixtureRequest) -> None:
+    (place / "runs" / "first").symlink_to(request.getfixturevalue("demo")[0])
+    (block,) = blocks(DOCS / "reference" / "python.md", "python")
+    exec(compile(block, "python.md", "exec"), {})
+
+
+def test_what_is_not_run_is_still_there() -> None:
+    every = [line for page in TUTORIALS for line in commands(page)]
+    for start in NOT_RUN:
+        assert any(line.startswith(start) for line in every), start
+    assert SHARED in every
