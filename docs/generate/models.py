@@ -17,7 +17,9 @@ _CROSS_REFERENCE = re.compile(r"(?<!`)`([A-Z]\w+)`(?!`)")
 
 def sections_of(model: type) -> str:
     """Return one heading and table a section of a file, the whole file's first."""
-    return "\n".join(_section(section) for section in _with_parts(model, []))
+    whole, *parts = _with_parts(model, [])
+    sections = [_section("Keys", whole), *(_section(_title(part), part) for part in parts)]
+    return "\n".join(sections)
 
 
 def _with_parts(model: Any, seen: list[type[BaseModel]]) -> list[type[BaseModel]]:
@@ -37,14 +39,14 @@ def _models_in(hint: Any) -> Iterator[type[BaseModel]]:
         yield from _models_in(part)
 
 
-def _section(model: type[BaseModel]) -> str:
+def _section(title: str, model: type[BaseModel]) -> str:
     text, meanings = _documented(model)
     rows = [
         f"| `{name}` | {_values(field)} | {_default(field)} | {cell(meanings.get(name, ''))} |"
         for name, field in model.model_fields.items()
     ]
     table = "\n".join(["| key | value | default | meaning |", "| --- | --- | --- | --- |", *rows])
-    return f"## {_title(model)}\n\n{text}\n\n{table}\n"
+    return f"## {title}\n\n{text}\n\n{table}\n"
 
 
 def _title(model: type[BaseModel]) -> str:

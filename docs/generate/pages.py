@@ -13,6 +13,7 @@ from docs.generate.text import GENERATED
 from tuner.bench.plan import BenchFile
 from tuner.coefficients.table import markdown_table
 from tuner.config import ControllerFile, JobFile, VehicleFile, configs_folder
+from tuner.engine.cluster_file import ClusterFile
 from tuner.result import RunResult
 
 ROOT = Path(__file__).parents[2]
@@ -68,6 +69,18 @@ def _bench() -> str:
     )
 
 
+def _cluster() -> str:
+    return _files_page(
+        "Cluster file",
+        "Where workers come from, for `--cluster`: this machine, a batch system, Kubernetes, or a "
+        "Dask scheduler that runs already (`tcp://HOST:8786` in place of a file). It needs the "
+        "extra `[cluster]`. `--dry-run` prints the job script of a batch system and does nothing. "
+        "For Slurm, `configs/clusters/slurm.yaml`; others lie beside it:",
+        ClusterFile,
+        configs_folder() / "clusters" / "slurm.yaml",
+    )
+
+
 def _topics() -> str:
     guide = (configs_folder() / "topics" / "README.md").read_text(encoding="utf-8")
     return f"{GENERATED}{guide}"
@@ -95,6 +108,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "controller-file.md": _controller,
     "job-file.md": _job,
     "bench-file.md": _bench,
+    "cluster-file.md": _cluster,
     "topic-maps.md": _topics,
     "messages.md": messages_page,
     SCHEMA: _schema,
