@@ -8,9 +8,27 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from tuner.api import compare, export, fit, load_flight, read_run, sensitivity, simulate
+    from tuner.api import (
+        compare,
+        connect,
+        export,
+        fit,
+        load_flight,
+        read_run,
+        sensitivity,
+        simulate,
+    )
 
-__all__ = ["compare", "export", "fit", "load_flight", "read_run", "sensitivity", "simulate"]
+__all__ = [
+    "compare",
+    "connect",
+    "export",
+    "fit",
+    "load_flight",
+    "read_run",
+    "sensitivity",
+    "simulate",
+]
 
 
 def __getattr__(name: str) -> object:

@@ -17,6 +17,7 @@ from tuner.trajectory_settings import TrajectoryName
 
 if TYPE_CHECKING:
     from sim_jax.precision import Precision
+    from tuner.client.client import Client
     from tuner.comparison.table import Table
     from tuner.exporters.export import Exported
     from tuner.exporters.target import Simulator
@@ -28,6 +29,7 @@ T = TypeVar("T")
 
 __all__ = [
     "compare",
+    "connect",
     "export",
     "fit",
     "load_flight",
@@ -387,6 +389,27 @@ def export(
         simulator=simulator,
         accept=accept,
     )
+
+
+def connect(url: str | None = None, *, token: str | None = None) -> Client:
+    """Return a tuning service, whose ``fit`` is `fit` on its machine.
+
+    Parameters
+    ----------
+    url
+        Its address; None takes ``TUNE_SERVER``, or the one that `tune serve` listens to.
+    token
+        That its server demands; None takes ``TUNE_TOKEN``.
+
+    Raises
+    ------
+    InputError
+        The address is none, or the extra ``service`` is not installed.
+    """
+    from tuner.client.client import Client  # noqa: PLC0415 (an extra)
+    from tuner.client.connection import Connection  # noqa: PLC0415
+
+    return Client(Connection(url, token))
 
 
 def _options(flights: Sequence[Named], **given: Any) -> Options:

@@ -43,6 +43,10 @@ class OutputError(InputError):
     """A file or folder cannot be written where it was asked for."""
 
 
+class ServerFaultError(Exception):
+    """A server that was asked has a fault; the command line gives one line and exit status 1."""
+
+
 class ExportError(InputError):
     """An export was refused or could not be written."""
 

@@ -29,7 +29,7 @@ def config_error(
     """
     lines = lines or {}
     details = error.errors(include_url=False)
-    what, remedy = _sentence(details[0])
+    what, remedy = complaint(details[0])
     place: Place = details[0]["loc"]
     if details[0]["type"] == "unknown_key":
         place = (*place, details[0]["ctx"]["key"])
@@ -40,7 +40,8 @@ def config_error(
     return ConfigError(path, line + what, remedy + more)
 
 
-def _sentence(detail: ErrorDetails) -> tuple[str, str]:
+def complaint(detail: ErrorDetails) -> tuple[str, str]:
+    """Return what one of pydantic's complaints says is wrong, and what to do about it."""
     key = dotted(detail["loc"]) or "the file"
     context = detail.get("ctx", {})
     match detail["type"]:

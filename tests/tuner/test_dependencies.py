@@ -15,7 +15,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 #: Import packages whose distribution is named otherwise.
 DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports-zstd"}
 #: Distributions that work without being imported: plugins, and what `make lint` and `docs` run.
+#: psycopg is found by SQLAlchemy, from the URL of a database.
 NOT_IMPORTED = {
+    "psycopg",
     *("pytest-xdist", "ruff", "mypy", "import-linter", "types-pyyaml", "lxml-stubs"),
     *("mkdocs", "mkdocs-material", "mkdocstrings"),
 }
@@ -29,20 +31,30 @@ USES = {
     "test": ("tests",),
     "bench": ("benchmarks",),
     "cluster": ("tuner/engine",),
+    "service": ("tuner/service", "tuner/client"),
+    "postgresql": (),
 }
 #: Folders inside others of which only an extra is asked.
-APART = {ROOT / folder for name in ("cluster",) for folder in USES[name]}
+APART = {ROOT / folder for name in ("cluster", "service") for folder in USES[name]}
 
 
 def normalised(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def declared(extra: str | None) -> set[str]:
+def declared(extra: str | None, *, others: bool = False) -> set[str]:
+    """Return what an extra brings, with what the ``others`` that it names bring."""
     requirements = (
         PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
     )
-    return {normalised(re.match(r"[\w.-]+", line)[0]) for line in requirements}
+    found = set()
+    for line in requirements:
+        if own := re.fullmatch(re.escape(PROJECT["name"]) + r"\[(.*)\]", line):
+            for other in own[1].split(",") if others else ():
+                found |= declared(other)
+        else:
+            found.add(normalised(re.match(r"[\w.-]+", line)[0]))
+    return found
 
 
 def modules(tree: ast.AST, *, by_name: bool = True) -> Iterator[str]:
@@ -79,7 +91,7 @@ def imported(*folders: str) -> set[str]:
 
 @pytest.mark.parametrize("extra", USES, ids=str)
 def test_everything_imported_is_declared(extra):
-    assert imported(*USES[extra]) <= declared(None) | declared(extra)
+    assert imported(*USES[extra]) <= declared(None) | declared(extra, others=True)
 
 
 @pytest.mark.parametrize("extra", USES, ids=str)

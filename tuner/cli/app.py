@@ -66,6 +66,34 @@ COMMANDS = {
         "tune new-vehicle --mass 2.2 --wheelbase 0.5 --propeller 11x4.7 --out quad.yaml",
         "tune new-vehicle --like crazyflie --mass 0.034 --out cf.yaml",
     ),
+    "serve": (
+        "Run the tuning service: jobs of many people, over HTTP and as pages in a browser.",
+        "tune serve",
+    ),
+    "submit": (
+        "Send recordings to a tuning service and have it fit them.",
+        "tune submit --flights lab/*.bag --server http://lab:8000 --wait",
+    ),
+    "jobs": (
+        "List the jobs of a tuning service.",
+        "tune jobs --server http://lab:8000 --state running",
+    ),
+    "watch": (
+        "Show what a job of a tuning service does until it ends.",
+        "tune watch 3f2a91c05d7e4b68 --server http://lab:8000",
+    ),
+    "fetch": (
+        "Fetch the result of a job of a tuning service.",
+        "tune fetch 3f2a91c05d7e4b68 --out runs/first",
+    ),
+    "cancel": (
+        "Cancel a job of a tuning service.",
+        "tune cancel 3f2a91c05d7e4b68",
+    ),
+    "watch-folder": (
+        "Submit a job to a tuning service whenever new recordings in a folder have settled.",
+        "tune watch-folder lab/ --server http://lab:8000",
+    ),
     "simulate": (
         "Simulate a trajectory and write the flight as CSV or ROS 1 bag.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",
@@ -73,6 +101,9 @@ COMMANDS = {
     ),
 }
 for _name, (_summary, *_examples) in COMMANDS.items():
+    if _name == "serve":
+        app.command("tuner.cli.serve:serve", name=_name, help=_summary)  # has commands of its own
+        continue
     app.command(
         "tuner.cli.{0}:{0}".format(_name.replace("-", "_")),
         name=_name,

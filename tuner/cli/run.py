@@ -13,7 +13,7 @@ from cyclopts import CycloptsError
 
 from tuner.cli.app import COMMANDS, app
 from tuner.cli.options import TYPED
-from tuner.errors import InputError, did_you_mean
+from tuner.errors import InputError, ServerFaultError, did_you_mean
 
 DONE = 0
 OUR_FAULT = 1
@@ -38,6 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _know_the_command(given)
         app(given)
         sys.stdout.flush()
+    except ServerFaultError as error:
+        return _say(str(error), OUR_FAULT)
     except InputError as error:
         return _say(str(error), WRONG_INPUT)
     except CycloptsError as error:
@@ -46,7 +48,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _say("interrupted", INTERRUPTED)
     except BrokenPipeError:
         sys.stderr.close()  # whoever read our output has gone; nothing is left to say
-        return DONE
     except Exception as error:
         return _unforeseen(error)
     return DONE

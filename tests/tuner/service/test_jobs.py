@@ -1,0 +1,209 @@
+"""Jobs through the HTTP interface: shapes, states, deaths, cancelling, trying again."""
+
+import json
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from tests.tuner.service.conftest import ended, submit, upload
+from tuner.result import RunResult
+
+KEYS = {
+    "id",
+    "name",
+    "state",
+    "stage",
+    "iteration",
+    "rmse",
+    "seconds_left",
+    "submitted",
+    "started",
+    "ended",
+    "error",
+    "files",
+}
+
+
+@pytest.fixture
+def recording(client, table):
+    return upload(client, table.read_bytes())
+
+
+def test_a_job_goes_from_the_recording_to_its_files(client, recording):
+    answer = client.post("/api/v1/jobs", json={"recordings": [recording], "name": "first"})
+    assert answer.status_code == 202
+    assert set(answer.json()) == {"id", "state", "links"}
+    job = ended(client, answer.json()["id"])
+    assert set(job) >= KEYS
+    assert (job["state"], job["name"], job["error"], job["exit_status"]) == (
+        "done",
+        "first",
+        None,
+        0,
+    )
+    assert (job["iteration"], job["rmse"], job["seconds_left"]) == (5, 0.1 / 5, 0.0)
+    assert job["submitted"] <= job["started"] <= job["ended"]
+    assert job["files"] == ["best_fit.yaml", "plots/one.svg", "report.html", "result.json"]
+    assert job["log"] == ["begins at 0"]
+    for name, link in job["links"]["files"].items():
+        file = client.get(link)
+        assert file.status_code == 200
+        assert ("attachment" in file.headers.get("content-disposition", "")) != (
+            name == "report.html"
+        )
+    content = client.get(job["links"]["files"]["result.json"]).json()
+    assert RunResult.model_validate(content).coefficients["motor_constant"].best == 1e-7
+
+
+def test_every_file_is_served_where_it_reaches_nothing(client, recording):
+    job = ended(client, submit(client, recording))
+    for link in job["links"]["files"].values():
+        policy = client.get(link).headers["content-security-policy"]
+        assert policy.startswith("sandbox allow-scripts")
+        assert "default-src 'none'" in policy
+        assert "connect-src" not in policy
+        assert "allow-same-origin" not in policy
+
+
+def test_events_tell_the_whole_story_and_go_on_from_any_of_them(client, recording):
+    job = submit(client, recording)
+    text = client.get(f"/api/v1/jobs/{job}/events").text
+    events = [
+        dict(line.split(": ", 1) for line in block.split("\n"))
+        for block in text.split("\n\n")
+        if block
+    ]
+    kinds = [event["event"] for event in events if "id" in event]
+    assert kinds == ["state", "state", "message", *["iteration"] * 5, "state"]
+    assert [int(event["id"]) for event in events if "id" in event] == list(range(1, 10))
+    last = json.loads([event for event in events if event["event"] == "job"][-1]["data"])
+    assert last["state"] == "done"
+    rest = client.get(f"/api/v1/jobs/{job}/events", headers={"Last-Event-ID": "8"}).text
+    assert rest.count("event: iteration") == 0
+    assert '"state": "done"' in rest
+
+
+def test_a_worker_that_dies_once_goes_on_from_its_checkpoint(client, recording):
+    job = ended(client, submit(client, recording, namespace="die once"))
+    assert job["state"] == "done"
+    assert job["log"][0] == "begins at 0"
+    assert "SIGKILL" in job["log"][1]
+    assert "goes on from its checkpoint" in job["log"][1]
+    assert job["log"][2] == "begins at 1"
+
+
+def test_three_deaths_are_the_end_with_the_reason(client, recording):
+    job = ended(client, submit(client, recording, namespace="die"))
+    assert job["state"] == "failed"
+    assert job["error"].startswith("its worker died 3 times; the last time it was ended by SIGKILL")
+    assert job["exit_status"] == 1
+    assert "tune_worker_deaths_total 3.0" in client.get("/metrics").text
+
+
+@pytest.mark.parametrize(
+    ("wish", "status", "error"),
+    [
+        ("refuse", 2, "flights: nothing moves; fly a circle"),
+        ("fault", 1, "this is a fault of ours: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_what_a_worker_refuses_is_the_error_of_the_job(client, recording, wish, status, error):
+    job = ended(client, submit(client, recording, namespace=wish))
+    assert (job["state"], job["exit_status"], job["error"]) == ("failed", status, error)
+    assert job["files"] == []
+
+
+def test_cancelling_stops_the_worker_and_a_retry_goes_on(client, recording):
+    job = submit(client, recording, namespace="slow")
+    while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
+        time.sleep(0.02)
+    assert client.post(f"/api/v1/jobs/{job}/retry").status_code == 409
+    cancelled = client.post(f"/api/v1/jobs/{job}/cancel").json()
+    assert (cancelled["state"], cancelled["exit_status"]) == ("cancelled", 130)
+    again = client.post(f"/api/v1/jobs/{job}/cancel")
+    assert again.status_code == 409
+    assert again.json()["detail"] == f"job {job}: is cancelled; there is nothing left to cancel"
+    assert client.post(f"/api/v1/jobs/{job}/retry").json()["state"] == "queued"
+    done = ended(client, job)
+    assert done["state"] == "done"
+    begins = [line for line in done["log"] if line.startswith("begins")]
+    assert begins[0] == "begins at 0"
+    assert begins[1] != "begins at 0"
+    result = client.get(done["links"]["files"]["result.json"]).json()
+    assert result["coefficients"]["motor_constant"]["best"] == sum(range(40)) * 1e-8
+
+
+def test_a_hundred_jobs_at_once_are_all_done(client, recording):
+    with ThreadPoolExecutor(16) as pool:
+        jobs = list(pool.map(lambda n: submit(client, recording, name=f"job {n}"), range(100)))
+    assert len(set(jobs)) == 100
+    for job in jobs:
+        assert ended(client, job, within=120)["state"] == "done"
+    seen, after = [], None
+    while True:
+        page = client.get("/api/v1/jobs", params={"after": after} if after else {}).json()
+        seen += [job["id"] for job in page["jobs"]]
+        assert len(page["jobs"]) <= 50
+        after = page["next"]
+        if after is None:
+            break
+    assert sorted(seen) == sorted(jobs)
+
+
+def test_the_same_submission_twice_is_one_job(client, recording):
+    body = {"recordings": [recording]}
+    with ThreadPoolExecutor(8) as pool:
+        answers = list(
+            pool.map(
+                lambda _: client.post(
+                    "/api/v1/jobs", json=body, headers={"Idempotency-Key": "abc"}
+                ),
+                range(8),
+            )
+        )
+    assert {answer.status_code for answer in answers} == {202}
+    assert len({answer.json()["id"] for answer in answers}) == 1
+    assert sum("idempotent-replayed" in answer.headers for answer in answers) == 7
+    other = client.post("/api/v1/jobs", json=body)
+    assert other.json()["id"] != answers[0].json()["id"]
+
+
+def test_a_list_is_narrowed_by_vehicle_and_state(client, recording):
+    small = ended(client, submit(client, recording, vehicle="crazyflie"))["id"]
+    failed = ended(client, submit(client, recording, namespace="refuse"))["id"]
+    listed = lambda **by: [j["id"] for j in client.get("/api/v1/jobs", params=by).json()["jobs"]]  # noqa: E731
+    assert listed() == [failed, small]
+    assert listed(vehicle="crazyflie") == [small]
+    assert listed(state="failed") == [failed]
+    assert listed(vehicle="crazyflie", state="failed") == []
+    assert listed(vehicle="\x00") == []
+    assert client.get("/api/v1/jobs", params={"after": "nobody"}).status_code == 404
+
+
+def test_the_history_of_a_vehicle_has_every_job_with_its_interval(client, recording):
+    jobs = [ended(client, submit(client, recording, name=f"day {n}"))["id"] for n in range(3)]
+    ended(client, submit(client, recording, vehicle="crazyflie"))
+    history = client.get("/api/v1/vehicles/hovergames/history").json()
+    found = history["coefficients"]["motor_constant"]
+    assert found["unit"] == "N s²/rad²"
+    assert [point["job"] for point in found["points"]] == jobs
+    assert found["points"][0]["ci95"] == [8e-8, 1.2e-7]
+    assert found["points"][0]["flights"] == ["hop"]
+    assert client.get("/api/v1/vehicles/nobody/history").status_code == 404
+
+
+def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):
+    own = updated.model_dump(mode="json", exclude_none=True) | {"name": "quad 7"}
+    submit(client, recording, vehicle=own)
+    ended(client, submit(client, recording, vehicle="quad 7"))
+    assert len(client.get("/api/v1/jobs", params={"vehicle": "quad 7"}).json()["jobs"]) == 2
+
+
+def test_health_and_counters(client, recording):
+    ended(client, submit(client, recording))
+    assert client.get("/healthz").json()["status"] == "ok"
+    text = client.get("/metrics").text
+    assert 'tune_jobs{state="done"} 1.0' in text
+    assert 'route="/api/v1/jobs/{job}"' in text
+    assert "tune_uploaded_bytes_total" in text

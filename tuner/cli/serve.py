@@ -1,0 +1,170 @@
+"""``tune serve``: the tuning service, and who may use it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+if TYPE_CHECKING:
+    from tuner.service.database import Database
+
+EXAMPLES = (
+    "tune serve",
+    "tune serve --host 0.0.0.0 --data /srv/tune --workers 4",
+    "tune serve token add NAME",
+)
+serve = App(
+    name="serve",
+    help="Run the tuning service: jobs of many people, over HTTP and as pages in a browser.",
+    help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
+    help_format="plaintext",
+    result_action="return_value",
+    exit_on_error=False,
+    print_error=False,
+    suppress_keyboard_interrupt=False,
+)
+token = App(name="token", help="Make and take away the tokens that visitors show.")
+serve.command(token)
+
+Data = Annotated[
+    Path | None,
+    Parameter(help="Keep everything in this folder. Default: ~/.local/share/multirotor-tune."),
+]
+DatabaseUrl = Annotated[
+    str, Parameter(help="Use this database, as postgresql://user@host/name. Default: SQLite.")
+]
+
+
+@serve.default
+def _serve(
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    data: Data = None,
+    database: DatabaseUrl = "",
+    store: str = "",
+    workers: int = 2,
+    max_upload: float = 4.0,
+    memory: float = 8.0,
+) -> None:
+    """Run the tuning service until Ctrl-C; jobs under way go on when it is started again.
+
+    Parameters
+    ----------
+    host
+        Listen to this address. Any but the loopback one demands tokens of all visitors.
+    port
+        Listen to this port; 0 takes a free one.
+    store
+        Keep recordings and results in this folder or fsspec URL. Default: in the data folder.
+    workers
+        Work on so many jobs at the same time.
+    max_upload
+        Take recordings of up to so many GiB.
+    memory
+        Let a job take so many GiB of memory.
+    """
+    with _extra():
+        from tuner.service.serve import LOOPBACK, is_loopback
+        from tuner.service.serve import serve as run
+    from tuner.errors import InputError
+    from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
+
+    if not 0 <= port < 2**16:
+        raise InputError("--port", f"{port} is no port", "name one from 1 to 65535")
+    for option, value in (("workers", workers), ("max-upload", max_upload), ("memory", memory)):
+        if not value > 0:
+            raise InputError(f"--{option}", f"is {value}", "give a number above zero")
+    limits = Limits(upload_bytes=int(max_upload * GIB), memory_bytes=int(memory * GIB))
+    settings = ServiceSettings(
+        data=data or default_data(),
+        database=database,
+        store=store,
+        workers=workers,
+        demands_tokens=not is_loopback(host),
+        hosts=LOOPBACK if is_loopback(host) else (),
+        limits=limits,
+    )
+    run(settings, host=host, port=port, say=lambda text: print(text, flush=True))
+
+
+@token.command
+def add(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> None:
+    """Make a token for a visitor, and print it: it cannot be shown again.
+
+    Parameters
+    ----------
+    name
+        Whose it is.
+    """
+    from tuner.service import tokens
+
+    with _database(data, database) as opened:
+        print(tokens.add(opened, name))
+
+
+@token.command
+def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> None:
+    """Let a visitor's token hold no more.
+
+    Parameters
+    ----------
+    name
+        Whose it is.
+    """
+    from tuner.service import tokens
+
+    with _database(data, database) as opened:
+        tokens.remove(opened, name)
+        print(f"{name} has no token any more")
+
+
+@token.command(name="list")
+def names(*, data: Data = None, database: DatabaseUrl = "") -> None:
+    """List who has a token."""
+    from tuner.service import tokens
+
+    with _database(data, database) as opened:
+        for name in tokens.names(opened):
+            print(name)
+
+
+@contextmanager
+def _database(data: Path | None, url: str) -> Iterator[Database]:
+    """Open the database of a server, which may be running."""
+    with _extra():
+        from tuner.service.database import Database
+    from tuner.disk import make_folder
+    from tuner.service.settings import ServiceSettings, default_data
+
+    settings = ServiceSettings(data=data or default_data(), database=url)
+    make_folder(settings.data)
+    opened = Database(settings.database_url)
+    try:
+        opened.migrate()
+        yield opened
+    finally:
+        opened.close()
+
+
+@contextmanager
+def _extra() -> Iterator[None]:
+    """Turn a missing package of the extra, imported inside, into one line."""
+    from tuner.errors import InputError
+
+    packages = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "fsspec", "python_multipart")
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in (*packages, "prometheus_client", "starlette", "anyio"):
+            raise
+        raise InputError(
+            "tune serve",
+            f"needs {package}, which is not installed",
+            "pip install 'multirotor-tune[service]'",
+        ) from None

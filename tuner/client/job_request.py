@@ -1,0 +1,100 @@
+"""What the options of `tune` ask for, as a server takes it: contents in place of paths."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tuner.config import Options, Settings, VehicleFile, read_vehicle, settle
+from tuner.config.controller import ControllerFile, read_controller
+from tuner.errors import InputError
+from tuner.flights.topics import load_topic_map
+from tuner.yaml_files.document import read_yaml
+from tuner.yaml_files.section import Section
+from tuner.yaml_files.shipped import Kind, configs_folder, find_config
+
+
+def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:
+    """Return the recordings to send and the request that names them, but for their ids.
+
+    Raises
+    ------
+    InputError
+        A path, name or value cannot be used, here or by any server.
+    """
+    if options.bench is not None:
+        raise InputError("--bench", "is not taken by a server", "fit with tune on this machine")
+    settled = settle(options)
+    request: dict[str, Any] = {
+        "settings": _settings(settled),
+        "vehicle": _vehicle(options.vehicle),
+        "controller": _controller(options.controller),
+        "holdout": None if options.holdout is None else list(settled.job.holdout),
+        "mass": options.mass,
+        "fit": None if options.fit is None else list(options.fit),
+        "fix": None if options.fix is None else list(options.fix),
+        "method": options.method,
+        "seed": options.seed,
+        "namespace": options.namespace,
+    }
+    if options.topics is not None:
+        request["settings"]["topics"] = _topics(find_config("topics", options.topics, Path()))
+    return settled.flights, {key: value for key, value in request.items() if value is not None}
+
+
+def _settings(settled: Settings) -> dict[str, Any]:
+    """Return the keys of the job file, the files that it names as their contents."""
+    if settled.job_path is None:
+        return {}
+    data = read_yaml(settled.job_path).data
+    settings = dict(data) if isinstance(data, dict) else {}
+    base = settled.job_path.parent
+    if settled.job.export.into is not None:
+        raise InputError(
+            settled.job_path,
+            "export.into names a file of this machine",
+            "leave it out, and use tune export --into on what you fetch",
+        )
+    if (named := settings.get("vehicle")) is not None:
+        settings["vehicle"] = _vehicle(str(find_config("vehicles", str(named), base)))
+    if (named := settings.get("controller")) is not None:
+        settings["controller"] = _controller(str(find_config("controllers", str(named), base)))
+    if (named := settings.get("topics")) is not None:
+        settings["topics"] = _topics(find_config("topics", str(named), base))
+    return settings
+
+
+def _vehicle(named: str | VehicleFile | None) -> Any:
+    if named is None or isinstance(named, VehicleFile):
+        return _content(named)
+    path = find_config("vehicles", named, Path())
+    return _shipped("vehicles", path) or _content(read_vehicle(path))
+
+
+def _controller(named: str | ControllerFile | None) -> Any:
+    if named is None or isinstance(named, ControllerFile):
+        return _content(named)
+    path = find_config("controllers", named, Path())
+    return _shipped("controllers", path) or _content(read_controller(path))
+
+
+def _topics(path: Path) -> Any:
+    shipped = _shipped("topics", path)
+    if shipped is not None:
+        return shipped
+    topics = load_topic_map(path)
+    if topics.messages:
+        raise InputError(
+            path, "names .msg files, which no server takes", "fit with tune on this machine"
+        )
+    return _content(topics.replace(extends=None))
+
+
+def _shipped(kind: Kind, path: Path) -> str | None:
+    """Return the name of a file that ships with every server."""
+    inside = path.resolve().parent == (configs_folder() / kind).resolve()
+    return path.stem if inside else None
+
+
+def _content(section: Section | None) -> dict[str, Any] | None:
+    return None if section is None else section.model_dump(mode="json", exclude_none=True)

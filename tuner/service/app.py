@@ -1,0 +1,116 @@
+"""The application: calls and pages, what they refuse as sentences, and the guard around all."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from http import HTTPStatus
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+from starlette.types import ASGIApp
+
+from tuner.errors import InputError
+from tuner.service.errors import ServiceError
+from tuner.service.http import Doors, api, watching
+from tuner.service.metrics import Metrics
+from tuner.service.safety import Guard
+from tuner.service.service import Service
+from tuner.service.shapes import API, Problem
+from tuner.validation import complaint
+from tuner.versions import installed
+
+logger = logging.getLogger(__name__)
+
+INSPECTIONS_AT_ONCE = 2
+
+
+def create_app(service: Service) -> FastAPI:
+    """Return the application of a service; it starts and closes the service."""
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        service.start()
+        try:
+            yield
+        finally:
+            service.close()
+
+    app = FastAPI(
+        title="tune: multirotor coefficients from recorded flights",
+        version=installed(),
+        openapi_url=f"{API}/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+    )
+    app.state.service = service
+    app.state.metrics = Metrics(service)
+    app.state.doors = Doors(service.settings.limits.uploads_at_once, INSPECTIONS_AT_ONCE)
+    app.include_router(api)
+    app.include_router(watching)
+    app.add_exception_handler(InputError, _refused)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http)
+    app.add_exception_handler(Exception, _fault)
+    app.add_middleware(Guard, service=service, metrics=app.state.metrics, refuse=refused)
+    return app
+
+
+async def refused(_: Request, error: InputError) -> ASGIApp:
+    """Return the answer to a request that cannot be met."""
+    status = error.STATUS if isinstance(error, ServiceError) else 422
+    return _problem(status, error.where, error.what, error.remedy)
+
+
+async def _refused(request: Request, error: Exception) -> Response:
+    assert isinstance(error, InputError)
+    answer = await refused(request, error)
+    assert isinstance(answer, Response)
+    return answer
+
+
+async def _invalid(_: Request, error: Exception) -> Response:
+    """Return the first complaint about a request's form, as a sentence."""
+    assert isinstance(error, RequestValidationError)
+    first = dict(error.errors()[0])
+    first["loc"] = tuple(part for part in first["loc"] if part != "body")
+    if first["type"] == "json_invalid":
+        return _problem(422, "the request", "is not JSON", "correct it")
+    what, remedy = complaint(first)  # type: ignore[arg-type]
+    return _problem(422, "the request", what, remedy)
+
+
+async def _http(_: Request, error: Exception) -> Response:
+    """Return what the framework refuses: an unknown address or method, a body that is no JSON."""
+    assert isinstance(error, HTTPException)
+    words = {
+        400: ("cannot be understood", "correct it"),
+        404: ("asks for what is not here", "see the start page"),
+        405: ("uses a method that this address does not take", "see /api/v1/openapi.json"),
+    }
+    fallback = (HTTPStatus(error.status_code).phrase.lower(), "correct it")
+    what, remedy = words.get(error.status_code, fallback)
+    answer = _problem(error.status_code, "the request", what, remedy)
+    answer.headers.update(error.headers or {})
+    return answer
+
+
+async def _fault(request: Request, error: Exception) -> Response:
+    logger.error("%s %s", request.method, request.url.path, exc_info=error)
+    return _problem(
+        500, "the server", "met a fault of ours", "see its log, and report what was asked of it"
+    )
+
+
+def _problem(status: int, where: str, what: str, remedy: str) -> JSONResponse:
+    detail = " ".join(f"{where}: {what}; {remedy}".split())
+    problem = Problem(where=where, what=what, remedy=remedy, detail=detail)
+    headers = {"retry-after": "5"} if status in (429, 503) else {}
+    if status == 401:
+        headers["www-authenticate"] = "Bearer"
+    return JSONResponse(problem.model_dump(), status_code=status, headers=headers)

@@ -1,0 +1,269 @@
+"""One attempt at a job: its folder, its process, what that says, and the result into the store."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import IO, Any
+
+from tuner.result import RunResult
+from tuner.service.queue import Claim, Outcome
+from tuner.service.request import FLIGHTS, Asked
+from tuner.service.settings import Limits
+from tuner.service.states import State
+from tuner.service.store import Store, digest_of, full_disk
+from tuner.service.worker import RESULT, Assignment
+
+logger = logging.getLogger(__name__)
+
+WORKER = [sys.executable, "-m", "tuner.service.worker"]
+CHECKPOINTS = "checkpoint*.npz"
+BEAT = 0.5
+"""s between two looks at whether the attempt is still wanted"""
+LONGEST_LINE = 1_000_000
+
+Events = Sequence[tuple[str, Mapping[str, Any]]]
+Report = Callable[[Events, Mapping[str, Any]], bool]
+
+
+class DiedError(Exception):
+    """The process of an attempt died; the message says of what."""
+
+
+class UnwantedError(Exception):
+    """The attempt holds its job no more, or its server is ending."""
+
+
+def prepare(folder: Path, claim: Claim, store: Store) -> Asked:
+    """Lay out the folder of a job, as far as an earlier attempt has not.
+
+    Raises
+    ------
+    NoSpaceError
+        The disk is full.
+    """
+    asked = Asked.model_validate(claim.request)
+    with full_disk():
+        shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
+        (folder / FLIGHTS).mkdir(parents=True)
+        for name, digest in claim.flights.items():
+            store.fetch(digest, folder / FLIGHTS / name)
+        asked.lay_out(folder)
+    return asked
+
+
+def attempt(
+    folder: Path,
+    claim: Claim,
+    asked: Asked,
+    *,
+    limits: Limits,
+    cores: Sequence[int],
+    report: Report,
+    is_unwanted: Callable[[], bool],
+) -> dict[str, Any]:
+    """Run the worker's process to its end, and return its last message.
+
+    Parameters
+    ----------
+    folder, claim, asked
+        As of `prepare`.
+    limits, cores
+        For the process.
+    report
+        Called with events and the job's standing, at least every `BEAT`; returns whether the
+        attempt still holds its job.
+    is_unwanted
+        Returns whether the server is ending.
+
+    Raises
+    ------
+    DiedError
+        The process died, or took too long.
+    UnwantedError
+        See there; the process has been stopped.
+    """
+    assignment = Assignment(
+        job=claim.id,
+        folder=folder.absolute(),
+        flights=tuple(claim.flights),
+        asked=asked,
+        cores=tuple(cores),
+        limits=limits,
+    )
+    with (folder / "worker.log").open("ab") as log:
+        process = subprocess.Popen(
+            WORKER,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            start_new_session=True,
+        )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    lines: queue.Queue[bytes | None] = queue.Queue(maxsize=10_000)
+    reader = threading.Thread(target=_read, args=(process.stdout, lines), daemon=True)
+    reader.start()
+    try:
+        with suppress(BrokenPipeError):
+            process.stdin.write(assignment.model_dump_json().encode() + b"\n")
+            process.stdin.flush()
+        last = _follow(lines, report, is_unwanted, time.monotonic() + limits.job_seconds)
+        process.wait(timeout=60)
+    except subprocess.TimeoutExpired:
+        raise DiedError("it did not end") from None
+    finally:
+        _kill(process)
+        process.stdin.close()
+        reader.join(timeout=5)
+        process.stdout.close()
+    if last is None:
+        raise DiedError(_cause(process.returncode))
+    return last
+
+
+def _read(stream: IO[bytes], lines: queue.Queue[bytes | None]) -> None:
+    """Pass lines on until the stream ends."""
+    while line := stream.readline(LONGEST_LINE):
+        lines.put(line)
+    lines.put(None)
+
+
+def _follow(
+    lines: queue.Queue[bytes | None],
+    report: Report,
+    is_unwanted: Callable[[], bool],
+    deadline: float,
+) -> dict[str, Any] | None:
+    """Report what a worker says until it ends, and return how it says that it did."""
+    while True:
+        events: list[tuple[str, dict[str, Any]]] = []
+        last, ended = None, False
+        until = time.monotonic() + BEAT
+        while (rest := until - time.monotonic()) > 0 and not ended:
+            try:
+                line = lines.get(timeout=rest)
+            except queue.Empty:
+                break
+            ended = line is None
+            message = _message(line)
+            kind = message.pop("kind", None)
+            if kind in ("message", "iteration", "folds"):
+                events.append((kind, message))
+            elif kind in ("done", "refused", "fault"):
+                last, ended = {"kind": kind, **message}, True
+        if is_unwanted() or not report(events, _standing(events)):
+            raise UnwantedError
+        if ended:
+            return last
+        if time.monotonic() > deadline:
+            raise DiedError("it took longer than the service allows")
+
+
+def _message(line: bytes | None) -> dict[str, Any]:
+    try:
+        content = json.loads(line or b"null")
+    except ValueError:
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _standing(events: Events) -> dict[str, Any]:
+    """Return where the search stands after these events."""
+    iterations = [content for kind, content in events if kind == "iteration"]
+    if not iterations:
+        return {}
+    last = iterations[-1]
+    standing = {
+        "stage": last["stage"],
+        "iteration": last["number"],
+        "seconds_left": last["seconds_left"],
+    }
+    if last["position_rmse"] is not None:
+        standing["rmse"] = last["position_rmse"]
+    return standing
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """Stop a process and those that it has started."""
+    with suppress(ProcessLookupError, PermissionError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def _cause(status: int) -> str:
+    """Return why a process died, in words."""
+    if status >= 0:
+        return f"it ended with status {status}"
+    try:
+        name = signal.Signals(-status).name
+    except ValueError:
+        name = str(-status)
+    hint = ", as when memory runs out" if -status == getattr(signal, "SIGKILL", 9) else ""
+    return f"it was ended by {name}{hint}"
+
+
+def outcome_of(last: Mapping[str, Any], folder: Path, store: Store) -> Outcome:
+    """Return what an attempt came to, the files of a result put into the store.
+
+    Raises
+    ------
+    NoSpaceError
+        The disk is full.
+    """
+    if last["kind"] == "refused":
+        return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
+    if last["kind"] == "fault":
+        error = f"this is a fault of ours: {last['error']}"
+        return Outcome(State.FAILED, error=error, exit_status=1)
+    result = RunResult.read(folder / RESULT)
+    return Outcome(
+        State.DONE,
+        exit_status=0,
+        files=_stored(folder / RESULT, store),
+        points=[
+            {
+                "coefficient": name,
+                "unit": found.unit,
+                "best": found.best,
+                "std_error": found.std_error,
+                "lower": None if found.ci95 is None else found.ci95[0],
+                "upper": None if found.ci95 is None else found.ci95[1],
+                "identifiable": found.identifiable,
+            }
+            for name, found in result.coefficients.items()
+            if found.fitted
+        ],
+    )
+
+
+def _stored(result: Path, store: Store) -> list[dict[str, Any]]:
+    """Put copies of a result's files into the store, and return their rows."""
+    rows = []
+    for file in sorted(result.rglob("*")):
+        if file.is_symlink() or not file.is_file() or file.match(CHECKPOINTS):
+            continue
+        digest, size = digest_of(file), file.stat().st_size
+        with full_disk():
+            copy = file.with_name(f".{file.name}.copy")
+            try:
+                shutil.copyfile(file, copy)
+                store.take(copy, digest)
+            finally:
+                copy.unlink(missing_ok=True)
+        rows.append({"name": file.relative_to(result).as_posix(), "sha256": digest, "size": size})
+    return rows

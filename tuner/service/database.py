@@ -1,0 +1,155 @@
+"""The database: SQLite beside the data or PostgreSQL by URL, migrated when it is opened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Connection, Engine, create_engine, event, make_url, text
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
+from sqlalchemy.orm import Session
+
+from tuner.errors import InputError
+from tuner.service.errors import UnavailableError
+
+LOCKED_FOR = 5.0
+"""s for which a writer waits for another one."""
+
+
+class Database:
+    """Sessions of one database.
+
+    Parameters
+    ----------
+    url
+        SQLAlchemy's; ``postgresql://`` is taken through psycopg 3.
+
+    Raises
+    ------
+    InputError
+        The URL is of no database that is supported, or its driver is not installed.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._reader = _engine(url)
+        self._writer = self._reader.execution_options(writes=True)
+
+    def migrate(self) -> None:
+        """Bring the tables to this version of the program.
+
+        Raises
+        ------
+        UnavailableError
+            The database cannot be reached.
+        """
+        config = Config()
+        config.set_main_option("script_location", "tuner.service:migrations")
+        with _outages(), self._writer.begin() as connection:
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+
+    @contextmanager
+    def reading(self) -> Iterator[Session]:
+        """Yield a session that sees one moment.
+
+        Raises
+        ------
+        UnavailableError
+            The database cannot be reached, or is locked.
+        """
+        with _outages(), Session(self._reader) as session:
+            yield session
+
+    @contextmanager
+    def writing(self) -> Iterator[Session]:
+        """Yield a session that is committed at the end, or leaves nothing.
+
+        Raises
+        ------
+        UnavailableError
+            The database cannot be reached, or is locked.
+        """
+        session = Session(self._writer, expire_on_commit=False)
+        with _outages(), session, session.begin():
+            yield session
+
+    def ping(self) -> None:
+        """Ask for an answer.
+
+        Raises
+        ------
+        UnavailableError
+            There is none.
+        """
+        with self.reading() as session:
+            session.execute(text("SELECT 1"))
+
+    def close(self) -> None:
+        """Let go of all connections."""
+        self._reader.dispose()
+
+
+@contextmanager
+def _outages() -> Iterator[None]:
+    """Turn a database that does not answer into a sentence for the user."""
+    try:
+        yield
+    except PoolTimeout:
+        raise UnavailableError("the database", "is busy", "try again in a minute") from None
+    except DBAPIError as error:
+        words = str(error.orig)
+        if "locked" in words:
+            what, remedy = "is locked by another program", "close that, or try again in a minute"
+        elif "disk is full" in words or "No space left" in words:
+            what, remedy = "cannot be written: the disk is full", "free some space and try again"
+        elif error.connection_invalidated or type(error).__name__ in _OUTAGES:
+            what, remedy = "cannot be reached", "check that it runs, and try again"
+        else:
+            raise
+        raise UnavailableError("the database", what, remedy) from error
+
+
+_OUTAGES = ("OperationalError", "InterfaceError")
+
+
+def _engine(given: str) -> Engine:
+    try:
+        url = make_url(given)
+        if url.drivername == "postgresql":
+            url = url.set(drivername="postgresql+psycopg")
+        if url.get_backend_name() not in ("sqlite", "postgresql"):
+            raise ArgumentError
+        engine = create_engine(url, pool_pre_ping=True, pool_size=20, max_overflow=40)
+    except (ArgumentError, NoSuchModuleError, ValueError):
+        raise InputError(
+            "--database", "is no URL of SQLite or PostgreSQL", "write postgresql://user@host/name"
+        ) from None
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "--database", f"needs {error.name}", "pip install 'multirotor-tune[postgresql]'"
+        ) from None
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _set_up_sqlite)
+        event.listen(engine, "begin", _begin)
+    return engine
+
+
+def _set_up_sqlite(connection: Any, _: object) -> None:
+    """Let readers and one writer go side by side, and let us begin transactions ourselves."""
+    connection.isolation_level = None
+    cursor = connection.cursor()
+    cursor.execute(f"PRAGMA busy_timeout={int(1000 * LOCKED_FOR)}")
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=FULL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()
+
+
+def _begin(connection: Connection) -> None:
+    """Begin as a writer where one is to write: a reader that turns writer may not wait its turn."""
+    writes = connection.get_execution_options().get("writes")
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

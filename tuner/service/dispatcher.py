@@ -1,0 +1,202 @@
+"""What takes jobs from the table and has them worked on, as many at a time as there are workers."""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from tuner.errors import InputError
+from tuner.runtime import cores
+from tuner.service.attempt import DiedError, Events, UnwantedError, attempt, outcome_of, prepare
+from tuner.service.errors import NoSpaceError, UnavailableError
+from tuner.service.queue import Claim, Outcome, Queue
+from tuner.service.settings import ServiceSettings
+from tuner.service.states import State
+from tuner.service.store import Store
+
+logger = logging.getLogger(__name__)
+
+LOOK = 0.5
+"""s between two looks into the table when nothing calls"""
+
+
+class Dispatcher:
+    """Claims jobs, has each fitted by a process of its own, and commits what comes of it.
+
+    Parameters
+    ----------
+    settings
+        Of the server.
+    queue
+        The job table.
+    store
+        Recordings and results.
+    """
+
+    def __init__(self, settings: ServiceSettings, jobs: Queue, store: Store) -> None:
+        self._settings = settings
+        self._jobs = jobs
+        self._store = store
+        self._stopping = threading.Event()
+        self._called = threading.Event()
+        self._slots: queue.SimpleQueue[int] = queue.SimpleQueue()
+        for slot in range(settings.workers):
+            self._slots.put(slot)
+        self._threads = ThreadPoolExecutor(max(1, settings.workers), "attempt")
+        self._loop = threading.Thread(target=self._run, name="dispatcher", daemon=True)
+        self.deaths = 0
+
+    def start(self) -> None:
+        """Begin to work off the table, what an earlier life of this server left there first."""
+        self._jobs.recover(own=True)
+        self._loop.start()
+
+    def call(self) -> None:
+        """Say that there may be something to do."""
+        self._called.set()
+
+    def stop(self) -> None:
+        """Stop all attempts, and put their jobs back into the queue."""
+        self._stopping.set()
+        self._called.set()
+        if self._loop.is_alive():
+            self._loop.join()
+        self._threads.shutdown()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether jobs are being worked off."""
+        return self._loop.is_alive()
+
+    def _run(self) -> None:
+        looked_for_lost = 0.0
+        while not self._stopping.is_set():
+            try:
+                if time.monotonic() - looked_for_lost > self._settings.lease_seconds / 3:
+                    looked_for_lost = time.monotonic()
+                    self._jobs.recover(own=False)
+                while not self._slots.empty() and not self._stopping.is_set():
+                    claim = self._jobs.claim()
+                    if claim is None:
+                        break
+                    self._threads.submit(self._work, claim, self._slots.get())
+            except UnavailableError as error:
+                logger.warning("%s", error)
+                self._stopping.wait(1.0)
+            except Exception:
+                logger.exception("jobs cannot be taken from the table")
+                self._stopping.wait(5.0)
+            self._called.wait(LOOK)
+            self._called.clear()
+
+    def _work(self, claim: Claim, slot: int) -> None:
+        try:
+            self._attempt(claim, slot)
+        except Exception as error:
+            logger.exception("job %s", claim.id)
+            ours = f"this is a fault of ours: {type(error).__name__}"
+            self._commit(claim, Outcome(State.FAILED, ours, exit_status=1))
+        finally:
+            self._slots.put(slot)
+            self._called.set()
+
+    def _attempt(self, claim: Claim, slot: int) -> None:
+        """Work on a job until it ends, dies, or is wanted no more."""
+        folder = self._settings.work / claim.id
+        try:
+            asked = prepare(folder, claim, self._store)
+            last = attempt(
+                folder,
+                claim,
+                asked,
+                limits=self._settings.limits,
+                cores=self._cores(slot),
+                report=_Reporting(self._jobs, claim, self._settings.lease_seconds),
+                is_unwanted=self._stopping.is_set,
+            )
+            outcome = outcome_of(last, folder, self._store)
+        except UnwantedError:
+            if self._stopping.is_set():
+                self._put_back(claim, "The server was stopped; the job waits for it.")
+            return
+        except DiedError as death:
+            self._mourn(claim, death)
+            return
+        except NoSpaceError as error:
+            outcome = Outcome(State.FAILED, f"{error}; then retry the job", exit_status=2)
+        except (InputError, OSError) as error:
+            outcome = Outcome(State.FAILED, str(error), exit_status=2)
+        if self._commit(claim, outcome) and outcome.state == State.DONE:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def _mourn(self, claim: Claim, death: DiedError) -> None:
+        """Put the job of a worker that died back, or give it up after too many deaths."""
+        self.deaths += 1
+        deaths = claim.deaths + 1
+        logger.warning("job %s: its worker died: %s", claim.id, death)
+        if deaths < self._settings.limits.deaths:
+            text = f"The worker died ({death}); the job goes on from its checkpoint."
+            self._put_back(claim, text, died=True)
+            return
+        what = f"its worker died {deaths} times; the last time {death}"
+        remedy = "look for memory and disk of the machine, then retry the job"
+        self._commit(claim, Outcome(State.FAILED, f"{what}; {remedy}", exit_status=1))
+
+    def _put_back(self, claim: Claim, message: str, *, died: bool = False) -> None:
+        """Put a job back; where the table cannot be reached, its lease will run out instead."""
+        try:
+            self._jobs.give_back(claim, message=message, died=died)
+        except UnavailableError as error:
+            logger.warning("job %s: %s", claim.id, error)
+
+    def _commit(self, claim: Claim, outcome: Outcome) -> bool:
+        """Enter an outcome, however long the table cannot be reached."""
+        while True:
+            try:
+                return self._jobs.finish(claim, outcome)
+            except UnavailableError as error:
+                logger.warning("job %s: %s", claim.id, error)
+                if self._stopping.wait(1.0):
+                    return False
+
+    def _cores(self, slot: int) -> list[int]:
+        """Return the processor cores of a slot: each has its own where there are enough."""
+        if not hasattr(os, "sched_getaffinity") or self._settings.workers > cores():
+            return []
+        return sorted(os.sched_getaffinity(0))[slot :: self._settings.workers]
+
+
+class _Reporting:
+    """Passes on what a worker says, and renews the lease now and then when it says nothing.
+
+    What cannot be entered because the database does not answer is kept for the next time.
+    """
+
+    def __init__(self, jobs: Queue, claim: Claim, lease: float) -> None:
+        self._jobs = jobs
+        self._claim = claim
+        self._pause = min(1.0, lease / 4)
+        self._last = 0.0
+        self._events: list[tuple[str, Mapping[str, Any]]] = []
+        self._standing: dict[str, Any] = {}
+
+    def __call__(self, events: Events, standing: Mapping[str, Any]) -> bool:
+        self._events.extend(events)
+        self._standing.update(standing)
+        now = time.monotonic()
+        if not self._events and now - self._last < self._pause:
+            return True
+        try:
+            held = self._jobs.report(self._claim, self._events, self._standing)
+        except UnavailableError as error:
+            logger.warning("job %s: %s", self._claim.id, error)
+            return True
+        self._last, self._events, self._standing = now, [], {}
+        return held

@@ -1,0 +1,72 @@
+"""What the service refuses: each is a sentence for the user, and a status of HTTP."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from tuner.errors import InputError
+
+
+class ServiceError(InputError):
+    """A request that cannot be met; ``STATUS`` is what HTTP answers."""
+
+    STATUS: ClassVar[int] = 422
+
+
+class NotKnownError(ServiceError):
+    """There is no such thing."""
+
+    STATUS = 404
+
+
+class NotNowError(ServiceError):
+    """The state of the job does not allow it."""
+
+    STATUS = 409
+
+
+class TooLargeError(ServiceError):
+    """More bytes than the service takes."""
+
+    STATUS = 413
+
+
+class TooManyError(ServiceError):
+    """More requests, uploads or jobs than the service takes."""
+
+    STATUS = 429
+
+
+class NotAllowedError(ServiceError):
+    """A request from another page, or under a name that is not this server's."""
+
+    STATUS = 403
+
+
+class NoTokenError(ServiceError):
+    """No token, or none of this server."""
+
+    STATUS = 401
+
+
+class UnavailableError(ServiceError):
+    """The database cannot be reached, or the server is ending."""
+
+    STATUS = 503
+
+
+class NoSpaceError(ServiceError):
+    """The disk is full."""
+
+    STATUS = 507
+
+
+def unknown_job(name: str) -> NotKnownError:
+    """Return the refusal of a job that does not exist."""
+    return NotKnownError(f"job {shown(name)}", "is not known here", "list the jobs with tune jobs")
+
+
+def shown(name: str) -> str:
+    """Return a user's word for a message: short, in one line."""
+    plain = "".join(c if c.isprintable() else "?" for c in name)
+    return plain if len(plain) <= 60 else plain[:57] + "..."

@@ -1,0 +1,75 @@
+"""A vehicle over time: each coefficient as its jobs found it."""
+
+from __future__ import annotations
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import selectinload
+
+from tuner.service.database import Database
+from tuner.service.errors import NotKnownError, shown
+from tuner.service.naming import stems
+from tuner.service.shapes import CoefficientHistory, History, Point, iso
+from tuner.service.states import State
+from tuner.service.tables import JobRow, PointRow
+
+MOST_JOBS = 500
+"""Of a history, the latest."""
+
+
+def history(database: Database, vehicle: str) -> History:
+    """Return every fitted coefficient over the jobs of a vehicle that are done.
+
+    They stand in the order in which their recordings were flown, as far as that is known, and else
+    in which they were submitted.
+
+    Raises
+    ------
+    NotKnownError
+        No job was of this vehicle.
+    """
+    with database.reading() as session:
+        any_job = select(JobRow.number).where(JobRow.vehicle == vehicle).limit(1)
+        if not vehicle.isprintable() or session.scalar(any_job) is None:
+            raise NotKnownError(f"vehicle {shown(vehicle)}", "has no jobs here", "submit one")
+        jobs = session.scalars(
+            select(JobRow)
+            .where(JobRow.vehicle == vehicle, JobRow.state == State.DONE)
+            .order_by(JobRow.number.desc())
+            .limit(MOST_JOBS)
+            .options(selectinload(JobRow.flights))
+        ).all()
+        by_number = {job.number: job for job in jobs}
+        rows = session.scalars(select(PointRow).where(PointRow.job.in_(by_number))).all()
+    rows = sorted(rows, key=lambda row: _moment(by_number[row.job]))
+    coefficients: dict[str, CoefficientHistory] = {}
+    for row in rows:
+        job = by_number[row.job]
+        ci95 = None
+        if row.lower is not None and row.upper is not None:
+            ci95 = (row.lower, row.upper)
+        point = Point(
+            job=job.id,
+            name=job.name,
+            flown=iso(job.flown),
+            ended=iso(job.ended),
+            best=row.best,
+            std_error=row.std_error,
+            ci95=ci95,
+            identifiable=row.identifiable,
+            flights=stems(flight.name for flight in job.flights if not flight.holdout),
+        )
+        empty = CoefficientHistory(unit=row.unit, points=[])
+        coefficients.setdefault(row.coefficient, empty).points.append(point)
+    return History(vehicle=vehicle, coefficients=coefficients)
+
+
+def _moment(job: JobRow) -> tuple[float, int]:
+    return job.submitted if job.flown is None else job.flown, job.number
+
+
+def vehicles(database: Database) -> dict[str, int]:
+    """Return each vehicle and how many jobs it has."""
+    with database.reading() as session:
+        statement = select(JobRow.vehicle, func.count()).group_by(JobRow.vehicle)
+        rows = session.execute(statement.order_by(JobRow.vehicle)).all()
+    return {vehicle: count for vehicle, count in rows}  # noqa: C416 (rows are no pairs to mypy)

@@ -1,0 +1,320 @@
+"""The calls under ``/api/v1``, ``/healthz`` and ``/metrics``."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Annotated, Any
+
+import anyio
+import anyio.to_thread
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
+from fastapi.responses import JSONResponse, StreamingResponse
+from starlette.requests import ClientDisconnect
+
+from tuner.errors import InputError
+from tuner.service import jobs, recordings
+from tuner.service.errors import NotKnownError, TooManyError, UnavailableError
+from tuner.service.events import follow
+from tuner.service.history import history
+from tuner.service.incoming import FIELD, Upload, receive
+from tuner.service.metrics import Metrics
+from tuner.service.request import JobRequest
+from tuner.service.safety import REPORT_POLICY
+from tuner.service.service import Service
+from tuner.service.shapes import (
+    API,
+    Accepted,
+    FullJobAnswer,
+    Health,
+    History,
+    JobAnswer,
+    JobPage,
+    Problem,
+    RecordingAnswer,
+    accepted,
+    full_job,
+    job_fields,
+    recording_answer,
+)
+from tuner.service.states import State
+from tuner.service.tables import FileRow, RecordingRow
+from tuner.versions import installed
+
+BLOCK = 2**18
+#: What any call may answer beside what it is for.
+PROBLEMS: Mapping[int | str, dict[str, Any]] = {
+    status: {"model": Problem, "description": what}
+    for status, what in {
+        400: "The request cannot be understood.",
+        401: "The request shows no token of this server.",
+        403: "The request comes from another site, or names another host.",
+        413: "The request is too large.",
+        422: "The input is wrong; the answer says where, what, and what to do.",
+        429: "Too many requests, uploads or jobs.",
+        503: "The database cannot be reached, or is locked.",
+        507: "The disk is full.",
+    }.items()
+}
+NOT_FOUND: dict[int | str, dict[str, Any]] = {
+    404: {"model": Problem, "description": "There is no such thing."}
+}
+CONFLICT: dict[int | str, dict[str, Any]] = {
+    409: {"model": Problem, "description": "The state of the job does not allow it."}
+}
+_FORM = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": [FIELD],
+                    "properties": {FIELD: {"type": "string", "format": "binary"}},
+                }
+            }
+        },
+    }
+}
+
+api = APIRouter(prefix=API, responses=dict(PROBLEMS), tags=["tuning"])
+watching = APIRouter(tags=["watching"])
+
+
+def service_of(request: Request) -> Service:
+    """Return the service that a request is for."""
+    service: Service = request.app.state.service
+    return service
+
+
+def metrics_of(request: Request) -> Metrics:
+    """Return the counters of the service."""
+    metrics: Metrics = request.app.state.metrics
+    return metrics
+
+
+Served = Annotated[Service, Depends(service_of)]
+Counted = Annotated[Metrics, Depends(metrics_of)]
+
+
+class Doors:
+    """How many uploads are received, and how many inspected, at the same time."""
+
+    def __init__(self, uploads: int, inspections: int) -> None:
+        self.left = uploads
+        self.inspections = anyio.CapacityLimiter(inspections)
+
+
+async def upload(request: Request) -> tuple[RecordingRow, bool]:
+    """Take in the recording of a request, and return its row and whether it is new.
+
+    Raises
+    ------
+    InputError
+        It cannot be taken; one line says why.
+    """
+    service, metrics = service_of(request), metrics_of(request)
+    doors: Doors = request.app.state.doors
+    if doors.left < 1:
+        raise TooManyError(
+            "the server", "is receiving too many recordings", "try again in a minute"
+        )
+    doors.left -= 1
+    try:
+        parts = (service.database, service.store, service.settings)
+        await anyio.to_thread.run_sync(recordings.check_space, *parts)
+        whole = await _received(request)
+        metrics.uploaded.inc(whole.size)
+        async with doors.inspections:
+            return await anyio.to_thread.run_sync(recordings.take, *parts, whole)
+    finally:
+        doors.left += 1
+
+
+async def _received(request: Request) -> Upload:
+    settings = service_of(request).settings
+    kind = request.headers.get("content-type", "")
+    try:
+        return await receive(request.stream(), kind, settings.incoming, settings.limits)
+    except ClientDisconnect:
+        raise InputError("upload", "was cut off", "upload the recording again") from None
+
+
+@api.post(
+    "/recordings",
+    status_code=201,
+    openapi_extra=_FORM,
+    responses={200: {"model": RecordingAnswer, "description": "It is stored already."}},
+)
+async def post_recording(request: Request, response: Response) -> RecordingAnswer:
+    """Store a recording and say what it holds; the same content is stored once."""
+    row, is_new = await upload(request)
+    response.status_code = 201 if is_new else 200
+    return recording_answer(row)
+
+
+@api.get("/recordings/{recording}", responses=NOT_FOUND)
+def get_recording(service: Served, recording: str) -> RecordingAnswer:
+    """Return a stored recording, so that it need not be sent again."""
+    return recording_answer(recordings.recording(service.database, recording))
+
+
+@api.post("/jobs", status_code=202)
+def post_job(
+    service: Served,
+    request: JobRequest,
+    response: Response,
+    idempotency_key: Annotated[str | None, Header(max_length=200, pattern="^[!-~]+$")] = None,
+) -> Accepted:
+    """Submit a job; a second request with the same ``Idempotency-Key`` is the same job."""
+    row, is_new = jobs.submit(
+        service.database, request, service.settings.limits, submission=idempotency_key
+    )
+    if not is_new:
+        response.headers["idempotent-replayed"] = "true"
+    service.dispatcher.call()
+    return accepted(row)
+
+
+@api.get("/jobs", responses=NOT_FOUND)
+def get_jobs(
+    service: Served,
+    vehicle: Annotated[str | None, Query(max_length=200)] = None,
+    state: State | None = None,
+    after: Annotated[str | None, Query(max_length=64)] = None,
+) -> JobPage:
+    """Return a page of jobs, the newest first."""
+    if vehicle is not None and not vehicle.isprintable():
+        return JobPage(jobs=[], next=None)
+    rows = jobs.page(
+        service.database, vehicle=vehicle, state=state, after=after, limit=jobs.PAGE + 1
+    )
+    shown = rows[: jobs.PAGE]
+    return JobPage(
+        jobs=[JobAnswer(**job_fields(row)) for row in shown],
+        next=shown[-1].id if len(rows) > len(shown) else None,
+    )
+
+
+@api.get("/jobs/{job}", responses=NOT_FOUND)
+def get_job(service: Served, job: str) -> FullJobAnswer:
+    """Return a job, with what it said."""
+    row = jobs.job(service.database, job)
+    return full_job(row, jobs.events(service.database, row))
+
+
+@api.get(
+    "/jobs/{job}/events",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}},
+        **NOT_FOUND,
+    },
+)
+async def get_events(
+    service: Served,
+    job: str,
+    after: Annotated[int, Query(ge=0, le=2**31 - 1)] = 0,
+    last_event_id: Annotated[str | None, Header(max_length=20)] = None,
+) -> StreamingResponse:
+    """Send a job's events as they happen: ``message``, ``iteration``, ``state``, and ``job``."""
+    row = await anyio.to_thread.run_sync(jobs.job, service.database, job)
+    if last_event_id is not None and last_event_id.isdecimal():
+        after = min(int(last_event_id), 2**31 - 1)
+    return StreamingResponse(follow(service, row.id, after), media_type="text/event-stream")
+
+
+@api.post("/jobs/{job}/cancel", responses={**NOT_FOUND, **CONFLICT})
+def cancel_job(service: Served, job: str) -> FullJobAnswer:
+    """Let a job end without a result; what its search has found so far is kept for a retry."""
+    return _after(service, jobs.cancel(service.database, job).id)
+
+
+@api.post("/jobs/{job}/retry", responses={**NOT_FOUND, **CONFLICT})
+def retry_job(service: Served, job: str) -> FullJobAnswer:
+    """Put a job that failed or was cancelled back into the queue; its search goes on."""
+    return _after(service, jobs.retry(service.database, job).id)
+
+
+def _after(service: Service, job: str) -> FullJobAnswer:
+    service.dispatcher.call()
+    return get_job(service, job)
+
+
+@api.get(
+    "/jobs/{job}/files/{name:path}",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"application/octet-stream": {"schema": {"type": "string"}}}},
+        **NOT_FOUND,
+    },
+)
+def get_file(service: Served, job: str, name: str) -> StreamingResponse:
+    """Return a file of a job's result."""
+    return file_response(service, jobs.file(service.database, job, name))
+
+
+_KINDS = {".json": "application/json", ".csv": "text/csv", ".svg": "image/svg+xml"}
+
+
+def file_response(service: Service, row: FileRow) -> StreamingResponse:
+    """Return a stored file; a report as a page that reaches nothing, the rest to be saved."""
+    suffix, base = row.name[row.name.rfind(".") :], row.name.rpartition("/")[2]
+    headers = {
+        "content-length": str(row.size),
+        "content-security-policy": REPORT_POLICY,
+        "etag": f'"{row.sha256}"',
+    }
+    if suffix == ".html":
+        kind = "text/html; charset=utf-8"
+    else:
+        kind = _KINDS.get(suffix, "application/octet-stream")
+        plain = "".join(c if c.isalnum() or c in "._-" else "_" for c in base)
+        headers["content-disposition"] = f'attachment; filename="{plain}"'
+    if not service.store.has(row.sha256):
+        raise NotKnownError(row.name, "is gone from the store", "submit the job again")
+
+    async def blocks() -> AsyncIterator[bytes]:
+        with service.store.reading(row.sha256) as file:
+            read: Callable[[int], bytes] = file.read
+            while block := await anyio.to_thread.run_sync(read, BLOCK):
+                yield block
+
+    return StreamingResponse(blocks(), media_type=kind, headers=headers)
+
+
+@api.get("/vehicles/{name}/history", responses=NOT_FOUND)
+def get_history(service: Served, name: str) -> History:
+    """Return each coefficient over a vehicle's jobs, with intervals."""
+    return history(service.database, name)
+
+
+@watching.get("/healthz", responses={503: {"model": Health}})
+def healthz(service: Served) -> Response:
+    """Say whether the server does its work."""
+    database = "ok"
+    try:
+        service.database.ping()
+    except UnavailableError as error:
+        database = error.what
+    workers = "ok" if service.dispatcher.is_alive else "stopped"
+    is_well = database == workers == "ok"
+    answer = Health(
+        status="ok" if is_well else "failing",
+        database=database,
+        workers=workers,
+        version=installed(),
+    )
+    return JSONResponse(answer.model_dump(), status_code=200 if is_well else 503)
+
+
+@watching.get(
+    "/metrics",
+    response_class=Response,
+    responses={
+        200: {"content": {"text/plain": {"schema": {"type": "string"}}}},
+        **{status: PROBLEMS[status] for status in (401, 403, 429)},
+    },
+)
+def metrics(counted: Counted) -> Response:
+    """Return counters for Prometheus."""
+    return Response(counted.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

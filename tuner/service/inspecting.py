@@ -1,0 +1,84 @@
+"""A recording inspected in a process of its own, with limits on memory, time and what it writes.
+
+``python -m tuner.service.inspecting FILE MEMORY BYTES SECONDS`` prints what `tune inspect --json`
+prints.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tuner.errors import RecordingError
+from tuner.service.limiting import limit_process
+from tuner.service.settings import Limits
+
+SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
+MOST_JSON = 20_000_000
+"""bytes of an inspection"""
+
+
+def inspect(file: Path, limits: Limits) -> dict[str, Any]:
+    """Return what `tune inspect` finds in a recording, as JSON holds it.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, or takes more memory or time than is allowed.
+    """
+    numbers = (
+        limits.inspection_memory_bytes,
+        limits.file_bytes,
+        int(limits.inspection_seconds) + 1,
+    )
+    command = [sys.executable, "-m", "tuner.service.inspecting", str(file), *map(str, numbers)]
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    try:
+        done = subprocess.run(
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=limits.inspection_seconds,
+            env={**os.environ, **single},
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        what = f"takes more than {limits.inspection_seconds:g} s to read"
+        raise RecordingError(file.name, what, SMALLER) from None
+    if done.returncode == 3:
+        what = f"needs more than {limits.inspection_memory_bytes / 2**30:g} GiB of memory to read"
+        raise RecordingError(file.name, what, SMALLER)
+    if done.returncode != 0 or len(done.stdout) > MOST_JSON:
+        raise RecordingError(
+            file.name, "cannot be read: its reader was stopped", "is it a recording of a flight?"
+        )
+    content = json.loads(done.stdout)
+    if "refused" in content:
+        raise RecordingError(file.name, content["refused"]["what"], content["refused"]["remedy"])
+    recording: dict[str, Any] = content["recordings"][0]
+    return recording | {"path": file.name}
+
+
+def main() -> None:
+    """Inspect the file that the command line names."""
+    file, memory, size, seconds = sys.argv[1], *map(int, sys.argv[2:])
+    limit_process(memory_bytes=memory, file_bytes=size, cpu_seconds=seconds)
+    from tuner.flights.inspection import as_json, inspect_recordings  # noqa: PLC0415 (after limits)
+
+    try:
+        inspections, errors = inspect_recordings([Path(file)], cache=False)
+    except MemoryError:
+        sys.exit(3)
+    if errors:
+        refused = {"what": errors[0].what, "remedy": errors[0].remedy}
+        sys.stdout.write(json.dumps({"refused": refused}))
+    else:
+        sys.stdout.write(as_json(inspections))
+
+
+if __name__ == "__main__":
+    main()

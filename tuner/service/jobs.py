@@ -1,0 +1,316 @@
+"""Jobs as users deal with them: submitted, listed, looked at, cancelled, tried again."""
+
+from __future__ import annotations
+
+import datetime
+import re
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sqlalchemy import func, select, update
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.orm import Session, selectinload, undefer
+
+from tuner.service.database import Database
+from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
+from tuner.service.naming import file_name
+from tuner.service.queue import add_event
+from tuner.service.request import JobRequest, checked
+from tuner.service.settings import Limits
+from tuner.service.states import FINISHED, UNFINISHED, State
+from tuner.service.tables import EventRow, FileRow, FlightRow, JobRow, RecordingRow
+
+PAGE = 50
+"""Jobs of one page."""
+_ID = re.compile("[0-9a-f]{16}")
+
+
+def submit(
+    database: Database, request: JobRequest, limits: Limits, *, submission: str | None = None
+) -> tuple[JobRow, bool]:
+    """Enter a job, and return it and whether it is new.
+
+    Parameters
+    ----------
+    database
+        With the tables.
+    request
+        What a user sent.
+    limits
+        On recordings of one job and on unfinished jobs.
+    submission
+        A key of this request; a second one with the same key is answered with the same job.
+
+    Raises
+    ------
+    InputError
+        The request cannot be met; one line says what to do.
+    """
+    if submission is not None and (before := _submitted(database, submission)) is not None:
+        return before, False
+    with database.reading() as session:
+        recordings = _recordings(session, request.recordings, limits)
+        unfinished = session.scalar(
+            select(func.count()).select_from(JobRow).where(JobRow.state.in_(UNFINISHED))
+        )
+        earlier = _earlier_vehicle(session, request)
+    if unfinished is not None and unfinished >= limits.unfinished_jobs:
+        raise TooManyError("the service", f"has {unfinished} unfinished jobs", "try again later")
+    flights = [file_name(recording.name) for recording in recordings]
+    asked, vehicle, holdout = checked(request, flights, earlier)
+    flown = [t for r in recordings if (t := _seconds(r.inspection.get("started"))) is not None]
+    row = JobRow(
+        id=secrets.token_hex(8),
+        name=request.name or _name(flights, vehicle),
+        vehicle=vehicle,
+        state=State.QUEUED,
+        request=asked.model_dump(mode="json", exclude_none=True),
+        submitted=time.time(),
+        flown=min(flown, default=None),
+        submission=submission,
+        deaths=0,
+        events=0,
+    )
+    row.flights = [
+        FlightRow(
+            position=position,
+            sha256=recording.sha256,
+            name=name,
+            holdout=name.rpartition(".")[0] in holdout or name in holdout,
+        )
+        for position, (recording, name) in enumerate(zip(recordings, flights, strict=True))
+    ]
+    try:
+        with database.writing() as session:
+            session.add(row)
+            session.flush()
+            add_event(session, row.number, "state", {"state": State.QUEUED})
+    except IntegrityError:  # the same request arrived twice at the same time
+        before = _submitted(database, submission or "")
+        if before is None:
+            raise
+        return before, False
+    return row, True
+
+
+def _recordings(session: Session, digests: Sequence[str], limits: Limits) -> list[RecordingRow]:
+    """Return the recordings of a request."""
+    if len(digests) > limits.recordings_of_job:
+        raise TooManyError(
+            "recordings", f"are {len(digests)}", f"give up to {limits.recordings_of_job} a job"
+        )
+    rows = {
+        row.sha256: row
+        for row in session.scalars(select(RecordingRow).where(RecordingRow.sha256.in_(digests)))
+    }
+    chosen = dict.fromkeys(digests)
+    for digest in chosen:
+        if digest not in rows:
+            raise UnknownRecordingError(digest)
+    return [rows[digest] for digest in chosen]
+
+
+class UnknownRecordingError(NotKnownError):
+    """A job names a recording that was not uploaded."""
+
+    STATUS = 422
+
+    def __init__(self, digest: str) -> None:
+        super().__init__(
+            "recordings", f"{digest[:12]}… was not uploaded here", "upload the recording first"
+        )
+
+
+def _earlier_vehicle(session: Session, request: JobRequest) -> dict[str, Mapping[str, Any]]:
+    """Return the vehicle of the last job of the name that a request gives, if there is one."""
+    name = request.vehicle or request.settings.get("vehicle")
+    if not isinstance(name, str) or not name.isprintable():
+        return {}
+    statement = (
+        select(JobRow)
+        .where(JobRow.vehicle == name)
+        .order_by(JobRow.number.desc())
+        .limit(1)
+        .options(undefer(JobRow.request))
+    )
+    row = session.scalars(statement).first()
+    vehicle = None if row is None else row.request.get("vehicle")
+    return {name: vehicle} if isinstance(vehicle, dict) else {}
+
+
+def _name(flights: Sequence[str], vehicle: str) -> str:
+    more = f" and {len(flights) - 1} more" if len(flights) > 1 else ""
+    return f"{vehicle}: {flights[0].rpartition('.')[0] or flights[0]}{more}"[:200]
+
+
+def _seconds(started: object) -> float | None:
+    """Return s since 1970 of an inspection's start."""
+    if not isinstance(started, str):
+        return None
+    try:
+        return datetime.datetime.fromisoformat(started).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def _submitted(database: Database, submission: str) -> JobRow | None:
+    with database.reading() as session:
+        return session.scalars(select(JobRow).where(JobRow.submission == submission)).first()
+
+
+def page(
+    database: Database,
+    *,
+    vehicle: str | None = None,
+    state: State | None = None,
+    after: str | None = None,
+    limit: int = PAGE,
+) -> Sequence[JobRow]:
+    """Return jobs with their files, the newest first.
+
+    Parameters
+    ----------
+    database
+        With the tables.
+    vehicle, state
+        Which jobs; None takes all.
+    after
+        Id of the last job of the page before.
+    limit
+        Jobs of a page.
+
+    Raises
+    ------
+    NotKnownError
+        There is no job ``after``.
+    """
+    statement = select(JobRow).order_by(JobRow.number.desc()).limit(limit)
+    if vehicle is not None:
+        statement = statement.where(JobRow.vehicle == vehicle)
+    if state is not None:
+        statement = statement.where(JobRow.state == state)
+    with database.reading() as session:
+        if after is not None:
+            statement = statement.where(JobRow.number < _row(session, after).number)
+        return session.scalars(statement.options(selectinload(JobRow.files))).all()
+
+
+def job(database: Database, name: str) -> JobRow:
+    """Return a job with its flights and files.
+
+    Raises
+    ------
+    NotKnownError
+        There is none of this id.
+    """
+    with database.reading() as session:
+        row = _row(session, name)
+        _ = row.flights, row.files
+        return row
+
+
+def events(database: Database, row: JobRow, *, after: int = 0, most: int = 5_000) -> list[EventRow]:
+    """Return what happened to a job after an event of it."""
+    with database.reading() as session:
+        statement = (
+            select(EventRow)
+            .where(EventRow.job == row.number, EventRow.number > after)
+            .order_by(EventRow.number)
+            .limit(most)
+        )
+        return list(session.scalars(statement))
+
+
+def file(database: Database, name: str, path: str) -> FileRow:
+    """Return a file of a job's result.
+
+    Raises
+    ------
+    NotKnownError
+        There is no such job, or no such file of it.
+    """
+    with database.reading() as session:
+        row = _row(session, name)
+        found = next((file for file in row.files if file.name == path), None)
+        if found is None:
+            remedy = "wait until the job is done, and see its list of files"
+            raise NotKnownError(f"job {row.id}", "has no such file", remedy)
+        return found
+
+
+def cancel(database: Database, name: str) -> JobRow:
+    """Let a job end without a result; its worker stops within a second.
+
+    Raises
+    ------
+    NotKnownError, NotNowError
+        There is no such job, or it has ended.
+    """
+    ending = {"state": State.CANCELLED, "ended": time.time(), "exit_status": 130}
+    changes = {**ending, "claim": None, "owner": None, "lease": None, "seconds_left": None}
+    return _move(database, name, UNFINISHED, changes, "there is nothing left to cancel")
+
+
+def retry(database: Database, name: str) -> JobRow:
+    """Put a job that failed or was cancelled back into the queue, with its checkpoint.
+
+    Raises
+    ------
+    NotKnownError, NotNowError
+        There is no such job, or it has not failed.
+    """
+    changes = {
+        "state": State.QUEUED,
+        "ended": None,
+        "error": None,
+        "exit_status": None,
+        "deaths": 0,
+    }
+    remedy = "only a job that failed or was cancelled is tried again; submit a new one"
+    return _move(database, name, (State.FAILED, State.CANCELLED), changes, remedy)
+
+
+def _move(
+    database: Database, name: str, allowed: Sequence[State], changes: Mapping[str, Any], remedy: str
+) -> JobRow:
+    """Change a job that is in one of some states."""
+    with database.writing() as session:
+        row = _row(session, name)
+        moved = session.scalar(
+            update(JobRow)
+            .where(JobRow.number == row.number, JobRow.state.in_(allowed))
+            .values(**changes)
+            .returning(JobRow.number)
+            .execution_options(synchronize_session=False)
+        )
+        if moved is None:
+            session.refresh(row)
+            raise NotNowError(f"job {row.id}", f"is {row.state}", remedy)
+        add_event(session, row.number, "state", {"state": changes["state"]})
+        session.refresh(row)
+        _ = row.flights, row.files
+        return row
+
+
+def _row(session: Session, name: str) -> JobRow:
+    row = None
+    if _ID.fullmatch(name):
+        row = session.scalars(select(JobRow).where(JobRow.id == name)).first()
+    if row is None:
+        raise unknown_job(name)
+    return row
+
+
+def counts(database: Database) -> dict[str, int]:
+    """Return how many jobs are in each state."""
+    with database.reading() as session:
+        rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all()
+    found = {state: count for state, count in rows}  # noqa: C416 (rows are no pairs to mypy)
+    return {state.value: found.get(state, 0) for state in State}
+
+
+def is_finished(row: JobRow) -> bool:
+    """Return whether a job has ended."""
+    return row.state in FINISHED

@@ -1,0 +1,115 @@
+"""Recordings as users deal with them: taken in, inspected, listed."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.exc import IntegrityError
+
+from tuner.errors import InputError
+from tuner.service.database import Database
+from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, shown
+from tuner.service.incoming import Upload
+from tuner.service.inspecting import inspect
+from tuner.service.naming import file_name
+from tuner.service.settings import ServiceSettings
+from tuner.service.store import Store
+from tuner.service.tables import RecordingRow
+
+
+def check_space(database: Database, store: Store, settings: ServiceSettings) -> None:
+    """Refuse an upload before it begins, where there is no room for it.
+
+    Raises
+    ------
+    TooManyError, NoSpaceError
+        There are too many recordings, or the disk is nearly full.
+    """
+    limits = settings.limits
+    free = store.free_bytes()
+    if free is not None and free < limits.free_bytes:
+        raise NoSpaceError("the server", "has no space left", "free some space and try again")
+    with database.reading() as session:
+        stored = session.scalar(select(func.count()).select_from(RecordingRow)) or 0
+    if stored >= limits.recordings:
+        raise TooManyError("the server", f"keeps {stored} recordings", "ask who runs it for more")
+
+
+def take(
+    database: Database, store: Store, settings: ServiceSettings, upload: Upload
+) -> tuple[RecordingRow, bool]:
+    """Inspect an upload, store and enter it, and return its row and whether it is new.
+
+    Raises
+    ------
+    InputError
+        It is no recording that can be read; nothing of it is kept.
+    """
+    try:
+        with database.reading() as session:
+            known = session.get(RecordingRow, upload.sha256)
+        if known is not None and store.has(upload.sha256):
+            return _enter(database, upload, known.inspection), False
+        inspection = _inspected(upload, settings)
+        store.take(upload.path, upload.sha256)
+        return _enter(database, upload, inspection), known is None
+    finally:
+        upload.path.unlink(missing_ok=True)
+
+
+def _inspected(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
+    """Return what an upload holds, read under a name of our own."""
+    with tempfile.TemporaryDirectory(dir=settings.incoming) as folder:
+        file = Path(folder) / file_name(upload.name)
+        os.link(upload.path, file)
+        try:
+            return inspect(file, settings.limits)
+        except InputError as error:
+            raise type(error)(upload.name, error.what, error.remedy) from None
+
+
+def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> RecordingRow:
+    """Enter a recording, or its new name."""
+    for last in (False, True):
+        try:
+            with database.writing() as session:
+                row = session.get(RecordingRow, upload.sha256)
+                if row is None:
+                    row = RecordingRow(sha256=upload.sha256, size=upload.size)
+                    session.add(row)
+                row.name, row.uploaded = upload.name, time.time()
+                row.inspection = inspection | {"path": upload.name}
+                return row
+        except IntegrityError:  # entered by another upload of the same recording
+            if last:
+                raise
+    raise AssertionError
+
+
+def latest(database: Database, most: int) -> Sequence[RecordingRow]:
+    """Return the recordings that were uploaded last."""
+    with database.reading() as session:
+        return session.scalars(
+            select(RecordingRow).order_by(RecordingRow.uploaded.desc()).limit(most)
+        ).all()
+
+
+def recording(database: Database, digest: str) -> RecordingRow:
+    """Return a recording.
+
+    Raises
+    ------
+    NotKnownError
+        There is none of this id.
+    """
+    with database.reading() as session:
+        row = session.get(RecordingRow, digest) if digest.isalnum() else None
+    if row is None:
+        raise NotKnownError(f"recording {shown(digest)}", "is not known here", "upload it")
+    return row

@@ -1,0 +1,267 @@
+"""What a job is asked to fit, checked at once as far as that goes without reading a recording."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+from annotated_types import Len
+from pydantic import AfterValidator, ConfigDict, Field, JsonValue
+
+from tuner.config import ControllerFile, Options, VehicleFile, settle
+from tuner.config.job import JobFile, Method
+from tuner.errors import ConfigError, InputError, did_you_mean
+from tuner.flights.topics import TopicMap
+from tuner.service.naming import last_part, stems
+from tuner.yaml_files.document import dump_yaml
+from tuner.yaml_files.section import Flag, Number, Section, Whole, build, refuse
+from tuner.yaml_files.shipped import Kind, configs_folder
+
+JOB_FILE = "tune.yaml"
+FLIGHTS = "flights"
+#: Keys of `tune.yaml` that name a file there, and a shipped file or its content here.
+_KINDS: Mapping[str, Kind] = {
+    "vehicle": "vehicles",
+    "controller": "controllers",
+    "topics": "topics",
+}
+
+
+def _one_line(text: str) -> str:
+    if not text.isprintable():
+        raise refuse("a name holds characters that cannot be printed", "leave them out")
+    return text
+
+
+M = TypeVar("M", bound=Section)
+Word = Annotated[str, Len(max_length=200), AfterValidator(_one_line)]
+Named = Word | dict[str, JsonValue]
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+
+class JobRequest(Section):
+    """A job: recordings, what is to be fitted to them, and options that win over the settings.
+
+    Attributes
+    ----------
+    recordings
+        Ids of uploaded recordings.
+    holdout
+        Names of flights that are evaluated, never fitted; None takes those of the settings.
+    vehicle, controller
+        A shipped file's name, or what such a file holds, as JSON. A vehicle may also be named that
+        an earlier job was of.
+    settings
+        The keys of ``tune.yaml``.
+    name
+        What lists call the job.
+    mass, fit, fix, method, seed, namespace, cross_validate, force
+        As the options of `tune`.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {"recordings": ["0" * 64], "holdout": ["circle_4mps"], "settings": {}}
+        }
+    )
+
+    recordings: Annotated[tuple[Digest, ...], Len(min_length=1, max_length=1000)]
+    holdout: tuple[Word, ...] | None = None
+    vehicle: Named | None = None
+    controller: Named | None = None
+    settings: dict[str, JsonValue] = Field(default_factory=dict)
+    name: Word = ""
+    mass: Number | None = None
+    fit: tuple[Word, ...] | None = None
+    fix: tuple[Word, ...] | None = None
+    method: Method | None = None
+    seed: Whole | None = None
+    namespace: Word | None = None
+    cross_validate: Flag = False
+    force: Flag = False
+
+
+class Asked(Section):
+    """A request that was checked, as the job table keeps it: nothing in it is a path.
+
+    Attributes
+    ----------
+    vehicle, controller, topics
+        A shipped file's name, or what such a file holds.
+    settings
+        The keys of ``tune.yaml`` but those.
+    """
+
+    vehicle: str | VehicleFile | None = None
+    controller: str | ControllerFile | None = None
+    topics: str | TopicMap | None = None
+    settings: dict[str, JsonValue] = Field(default_factory=dict)
+    holdout: tuple[str, ...] | None = None
+    mass: Number | None = None
+    fit: tuple[str, ...] | None = None
+    fix: tuple[str, ...] | None = None
+    method: Method | None = None
+    seed: Whole | None = None
+    namespace: str | None = None
+    cross_validate: Flag = False
+    force: Flag = False
+
+    def lay_out(self, folder: Path) -> None:
+        """Write the files that `options` names, beside the recordings in ``folder/flights``.
+
+        Raises
+        ------
+        OutputError
+            They cannot be written.
+        """
+        if self.settings:
+            (folder / FLIGHTS / JOB_FILE).write_text(dump_yaml(self.settings), encoding="utf-8")
+        if isinstance(self.topics, TopicMap):
+            content = self.topics.model_dump(mode="json", exclude_none=True)
+            (folder / "topics.yaml").write_text(dump_yaml(content), encoding="utf-8")
+
+    def options(self, folder: Path, flights: Sequence[str]) -> Options:
+        """Return what `tune` would have been called with, for files in ``folder/flights``."""
+        job_file = folder / FLIGHTS / JOB_FILE
+        topics = str(folder / "topics.yaml") if isinstance(self.topics, TopicMap) else self.topics
+        return Options(
+            [str(folder / FLIGHTS / name) for name in flights],
+            holdout=self.holdout,
+            vehicle=self.vehicle,
+            controller=self.controller,
+            mass=self.mass,
+            config=str(job_file) if self.settings else None,
+            fit=self.fit,
+            fix=self.fix,
+            method=self.method,
+            seed=self.seed,
+            topics=topics,
+            namespace=self.namespace,
+        )
+
+
+def checked(
+    request: JobRequest, flights: Sequence[str], earlier: Mapping[str, Mapping[str, Any]]
+) -> tuple[Asked, str, frozenset[str]]:
+    """Check a request, and return it with its vehicle's name and the held-out flights.
+
+    Parameters
+    ----------
+    request
+        What a user sent.
+    flights
+        The files' names of its recordings, fit to be names here.
+    earlier
+        Vehicles of earlier jobs: name -> content.
+
+    Raises
+    ------
+    InputError
+        A key, a name or a value cannot be used; one line says what to do.
+    """
+    settings = dict(request.settings)
+    named = {key: settings.pop(key, None) for key in _KINDS}
+    for key in ("vehicle", "controller"):
+        given = getattr(request, key)
+        named[key] = named[key] if given is None else given
+    job = build(JobFile, settings, "settings")
+    if job.export.into is not None:
+        what = "export.into names a file, and the service has only what it is sent"
+        raise ConfigError("settings", what, "fetch the result and use tune export --into")
+    of = named["vehicle"]
+    if isinstance(of, str) and of in earlier and of not in _shipped("vehicles"):
+        named["vehicle"] = dict(earlier[of])
+    asked = Asked(
+        vehicle=_named("vehicle", named["vehicle"], VehicleFile, earlier),
+        controller=_named("controller", named["controller"], ControllerFile),
+        topics=_topics(named["topics"]),
+        settings=settings,
+        holdout=_holdout(request.holdout, flights),
+        **{
+            key: getattr(request, key)
+            for key in ("mass", "fit", "fix", "method", "seed", "namespace")
+        },
+        cross_validate=request.cross_validate,
+        force=request.force,
+    )
+    with tempfile.TemporaryDirectory(prefix="tune-check-") as name:
+        folder = Path(name)
+        (folder / FLIGHTS).mkdir()
+        for flight in flights:
+            if (folder / FLIGHTS / flight).exists():
+                raise InputError(
+                    flight, "is the name of two recordings", "rename one and upload it again"
+                )
+            (folder / FLIGHTS / flight).touch()
+        asked.lay_out(folder)
+        try:
+            settled = settle(asked.options(folder, flights))
+        except InputError as error:
+            raise type(error)(
+                *(_without(folder, text) for text in (error.where, error.what, error.remedy))
+            ) from None
+    name = settled.vehicle.name
+    if not (name.strip() and name.isprintable() and len(name) <= 100):
+        raise ConfigError("vehicle", "name is no plain name", "give one of up to 100 letters")
+    return asked, name, frozenset(settled.job.holdout)
+
+
+def _holdout(names: Sequence[str] | None, flights: Sequence[str]) -> tuple[str, ...] | None:
+    """Return the names of flights that are meant: by their names or their files' names."""
+    if names is None:
+        return None
+    known = stems(flights)
+    chosen = []
+    for name in names:
+        stem = next((s for s in (name, *stems([last_part(name)])) if _is_among(s, known)), None)
+        if stem is None:
+            raise InputError("holdout", f"there is no flight '{name}'", did_you_mean(name, known))
+        chosen.append(stem)
+    return tuple(chosen)
+
+
+def _is_among(name: str, recordings: Collection[str]) -> bool:
+    """Return whether a flight is of one of these recordings, the second mission of one included."""
+    return name in recordings or re.sub(r"-\d+$", "", name) in recordings
+
+
+def _shipped(kind: Kind) -> list[str]:
+    return sorted(file.stem for file in (configs_folder() / kind).glob("*.yaml"))
+
+
+def _named(
+    key: str, given: Any, model: type[M], earlier: Mapping[str, object] | None = None
+) -> str | M | None:
+    """Return a shipped file's name, or what is given as the content of such a file."""
+    if given is None:
+        return None
+    if isinstance(given, Mapping):
+        return build(model, given, key)
+    shipped = _shipped(_KINDS[key])
+    if not isinstance(given, str) or given not in shipped:
+        known = [*shipped, *(earlier or ())]
+        remedy = did_you_mean(str(given), known) + " Or give the content of its file."
+        raise ConfigError(key, f"'{given}' is not known here", remedy)
+    return given
+
+
+def _topics(given: Any) -> str | TopicMap | None:
+    topics = _named("topics", given, TopicMap)
+    if isinstance(topics, TopicMap):
+        if topics.messages:
+            what = "messages names files, and the service has only what it is sent"
+            raise ConfigError("topics", what, "record in a format that defines its messages")
+        if topics.extends is not None and topics.extends not in _shipped("topics"):
+            remedy = did_you_mean(topics.extends, _shipped("topics"))
+            raise ConfigError("topics", f"extends '{topics.extends}', which is unknown", remedy)
+    return topics
+
+
+def _without(folder: Path, text: str) -> str:
+    """Return a message without the folder that the check was made in."""
+    for place in (folder.resolve() / FLIGHTS, folder / FLIGHTS, folder):
+        text = text.replace(f"{place}/", "")
+    return text

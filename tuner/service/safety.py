@@ -1,0 +1,154 @@
+"""What every request passes first: host, origin, token, rate and size; and headers on the way out.
+
+A page elsewhere on the web must not reach a server on this machine through its user's browser: not
+under a name that it made point here (the host is checked), and not with a form of its own (the
+origin is checked).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable
+from urllib.parse import urlsplit
+
+import anyio.to_thread
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import Request
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from tuner.service import tokens
+from tuner.service.errors import (
+    NotAllowedError,
+    NoTokenError,
+    ServiceError,
+    TooLargeError,
+    TooManyError,
+)
+from tuner.service.metrics import Metrics
+from tuner.service.rates import RateLimit
+from tuner.service.service import Service
+
+COOKIE = "tune_token"
+OPEN_TO_ALL = ("/healthz", "/login", "/static/")
+UPLOADS = ("/api/v1/recordings", "/recordings")
+#: Pages run the service's own script and style, and load nothing from elsewhere.
+PAGE_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
+    "connect-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; "
+    "frame-ancestors 'none'"
+)
+#: A report runs its own scripts in a world of its own: no cookies, no connection, no form.
+REPORT_POLICY = (
+    "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+Answer = Callable[[Request, ServiceError], Awaitable[ASGIApp]]
+
+
+class Guard:
+    """Middleware around the application.
+
+    Parameters
+    ----------
+    app
+        What answers.
+    service, metrics
+        Of the server.
+    refuse
+        Makes the answer to a request that is refused.
+    """
+
+    def __init__(self, app: ASGIApp, service: Service, metrics: Metrics, refuse: Answer) -> None:
+        limits = service.settings.limits
+        self._app = app
+        self._service = service
+        self._metrics = metrics
+        self._refuse = refuse
+        self._rates = RateLimit(limits.requests_per_second, limits.requests_in_a_burst)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request, or refuse it."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        began, status = time.perf_counter(), 500
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                _add_headers(MutableHeaders(scope=message))
+            await send(message)
+
+        request = Request(scope)
+        try:
+            await self._check(request)
+            body = await self._body(request, receive)
+            await self._app(scope, body, send_with_headers)
+        except ServiceError as error:
+            answer = await self._refuse(request, error)
+            await answer(scope, receive, send_with_headers)
+        finally:
+            route = getattr(scope.get("route"), "path", "none")
+            labels = (scope["method"] if route != "none" else "any", route, str(status))
+            self._metrics.seconds.labels(*labels).observe(time.perf_counter() - began)
+
+    async def _check(self, request: Request) -> None:
+        settings = self._service.settings
+        host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
+        if settings.hosts and host not in settings.hosts:
+            raise NotAllowedError("the request", "names another host", "open the server's own URL")
+        if request.method not in ("GET", "HEAD", "OPTIONS"):
+            _check_origin(request.headers)
+        visitor = request.client.host if request.client else "unknown"
+        if settings.demands_tokens:
+            name = await anyio.to_thread.run_sync(self._owner, request)
+            if name is not None:
+                visitor = f"token {name}"
+            elif not request.url.path.startswith(OPEN_TO_ALL):
+                raise NoTokenError("the request", "shows no token of this server", "log in with it")
+        if not self._rates.allows(visitor):
+            raise TooManyError("the server", "is asked too often by you", "wait some seconds")
+
+    def _owner(self, request: Request) -> str | None:
+        kind, _, word = request.headers.get("authorization", "").partition(" ")
+        token = word.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
+        return tokens.owner(self._service.database, token) if token else None
+
+    async def _body(self, request: Request, receive: Receive) -> Receive:
+        """Return what gives a body on, once it has arrived whole and is not too large."""
+        if request.url.path in UPLOADS or request.method in ("GET", "HEAD", "OPTIONS"):
+            return receive  # a file is counted as it is taken apart
+        most, body, more = self._service.settings.limits.body_bytes, b"", True
+        while more:
+            message = await receive()
+            body += message.get("body", b"")
+            more = message.get("more_body", False)
+            if len(body) > most:
+                what = f"is larger than {most / 2**20:g} MiB"
+                raise TooLargeError("the request", what, "send recordings as uploads")
+        parts: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+        async def replay() -> Message:
+            return parts.pop() if parts else await receive()
+
+        return replay
+
+
+def _check_origin(headers: Headers) -> None:
+    """Refuse what a page of another site sends."""
+    origin = headers.get("origin")
+    elsewhere = origin is not None and urlsplit(origin).netloc != headers.get("host")
+    if elsewhere or headers.get("sec-fetch-site") in ("cross-site", "same-site"):
+        raise NotAllowedError(
+            "the request", "comes from a page of another site", "use the server's own pages"
+        )
+
+
+def _add_headers(headers: MutableHeaders) -> None:
+    headers.setdefault("content-security-policy", PAGE_POLICY)
+    headers.setdefault("x-content-type-options", "nosniff")
+    headers.setdefault("referrer-policy", "no-referrer")
+    headers.setdefault("cache-control", "no-store")
+    headers.setdefault("cross-origin-resource-policy", "same-origin")

@@ -1,0 +1,121 @@
+"""What a server is started with: where things lie, who works, and how much is too much."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+MIB = 2**20
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much one visitor, one recording and one job may take.
+
+    Attributes
+    ----------
+    upload_bytes
+        Of one recording.
+    body_bytes
+        Of any other request.
+    uploads_at_once
+        Recordings that are received at the same time, of all visitors together.
+    recordings
+        Stored recordings, of all visitors together.
+    recordings_of_job
+        Recordings of one job.
+    unfinished_jobs
+        Jobs that are queued or running.
+    requests_per_second, requests_in_a_burst
+        Of one visitor, by token or address.
+    free_bytes
+        Left on the disk of the store, below which nothing more is taken.
+    memory_bytes
+        Of a process that fits a job.
+    inspection_memory_bytes, inspection_seconds
+        Of a process that inspects a recording.
+    file_bytes
+        Of a file that such a process writes.
+    job_seconds
+        Of one attempt at a job.
+    deaths
+        Attempts that end with the death of their process before the job is given up.
+    """
+
+    upload_bytes: int = 4 * GIB
+    body_bytes: int = 1 * MIB
+    uploads_at_once: int = 16
+    recordings: int = 100_000
+    recordings_of_job: int = 64
+    unfinished_jobs: int = 20_000
+    requests_per_second: float = 200.0
+    requests_in_a_burst: int = 2_000
+    free_bytes: int = 256 * MIB
+    memory_bytes: int = 8 * GIB
+    inspection_memory_bytes: int = 2 * GIB
+    inspection_seconds: float = 120.0
+    file_bytes: int = 2 * GIB
+    job_seconds: float = 6 * 3600.0
+    deaths: int = 3
+
+
+@dataclass(frozen=True)
+class ServiceSettings:
+    """One server.
+
+    Attributes
+    ----------
+    data
+        Folder for everything that is not said to lie elsewhere.
+    database
+        SQLAlchemy URL; empty for SQLite in ``data``.
+    store
+        fsspec URL of recordings and results; empty for a folder in ``data``.
+    workers
+        Jobs that are worked on at the same time.
+    lease_seconds
+        For which a claim on a job holds unless it is renewed.
+    demands_tokens
+        Whether a visitor must show a token.
+    hosts
+        Names under which visitors may address the server; none means any.
+    limits
+        See there.
+    """
+
+    data: Path
+    database: str = ""
+    store: str = ""
+    workers: int = 2
+    lease_seconds: float = 30.0
+    demands_tokens: bool = False
+    hosts: tuple[str, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+
+    @property
+    def database_url(self) -> str:
+        """SQLAlchemy URL of the database."""
+        return self.database or f"sqlite:///{self.data.absolute() / 'tune.sqlite'}"
+
+    @property
+    def store_url(self) -> str:
+        """URL, or folder, of the store."""
+        return self.store or str(self.data.absolute() / "store")
+
+    @property
+    def incoming(self) -> Path:
+        """Folder of uploads that are not complete."""
+        return self.data / "incoming"
+
+    @property
+    def work(self) -> Path:
+        """Folder of jobs under way, by their ids."""
+        return self.data / "work"
+
+
+def default_data() -> Path:
+    """Return the folder of a server whose user names none."""
+    base = os.environ.get("XDG_DATA_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "share") / "multirotor-tune"

@@ -1,0 +1,194 @@
+"""What the HTTP interface answers, as JSON."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import BaseModel, Field, JsonValue
+
+from tuner.service.states import State
+from tuner.service.tables import EventRow, JobRow, RecordingRow
+
+API = "/api/v1"
+
+
+class Problem(BaseModel):
+    """A refusal: where, what is wrong, what to do, and all of it as one sentence."""
+
+    where: str
+    what: str
+    remedy: str
+    detail: str
+
+
+class RecordingAnswer(BaseModel):
+    """A stored recording: its SHA-256, its name, and what `tune inspect` says of it."""
+
+    id: str
+    name: str
+    inspection: dict[str, JsonValue]
+
+
+class Links(BaseModel):
+    """Where more of a job is found."""
+
+    self: str
+    events: str
+    cancel: str
+    retry: str
+    page: str
+    files: dict[str, str] = Field(default_factory=dict)
+
+
+class Accepted(BaseModel):
+    """A job that was submitted."""
+
+    id: str
+    state: State
+    links: Links
+
+
+class JobAnswer(BaseModel):
+    """A job; ``rmse`` in m, times as ISO 8601, ``exit_status`` as of the local command."""
+
+    id: str
+    name: str
+    vehicle: str
+    state: State
+    stage: str | None
+    iteration: int | None
+    rmse: float | None
+    seconds_left: float | None
+    submitted: str
+    started: str | None
+    ended: str | None
+    error: str | None
+    exit_status: int | None
+    files: list[str]
+
+
+class FlightAnswer(BaseModel):
+    """A recording of a job."""
+
+    id: str
+    name: str
+    holdout: bool
+
+
+class FullJobAnswer(JobAnswer):
+    """A job with its flights, what it said, and links."""
+
+    flights: list[FlightAnswer]
+    log: list[str]
+    links: Links
+
+
+class JobPage(BaseModel):
+    """Jobs, the newest first; ``next`` is the ``after`` of the next page, null on the last."""
+
+    jobs: list[JobAnswer]
+    next: str | None
+
+
+class Point(BaseModel):
+    """A coefficient as one job found it, with the flights behind it; times as ISO 8601."""
+
+    job: str
+    name: str
+    flown: str | None
+    ended: str | None
+    best: float
+    std_error: float | None
+    ci95: tuple[float, float] | None
+    identifiable: bool | None
+    flights: list[str]
+
+
+class CoefficientHistory(BaseModel):
+    """A coefficient over the jobs of a vehicle, in the order in which they were flown."""
+
+    unit: str
+    points: list[Point]
+
+
+class History(BaseModel):
+    """All coefficients of a vehicle."""
+
+    vehicle: str
+    coefficients: dict[str, CoefficientHistory]
+
+
+class Health(BaseModel):
+    """Whether the parts of the server do their work."""
+
+    status: str
+    database: str
+    workers: str
+    version: str
+
+
+def recording_answer(row: RecordingRow) -> RecordingAnswer:
+    """Return a recording as JSON."""
+    return RecordingAnswer(id=row.sha256, name=row.name, inspection=row.inspection)
+
+
+def links(row: JobRow, files: Sequence[str] = ()) -> Links:
+    """Return where more of a job is found."""
+    at = f"{API}/jobs/{row.id}"
+    return Links(
+        self=at,
+        events=f"{at}/events",
+        cancel=f"{at}/cancel",
+        retry=f"{at}/retry",
+        page=f"/jobs/{row.id}",
+        files={name: f"{at}/files/{name}" for name in files},
+    )
+
+
+def accepted(row: JobRow) -> Accepted:
+    """Return a job as the answer to its submission."""
+    return Accepted(id=row.id, state=State(row.state), links=links(row))
+
+
+def job_fields(row: JobRow) -> dict[str, Any]:
+    """Return a job, whose files are loaded, as JSON."""
+    return {
+        "id": row.id,
+        "name": row.name,
+        "vehicle": row.vehicle,
+        "state": State(row.state),
+        "stage": row.stage,
+        "iteration": row.iteration,
+        "rmse": row.rmse,
+        "seconds_left": row.seconds_left,
+        "submitted": iso(row.submitted),
+        "started": iso(row.started),
+        "ended": iso(row.ended),
+        "error": row.error,
+        "exit_status": row.exit_status,
+        "files": [file.name for file in row.files],
+    }
+
+
+def full_job(row: JobRow, events: Sequence[EventRow]) -> FullJobAnswer:
+    """Return a job with what it said."""
+    fields = job_fields(row)
+    return FullJobAnswer(
+        **fields,
+        flights=[
+            FlightAnswer(id=flight.sha256, name=flight.name, holdout=flight.holdout)
+            for flight in row.flights
+        ],
+        log=[str(event.content["text"]) for event in events if event.kind == "message"],
+        links=links(row, fields["files"]),
+    )
+
+
+def iso(seconds: float | None) -> str | None:
+    """Return s since 1970 as ISO 8601."""
+    if seconds is None:
+        return None
+    moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

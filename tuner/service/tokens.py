@@ -1,0 +1,74 @@
+"""Visitors' tokens: made here, shown once, kept as hashes, compared in constant time."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+import time
+
+from sqlalchemy import delete, select
+
+from tuner.errors import InputError
+from tuner.service.database import Database
+from tuner.service.tables import TokenRow
+
+PREFIX = "tune_"
+"""What a token begins with, so that one that leaks is recognised."""
+
+
+def add(database: Database, name: str) -> str:
+    """Make a token for a visitor and return it; only its hash is kept.
+
+    Raises
+    ------
+    InputError
+        The name is taken, or no name.
+    """
+    if not (name.strip() and name.isprintable() and len(name) <= 100):
+        raise InputError("token", "needs a plain name of up to 100 letters", "say whose it is")
+    token = PREFIX + secrets.token_urlsafe(32)
+    with database.writing() as session:
+        if session.get(TokenRow, name) is not None:
+            raise InputError(
+                "token", f"'{name}' has one already", f"tune serve token remove {name}"
+            )
+        session.add(TokenRow(name=name, sha256=_hash(token), added=time.time()))
+    return token
+
+
+def remove(database: Database, name: str) -> None:
+    """Let a visitor's token hold no more.
+
+    Raises
+    ------
+    InputError
+        Nobody of this name has one.
+    """
+    with database.writing() as session:
+        gone = session.scalar(
+            delete(TokenRow).where(TokenRow.name == name).returning(TokenRow.name)
+        )
+    if gone is None:
+        raise InputError("token", f"'{name}' has none", "see tune serve token list")
+
+
+def names(database: Database) -> list[str]:
+    """Return who has a token."""
+    with database.reading() as session:
+        return list(session.scalars(select(TokenRow.name).order_by(TokenRow.name)))
+
+
+def owner(database: Database, token: str) -> str | None:
+    """Return whose token it is, None if nobody's; all are compared, each in constant time."""
+    given, found = _hash(token), None
+    with database.reading() as session:
+        for row in session.scalars(select(TokenRow)):
+            if hmac.compare_digest(row.sha256, given):
+                found = row.name
+    return found
+
+
+def _hash(token: str) -> str:
+    """Return the SHA-256 of a token: it has 256 random bits, so that no salt is needed."""
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
