@@ -92,7 +92,7 @@ class Table(TabularRecording):
             with parquet.ParquetFile(self.path) as file:
                 about = file.metadata
                 if about.num_rows * about.num_columns > MOST_CELLS:
-                    raise RecordingError(self.path, "claims an absurd size", "check it")
+                    raise RecordingError(self.path, "claims an absurd size", "write it again")
                 return list(file.schema_arrow.names)
         except (ArrowException, OSError, ValueError) as err:
             raise RecordingError(self.path, _why(err), "write it again") from None
@@ -105,7 +105,7 @@ class Table(TabularRecording):
                 return parquet.read_table(self.path, columns=names, memory_map=False)
             return self._read_csv(names)
         except MemoryError:
-            raise RecordingError(self.path, "claims an absurd size", "check it") from None
+            raise RecordingError(self.path, "claims an absurd size", "write it again") from None
         except Exception as err:  # whatever a hostile table makes of the library
             raise RecordingError(self.path, _why(err), "write it again") from None
 

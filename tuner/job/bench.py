@@ -199,7 +199,8 @@ def _coefficients(
     places = {name: place for place, name in enumerate(combination.names)}
     coefficients = {}
     for name, value in best.items():
-        unit, before = COEFFICIENTS[name].unit, initial.get(name, value)
+        row = COEFFICIENTS[name]
+        unit, before = row.unit, initial.get(name, value if row.neutral is None else row.neutral)
         if name not in places:
             coefficients[name] = CoefficientResult(
                 unit=unit,

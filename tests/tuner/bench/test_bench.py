@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from tuner.cli import main
-from tuner.config import read_vehicle, values_of
+from tuner.config import ControllerFile, TrajectorySettings, read_vehicle, values_of
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
 from tuner.job.bench import bench
@@ -36,6 +36,11 @@ def test_the_example_gives_the_truth_within_its_errors(example):
         assert values_of(example.vehicle)[name] == coefficient.best
     assert example.vehicle.mass == 2.243  # what hung
     assert example.result.findings == ()
+
+
+def test_a_term_that_the_start_leaves_out_begins_where_it_does_not_act(example):
+    exponent = example.result.coefficients["battery_exponent"]
+    assert exponent.initial == 0.0 < exponent.best
 
 
 def test_the_page_shows_which_samples_were_used(example):
@@ -207,6 +212,25 @@ def test_hovers_and_spins_are_taken_from_recordings(tmp_path):
     ratio = best["rotor_drag_coefficient"] / (best["moment_constant"] * best["motor_constant"])
     assert ratio == pytest.approx(33.0 / (2.0 * 0.0625), rel=0.02)
     assert "Steady part of hover.csv" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_hovers_and_spins_are_taken_from_bags(tmp_path, updated):
+    from tuner.simulation.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.simulation.write import write_flights  # noqa: PLC0415
+
+    for name in ("hover", "yaw_spin"):
+        shape = TrajectorySettings(name=name, yaw_rate=2.0)
+        flights = simulate(updated, ControllerFile(), shape, duration=12.0)
+        write_flights(flights, tmp_path / f"{name}.bag")
+    hover = HOVER | {"points": [{"mass": updated.mass, "recording": "hover.bag"}]}
+    spin = SPIN | {"points": [{"recording": "yaw_spin.bag"}]}
+    assert run(tmp_path, {"experiments": [hover, spin]}, "--out", str(tmp_path / "out")) == 0
+    best = {n: c.best for n, c in read_run(tmp_path / "out").result.coefficients.items()}
+    truth = updated.aerodynamics
+    assert best["motor_constant"] == pytest.approx(truth.motor_constant, rel=0.002)
+    ratio = best["rotor_drag_coefficient"] / (best["moment_constant"] * best["motor_constant"])
+    expected = truth.rotor_drag_coefficient / (truth.moment_constant * truth.motor_constant)
+    assert ratio == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize(

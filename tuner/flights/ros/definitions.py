@@ -103,5 +103,7 @@ def _read(path: Path) -> MessageDefinition:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise RecordingError(path, "cannot be read as a message definition", "check it") from None
+        raise RecordingError(
+            path, "cannot be read as a message definition", "name a .msg file"
+        ) from None
     return MessageDefinition(MessageDefinitionFormat.MSG, text)
