@@ -42,12 +42,14 @@ def _names(argument: Any) -> str:
 
 
 def _help(argument: Any) -> str:
-    return argument.parameter.help or ""
+    choices = type_in_words(argument.hint)
+    said = argument.parameter.help or ""
+    return f"{said} One of {choices}." if choices.startswith("`") else said
 
 
 def _default(argument: Any) -> str:
     default = argument.field_info.default
-    if default is None or default is False:
+    if default in (None, False, ""):
         return ""
     if default is Parameter.empty:
         return "required" if argument.required else type_in_words(argument.hint)

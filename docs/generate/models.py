@@ -75,7 +75,13 @@ def _linked(match: re.Match[str]) -> str:
 
 
 def _values(field: FieldInfo) -> str:
-    return cell(type_in_words(field.annotation))
+    """Return what may stand there: a type, or where the parts of a section are listed."""
+    links = [f"[{t}](#{t.lower().replace(' ', '-')})" for t in _titles(field.annotation)]
+    return " ".join(links) or cell(type_in_words(field.annotation))
+
+
+def _titles(hint: Any) -> list[str]:
+    return list(dict.fromkeys(_title(part) for part in _models_in(hint)))
 
 
 def _default(field: FieldInfo) -> str:

@@ -21,9 +21,9 @@ REFERENCE = ROOT / "docs" / "reference"
 SCHEMA = "result.schema.json"
 
 
-def _files_page(title: str, intro: str, model: type, example: Path | None) -> str:
-    shown = "" if example is None else f"```yaml\n{example.read_text(encoding='utf-8')}```\n\n"
-    return f"{GENERATED}# {title}\n\n{intro}\n\n{shown}{sections_of(model)}"
+def _files_page(title: str, intro: str, model: type, example: Path) -> str:
+    shown = f"```yaml\n{example.read_text(encoding='utf-8')}```"
+    return f"{GENERATED}# {title}\n\n{intro}\n\n{shown}\n\n{sections_of(model)}"
 
 
 def _vehicle() -> str:
@@ -42,9 +42,9 @@ def _controller() -> str:
     return _files_page(
         "Controller file",
         "Gains, laws, loop rates and filters that flew. What is left out has the value below, that "
-        "of the HoverGames set-up, which is also `--controller hovergames`.",
+        "of the HoverGames set-up, which is `--controller hovergames`:",
         ControllerFile,
-        None,
+        configs_folder() / "controllers" / "hovergames.yaml",
     )
 
 
