@@ -23,7 +23,22 @@ def commands_page() -> str:
     parts = [f"{GENERATED}{INTRO}", _section("tune", app, SUMMARY, EXAMPLES)]
     for name, (summary, *examples) in COMMANDS.items():
         parts.append(_section(f"tune {name}", app[name], summary, examples))
+        parts += _under(f"tune {name}", app[name])
     return "\n".join(parts)
+
+
+def _under(title: str, command: App) -> list[str]:
+    """Return a section of each command below another one."""
+    sections = []
+    for name in command:
+        if not name.startswith("-"):
+            inner = command[name]
+            if inner.default_command is not None:
+                sections.append(
+                    _section(f"{title} {name}", inner, inner.help.partition("\n\n")[0], ())
+                )
+            sections += _under(f"{title} {name}", inner)
+    return sections
 
 
 def _section(title: str, command: App, summary: str, examples: Any) -> str:
@@ -32,9 +47,9 @@ def _section(title: str, command: App, summary: str, examples: Any) -> str:
         for argument in command.assemble_argument_collection(parse_docstring=True)
         if argument.show
     ]
-    usage = "\n".join(examples)
+    usage = "```sh\n" + "\n".join(examples) + "\n```\n\n" if examples else ""
     table = "\n".join(["| option | meaning | default |", "| --- | --- | --- |", *rows])
-    return f"## {title}\n\n{summary}\n\n```sh\n{usage}\n```\n\n{table}\n"
+    return f"## {title}\n\n{summary}\n\n{usage}{table}\n"
 
 
 def _names(argument: Any) -> str:

@@ -15,12 +15,10 @@ from pathlib import Path
 
 from docs.generate.text import GENERATED
 from tuner import __file__ as _package
-from tuner import errors
 from tuner.findings import Code
 from tuner.wording.findings import TEXTS
 
 PACKAGE = Path(_package).parent
-ERRORS = {name for name in vars(errors) if name.endswith("Error")}
 UNKNOWN = "…"
 
 #: Where a message comes from -> heading; the first that matches.
@@ -35,6 +33,9 @@ TOPICS: Mapping[str, str] = {
     "validation": "Vehicle, controller and job files",
     "simulation/": "Simulated flights",
     "trajectory": "Simulated flights",
+    "service/": "The tuning service",
+    "client/": "The tuning service",
+    "engine/": "Workers and clusters",
     "cli/": "Options of the command line",
     "disk": "Files and folders",
     "files": "Files and folders",
@@ -140,7 +141,7 @@ def _errors_made(scope: ast.FunctionDef) -> Iterator[ast.Call]:
              for n in ast.walk(f)}  # fmt: skip
     for node in ast.walk(scope):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and id(node) not in inner:
-            made = node.func.id in ERRORS and len(node.args) == 3
+            made = node.func.id.endswith("Error") and len(node.args) == 3
             refused = node.func.id == "refuse" and len(node.args) == 2
             if made or refused:
                 yield node

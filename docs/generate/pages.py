@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from docs.generate.commands import commands_page
+from docs.generate.http import http_page, openapi_file
 from docs.generate.messages import messages_page
 from docs.generate.models import sections_of
 from docs.generate.text import GENERATED
@@ -19,6 +20,7 @@ from tuner.result import RunResult
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
 SCHEMA = "result.schema.json"
+OPENAPI = "openapi.json"
 
 
 def _files_page(title: str, intro: str, model: type, example: Path) -> str:
@@ -111,5 +113,7 @@ PAGES: Mapping[str, Callable[[], str]] = {
     "cluster-file.md": _cluster,
     "topic-maps.md": _topics,
     "messages.md": messages_page,
+    "http.md": http_page,
     SCHEMA: _schema,
+    OPENAPI: openapi_file,
 }

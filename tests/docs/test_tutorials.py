@@ -21,6 +21,8 @@ NOT_RUN = {
     "tune --flights reference_flights/*.bag --config runs/quad.job.yaml": "another fit as long as "
     "the shared one; what its files hold is read instead",
 }
+FOLLOWED = [page for page in TUTORIALS if page.stem != "service"]
+"""All but the one that needs a server, see `tests.docs.test_service_tutorial`."""
 SHARED = "tune --flights reference_flights/*.bag --out runs/first"
 """The fit of ``make demo``, which is made once for all tests."""
 
@@ -44,7 +46,7 @@ def words_of(command: str) -> list[str]:
     return words
 
 
-@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", FOLLOWED, ids=lambda page: page.stem)
 def test_its_commands_run_and_print_what_it_shows(
     page: Path, place: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -43,12 +43,19 @@ def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:
 
 
 def _settings(settled: Settings) -> dict[str, Any]:
-    """Return the keys of the job file, the files that it names as their contents."""
+    """Return the keys of the job file, the files that it names as their contents.
+
+    A lab's job file may speak of recordings beside it that are not sent; a server knows none of
+    them.
+    """
     if settled.job_path is None:
         return {}
     data = read_yaml(settled.job_path).data
     settings = dict(data) if isinstance(data, dict) else {}
     base = settled.job_path.parent
+    sent = {flight.stem for flight in settled.flights}
+    settings["holdout"] = list(settled.job.holdout)
+    settings["flights"] = {n: v for n, v in (settings.get("flights") or {}).items() if n in sent}
     if settled.job.export.into is not None:
         raise InputError(
             settled.job_path,
