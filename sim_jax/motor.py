@@ -114,3 +114,12 @@ def reference_speed(motor: Motor, command: Scalar) -> Scalar:
     shifted = command + motor.input_offset
     speed = shifted * (motor.input_scaling + motor.quadratic * shifted) + motor.zero_position_armed
     return jnp.where(speed > motor.max_rotor_velocity, motor.max_rotor_velocity, speed)
+
+
+def command_of(motor: Motor, speed: Scalar) -> Scalar:
+    """Return the command in 0..1 that asks for a rotor speed in rad/s below the largest."""
+    wanted = speed - motor.zero_position_armed
+    slope = motor.input_scaling
+    # the smaller root, in the form that stays finite where the curve is a line
+    root = jnp.sqrt(slope * slope + 4.0 * motor.quadratic * wanted)
+    return 2.0 * wanted / (slope + root) - motor.input_offset

@@ -161,6 +161,20 @@ def mix(
     return a, b, c, d
 
 
+def torque_of(settings: MixerSettings, commands: PerRotor) -> Vec3:
+    """Return the normalised torque set-point, FRD, with which four commands in 0..1 are mixed."""
+    factor = settings.thrust_factor
+    first, second, third, fourth = (
+        command * (1.0 - factor + factor * command) for command in commands
+    )
+    ahead, across = first - second, third - fourth
+    return Vec3(
+        0.25 * (across - ahead) / HALF_SQRT2,
+        0.25 * (across + ahead) / HALF_SQRT2,
+        0.25 * (first + second - third - fourth),
+    )
+
+
 def saturation(settings: MixerSettings, commands: PerRotor) -> Saturation:
     """Return the directions of torque that rotors clipped low cannot give any more.
 

@@ -15,6 +15,7 @@ from sim_jax.environment import Environment
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
+from sim_jax.trim import in_trim
 from sim_jax.vector import Vec3
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
@@ -107,6 +108,13 @@ def simulate_segments(
     markers = markers_of(model.vehicle)
     if markers is not None:
         start = markers.start(start, segments.resting)
+    environment = environment_of(model, segments, conditions)
+    if segments.resting is not None:
+        exponent = model.vehicle.effects.get("battery_exponent")
+        factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
+        start = in_trim(
+            model.vehicle, model.controller, start, segments.resting, speed_factor=factor
+        )
     if segments.turning is not None:
         start = spun_up(start, model.vehicle, segments.turning)
     if states is not None and segments.freedom is not None:
@@ -119,7 +127,7 @@ def simulate_segments(
         inlet,
         start,
         samples=samples,
-        environment=environment_of(model, segments, conditions),
+        environment=environment,
         horizon=horizon,
         limits=limits,
     )

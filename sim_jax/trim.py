@@ -1,0 +1,124 @@
+"""A vehicle in trim: the level hover in which nothing pushes or turns it.
+
+An offset centre of mass, uneven rotors or a steady moment ask different rotors for different
+speeds, which the rate controller's integrator has found long before a mission starts.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from sim_jax.control.gains import Controller
+from sim_jax.control.mixer import ROTORS, torque_of
+from sim_jax.motor import command_of
+from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.state import Start
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor, Vehicle
+
+UNEVEN = ("center_of_mass", "rotor_thrust_scale", "torque_trim")
+"""Beginnings of the effects' names with which rotors in trim differ."""
+
+_Row: TypeAlias = list[Scalar]
+
+
+def in_trim(
+    vehicle: Vehicle,
+    controller: Controller,
+    start: Start,
+    resting: Bool[Array, "*batch"],
+    *,
+    speed_factor: Scalar | None = None,
+    gravity: float = GRAVITY,
+) -> Start:
+    """Return a start whose rotors and integrator are in trim where the vehicle rests.
+
+    Parameters
+    ----------
+    vehicle, controller
+        Of the flight; a quadrotor. One whose rotors are even starts as it would without this.
+    start
+        Level where it rests.
+    resting
+        Where the vehicle hovers.
+    speed_factor
+        The battery's factor on reference rotor speeds at the start; None for one.
+    gravity
+        m/s².
+    """
+    if len(vehicle.rotors) != ROTORS or not any(
+        name.startswith(UNEVEN) for name in vehicle.effects
+    ):
+        return start
+    speeds = trim_speeds(vehicle, gravity=gravity)
+    asked = speeds if speed_factor is None else tuple(speed / speed_factor for speed in speeds)
+    commands = tuple(command_of(vehicle.motor, speed) for speed in asked)
+    integral = torque_of(controller.mixer, commands)
+
+    def chosen(trimmed: Scalar, recorded: Scalar) -> Scalar:
+        return jnp.where(resting, trimmed, recorded)
+
+    return Start(
+        start.motion,
+        tuple(map(chosen, speeds, start.rotor_speed)),
+        tuple(map(chosen, commands, start.command)),
+        Vec3(
+            chosen(integral.x, start.rate_integral.x),
+            chosen(integral.y, start.rate_integral.y),
+            chosen(integral.z, start.rate_integral.z),
+        ),
+    )
+
+
+def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
+    """Return the speeds in rad/s at which four rotors carry the weight and all moments cancel.
+
+    At rest in still air every force and moment is linear in the squares of the rotor speeds, so
+    that four of these follow from Newton's and Euler's equations in equilibrium.
+    """
+    rest = Vec3.zeros(vehicle.body.mass)
+    motion = Motion(rest, rest, Quaternion.identity(rest.x), rest)
+    air = Air.around(vehicle, motion, rotor_acceleration=(rest.x,) * ROTORS)
+
+    def lift_and_moments(speeds: PerRotor) -> _Row:
+        wrench = total_wrench(vehicle, motion, speeds, air)
+        return [wrench.force.z, wrench.moment.x, wrench.moment.y, wrench.moment.z]
+
+    unit = jnp.ones_like(rest.x)
+    none = lift_and_moments((0.0 * unit,) * ROTORS)
+    columns = [
+        lift_and_moments(tuple(unit if i == rotor else 0.0 * unit for i in range(ROTORS)))
+        for rotor in range(ROTORS)
+    ]
+    weight = vehicle.body.mass * gravity
+    wanted = [weight - none[0], -none[1], -none[2], -none[3]]
+    rows = [
+        [*(column[axis] - none[axis] for column in columns), wanted[axis]] for axis in range(ROTORS)
+    ]
+    return tuple(jnp.sqrt(jnp.maximum(square, 1.0)) for square in _solved(rows))
+
+
+def _solved(rows: list[_Row]) -> _Row:
+    """Return the solution of rows (matrix | right side), by elimination in their order.
+
+    That order never divides by zero for a quad X: lift, roll, pitch and yaw of rotors front right,
+    rear left, front left, rear right.
+    """
+    rows = [list(row) for row in rows]
+    for pivot in range(len(rows)):
+        for below in range(pivot + 1, len(rows)):
+            share = rows[below][pivot] / rows[pivot][pivot]
+            rows[below] = [b - share * p for b, p in zip(rows[below], rows[pivot], strict=True)]
+    solution: _Row = []
+    for row in reversed(rows):
+        known = row[-1 - len(solution) : -1]
+        rest = row[-1] - sum((a * x for a, x in zip(known, solution, strict=True)), 0.0 * row[-1])
+        solution.insert(0, rest / row[-2 - len(solution)])
+    return solution
