@@ -18,7 +18,7 @@ from tuner.flights.flight import SIGNALS, Array, Flight, Note, Series
 from tuner.flights.flight_cache import from_parquet, to_parquet
 from tuner.flights.initial import initial_state
 from tuner.flights.mission import Mission, yaw_spin
-from tuner.flights.resample import GAP, resample
+from tuner.flights.resample import GAP, resample, without_gaps
 from tuner.flights.sidecar import Sidecar, read_sidecar
 from tuner.flights.topics import TopicMap
 
@@ -125,6 +125,8 @@ def _until(series: Series, end: float) -> Series:
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:
     if grid is not None and SIGNALS[signal][2] == "hold" and len(series.time) > 1:
         series = Series(grid.snap(series.time), series.values)
+    if signal.startswith("reference_"):
+        series = without_gaps(series)
     return resample(signal, series, clock)
 
 

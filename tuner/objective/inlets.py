@@ -30,6 +30,7 @@ from sim_jax.vector import Vec3
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
+from tuner.flights.resample import without_gaps
 from tuner.padding import padded_size
 
 MISSED = 1.5
@@ -109,7 +110,9 @@ class RecordedInlet(ABC):
         clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
         moves = rate is None or sparse(flights, signal, rate)
         read = linear_interpolation if moves else zero_order_hold
-        table = np.stack([read(flight.series[signal], clock) for flight in flights], axis=-1)
+        table = np.stack(
+            [read(without_gaps(flight.series[signal]), clock) for flight in flights], axis=-1
+        )
         return [jnp.asarray(table[:, column]) for column in range(table.shape[1])]
 
 
