@@ -21,7 +21,7 @@ from tuner.flights.flight import Flight, InitialState, Series
 from tuner.objective.battery import (
     log_voltage_of,
     require_voltage,
-    smoothed,
+    voltages_of,
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
@@ -59,26 +59,65 @@ def flight(name="flight", volts=None):
 TIME = np.arange(-2.0, 30.0, 0.1)
 
 
-def test_smoothing_keeps_the_sag_and_a_third_of_the_noise():
+def loaded(seed=0, gap=0.1):
+    """Return a flight whose battery of 0.2 V per load declines, its meter noisy, and the truth."""
+    time = np.arange(-2.0, 30.0, 0.02)
+    random = np.random.default_rng(seed)
+    command = 0.5 + 0.08 * np.sin(2.0 * np.pi * time / 2.5)[:, None] * np.ones(4)
+    load = (command**3).mean(axis=1) / (command**3).mean()
+    truth = 16.3 - 0.01 * time - 0.2 * load
+    slow = np.arange(-2.0, 30.0, gap)
+    readings = np.interp(slow, time, truth) + NOISE * random.normal(size=len(slow))
+    known = flight(volts=series(slow, readings))
+    return replace(
+        known,
+        signals=dict(known.signals) | {"command": np.ones((len(known.time), 4))},
+        series=dict(known.series) | {"command": Series(time, command)},
+    ), truth
+
+
+@pytest.mark.parametrize("gap", [0.01, 0.1, 0.5])
+def test_the_sag_follows_the_load_and_the_noise_goes(gap):
+    errors = []
+    for seed in range(5):
+        known, truth = loaded(seed, gap)
+        (curve,) = voltages_of([known])
+        errors.append(np.sqrt(np.mean((curve.volts - truth) ** 2)))
+        assert curve.without_load[0] == pytest.approx(16.32, abs=0.03)
+    assert np.mean(errors) < 0.5 * NOISE
+
+
+def test_a_voltage_without_a_load_is_a_smooth_curve():
     noise = NOISE * np.random.default_rng(0).normal(size=len(TIME))
-    clean = smoothed(series(TIME, sagging(TIME)))
-    inside = (TIME > 0) & (TIME < 28)
-    assert np.abs(clean.values[inside, 0] - sagging(TIME[inside])).max() < 2e-3
-    noisy = smoothed(series(TIME, sagging(TIME) + noise))
-    left = noisy.values[inside, 0] - clean.values[inside, 0]
-    assert left.std() < 0.4 * NOISE
+    (curve,) = voltages_of([flight(volts=series(TIME, sagging(TIME) + noise))])
+    assert (curve.volts - sagging(curve.time)).std() < 0.5 * NOISE
+    np.testing.assert_array_equal(curve.volts, curve.without_load)
+
+
+def test_a_load_that_the_voltage_does_not_follow_is_left_out():
+    known, _ = loaded()
+    noise = NOISE * np.random.default_rng(1).normal(size=len(TIME))
+    idle = replace(
+        known, series=dict(known.series) | {"battery_voltage": series(TIME, 16.0 + noise)}
+    )
+    (curve,) = voltages_of([idle])
+    np.testing.assert_array_equal(curve.volts, curve.without_load)
+    assert np.abs(curve.volts - 16.0).max() < NOISE
 
 
 @pytest.mark.parametrize("gap", [0.01, 0.1, 1.0])
 def test_smoothing_takes_any_rate_and_gaps(gap):
     time = np.arange(0.0, 40.0, gap)
     time = time[(time < 10) | (time > 25)]
-    smooth = smoothed(series(time, 16.0 - 0.01 * time))
-    np.testing.assert_allclose(smooth.values[:, 0], 16.0 - 0.01 * smooth.time, atol=1e-3)
+    (curve,) = voltages_of([flight(volts=series(time, 16.0 - 0.01 * time))])
+    np.testing.assert_allclose(curve.volts, 16.0 - 0.01 * curve.time, atol=1e-3)
 
 
-def test_a_lone_reading_is_itself():
-    np.testing.assert_allclose(smoothed(series(np.zeros(1), np.full(1, 15.0))).values, 15.0)
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_readings_are_joined_by_lines(count):
+    time = np.arange(float(count))
+    (curve,) = voltages_of([flight(volts=series(time, 15.0 - time))])
+    np.testing.assert_allclose(curve.volts, 15.0 - time)
 
 
 def test_windows_see_the_whole_flights_voltage():
@@ -103,7 +142,7 @@ def test_a_flight_without_a_voltage_has_none():
         require_voltage([known, unknown])
 
 
-def test_the_reference_voltage_is_the_largest_recorded_unless_it_is_given():
+def test_the_reference_voltage_is_the_largest_without_load_unless_it_is_given():
     known = flight(volts=series(TIME, 16.0 - 0.01 * TIME))
     vehicle = with_reference_voltage(vehicle_file(), [known, flight("silent")])
     assert vehicle.battery.reference_voltage == pytest.approx(16.02)
