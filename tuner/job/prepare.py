@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -51,6 +51,8 @@ class Job:
     windows
         The same flights in windows, searched first where one does not begin gently; None where
         all do.
+    first_terms
+        Groups of terms that are free from the beginning of the search.
     """
 
     settings: Settings
@@ -59,6 +61,7 @@ class Job:
     space: Space
     objective: Objective
     windows: Objective | None = None
+    first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def flights(self) -> tuple[Flight, ...]:

@@ -23,6 +23,7 @@ from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.findings import finer_than_steps, flights_worse, ground_conflicts
+from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
@@ -86,7 +87,7 @@ def run(
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
     recordings, left_out = read_usable(settings)
-    job = job_of(settings, recordings)
+    job = with_first_terms(job_of(settings, recordings))
     findings = (*left_out, *check(job))
     _report(findings, listener, force=force)
 

@@ -18,7 +18,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.job.extension import extended, refitted_with
+from tuner.job.extension import extended
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
@@ -30,7 +30,6 @@ from tuner.search.optimiser import Free
 from tuner.selection.candidates import (
     Groups,
     candidate_groups,
-    groups_named,
     start_of,
     with_terms,
 )
@@ -79,31 +78,21 @@ def _selected(
 ) -> Selected:
     settings = job.settings.job
     if not isinstance(settings.terms, str):
-        return _as_named(job, fitted, settings.terms, on_progress, on_message)
+        return Selected(job, fitted, _first_rows(job, SelectionCode.ASKED_FOR))
     candidates = candidate_groups(job.settings.vehicle, job.space, settings)
     if settings.terms == "none" or settings.free is not None or not candidates:
         return Selected(job, fitted)
-    return _Selection(job, fitted, candidates, on_progress, on_message).run()
+    selected = _Selection(job, fitted, candidates, on_progress, on_message).run()
+    first = _first_rows(job, SelectionCode.HOVERS_TILTED)
+    return replace(selected, rows=(*first, *selected.rows))
 
 
-def _as_named(
-    job: Job,
-    fitted: Fitted,
-    terms: Sequence[str],
-    on_progress: OnProgress,
-    on_message: Callable[[str], None],
-) -> Selected:
-    """Return the fit with the terms that the job names."""
-    groups = groups_named(terms, job.space)
-    if not groups:
-        return Selected(job, fitted)
-    on_message(f"Fitting again with {listed(tuple(groups))}, which the job file names.")
-    job, fitted = refitted_with(job, fitted, groups, on_progress)
-    rows = tuple(
-        SelectionRow(group=group, names=names, kept=True, reason=SelectionCode.ASKED_FOR)
-        for group, names in groups.items()
+def _first_rows(job: Job, reason: SelectionCode) -> tuple[SelectionRow, ...]:
+    """Return the rows of the terms that the search began with."""
+    return tuple(
+        SelectionRow(group=group, names=names, kept=True, reason=reason)
+        for group, names in job.first_terms.items()
     )
-    return Selected(job, fitted, rows)
 
 
 @dataclass(frozen=True)

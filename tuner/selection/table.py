@@ -19,6 +19,8 @@ class SelectionCode(StrEnum):
     """Kept: sections of the flights are, where one flight alone shows it."""
     ASKED_FOR = "asked_for"
     """Kept: the job file names it."""
+    HOVERS_TILTED = "hovers_tilted"
+    """Kept: every recording shows a hover that is not level, so the markers sit at an angle."""
     NOT_SIGNIFICANT = "not_significant"
     """It lowers the loss by no more than residuals that are correlated in time let any term."""
     IMMATERIAL = "immaterial"

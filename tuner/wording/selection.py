@@ -12,6 +12,7 @@ _REASONS = {
     SelectionCode.PREDICTS_SECTIONS: "sections of flights left out of the fit are predicted better "
     "with it; no single flight is by the others",
     SelectionCode.ASKED_FOR: "the job file names it",
+    SelectionCode.HOVERS_TILTED: "every recording shows a hover that is not level",
     SelectionCode.NOT_SIGNIFICANT: "residuals that are correlated in time gain as much from chance",
     SelectionCode.IMMATERIAL: "it lowers the loss by less than simulators of one vehicle differ",
     SelectionCode.NOT_PREDICTED: "flights left out of the fit are not predicted better by more "

@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tests.tuner.uncertainty.making import (
     FLIGHTS,
@@ -18,6 +19,7 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.coefficients.space import space_of
 from tuner.config import JobFile
+from tuner.flights.flight import InitialState
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
@@ -27,8 +29,13 @@ from tuner.search.optimiser import Free
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
 
-def job_with(drag: float, *, seed: int, job: JobFile | None = None) -> tuple[Job, Fitted]:
-    """Return a job whose flights were flown with some drag of the body, and its base fit."""
+def job_with(
+    drag: float, *, seed: int, job: JobFile | None = None, tilt: tuple[float, float] = (0.0, 0.0)
+) -> tuple[Job, Fitted]:
+    """Return a job whose flights were flown with some drag of the body, and its base fit.
+
+    Its recordings show a hover that is tilted, in rad about x and y.
+    """
     truth = problem((*BASE, "fuselage_drag"))
     vector = truth.space.vector_of(
         dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
@@ -40,7 +47,10 @@ def job_with(drag: float, *, seed: int, job: JobFile | None = None) -> tuple[Job
     objective = replace(truth, space=space)
     recordings = tuple(
         SimpleNamespace(
-            flight=SimpleNamespace(name=name), holdout=False, inlet="reference", time_offset=0.0
+            flight=SimpleNamespace(name=name, initial=hovering(tilt)),
+            holdout=False,
+            inlet="reference",
+            time_offset=0.0,
         )
         for name in FLIGHTS
     )
@@ -48,6 +58,15 @@ def job_with(drag: float, *, seed: int, job: JobFile | None = None) -> tuple[Job
     made = Job(settings, recordings, NOISE, space, objective)
     fitted = fitted_of(objective, objective.start(space.initial))
     return made, _fit(made, fitted)
+
+
+def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:
+    """Return the start of a hover at a heading, tilted in rad about x and y."""
+    attitude = Rotation.from_euler("z", heading) * Rotation.from_rotvec([*tilt, 0.0])
+    rest = np.zeros(3)
+    return InitialState(
+        rest, rest, attitude.as_quat(scalar_first=True), rest, np.full(4, 600.0), np.full(4, 0.5)
+    )
 
 
 def _fit(job: Job, fitted: Fitted) -> Fitted:

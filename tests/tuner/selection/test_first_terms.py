@@ -1,0 +1,71 @@
+"""Terms that a search begins with: those that a job names, and markers that hover at an angle."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.tuner.selection.making import BASE, hovering, job_with
+from tuner.config import JobFile
+from tuner.job.first_terms import hover_tilt, with_first_terms
+from tuner.job.selection import with_terms_selected
+from tuner.selection.table import SelectionCode
+
+MARKERS = {f"marker_{kind}_{axis}" for kind in ("offset", "tilt") for axis in "xyz"}
+TILT = (0.010, -0.016)
+
+
+class FlightWith:
+    def __init__(self, initial):
+        self.initial = initial
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, -3.0])
+def test_the_tilt_is_read_whatever_the_heading(heading):
+    tilt = hover_tilt([FlightWith(hovering(TILT, heading))])
+    np.testing.assert_allclose(tilt, [TILT], atol=1e-4)
+    assert not hover_tilt([]).any()
+
+
+def with_file(job, file):
+    return replace(job, settings=SimpleNamespace(job=file, vehicle=job.settings.vehicle))
+
+
+@pytest.fixture(scope="module")
+def jobs():
+    return {tilt: job_with(0.0, seed=0, job=None, tilt=tilt) for tilt in (TILT, (0.0, 0.001))}
+
+
+def test_markers_are_free_from_the_start_where_hover_is_not_level(jobs):
+    job, _ = jobs[TILT]
+    begun = with_first_terms(job)
+    assert set(begun.space.names) == {*BASE, *MARKERS}
+    start = begun.space.numbers(begun.space.initial)
+    assert (start["marker_tilt_x"], start["marker_tilt_y"]) == pytest.approx(TILT, abs=1e-4)
+
+
+def test_a_level_hover_and_a_job_without_terms_add_nothing(jobs):
+    level, _ = jobs[(0.0, 0.001)]
+    assert with_first_terms(level) is level
+    tilted, _ = jobs[TILT]
+    for file in (JobFile(terms="none"), JobFile(free=BASE)):
+        job = with_file(tilted, file)
+        assert with_first_terms(job) is job
+
+
+def test_named_terms_are_free_from_the_start_and_stand_in_the_table(jobs):
+    job, fitted = jobs[(0.0, 0.001)]
+    file = JobFile(terms=("fuselage_drag", "marker_tilt"))
+    begun = with_first_terms(with_file(job, file))
+    assert begun.space.names[-4:] == (
+        "fuselage_drag",
+        "marker_tilt_x",
+        "marker_tilt_y",
+        "marker_tilt_z",
+    )
+    rows = with_terms_selected(begun, fitted, lambda *_: None, lambda _: None).rows
+    assert [(row.group, row.kept, row.reason) for row in rows] == [
+        ("fuselage_drag", True, SelectionCode.ASKED_FOR),
+        ("marker_tilt", True, SelectionCode.ASKED_FOR),
+    ]
