@@ -68,7 +68,7 @@ COMMANDS = {
     ),
     "serve": (
         "Run the tuning service: jobs of many people, over HTTP and as pages in a browser.",
-        "tune serve",
+        "tune serve --data /srv/tune --workers 4",
     ),
     "submit": (
         "Send recordings to a tuning service and have it fit them.",

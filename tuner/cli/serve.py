@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from tuner.service.database import Database
 
 EXAMPLES = (
-    "tune serve",
+    "tune serve --port 8000",
     "tune serve --host 0.0.0.0 --data /srv/tune --workers 4",
-    "tune serve token add NAME",
+    "tune serve token add alice",
 )
 serve = App(
     name="serve",
@@ -35,7 +35,7 @@ Data = Annotated[
     Parameter(help="Keep everything in this folder. Default: ~/.local/share/multirotor-tune."),
 ]
 DatabaseUrl = Annotated[
-    str, Parameter(help="Use this database, as postgresql://user@host/name. Default: SQLite.")
+    str | None, Parameter(help="Use this database, as postgresql://user@host/name. Default: SQLite.")
 ]
 
 
@@ -45,8 +45,8 @@ def _serve(
     host: str = "127.0.0.1",
     port: int = 8000,
     data: Data = None,
-    database: DatabaseUrl = "",
-    store: str = "",
+    database: DatabaseUrl = None,
+    store: str | None = None,
     workers: int = 2,
     max_upload: float = 4.0,
     memory: float = 8.0,
@@ -82,8 +82,8 @@ def _serve(
     limits = Limits(upload_bytes=int(max_upload * GIB), memory_bytes=int(memory * GIB))
     settings = ServiceSettings(
         data=data or default_data(),
-        database=database,
-        store=store,
+        database=database or "",
+        store=store or "",
         workers=workers,
         demands_tokens=not is_loopback(host),
         hosts=LOOPBACK if is_loopback(host) else (),
@@ -93,7 +93,7 @@ def _serve(
 
 
 @token.command
-def add(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> None:
+def add(name: str, /, *, data: Data = None, database: DatabaseUrl = None) -> None:
     """Make a token for a visitor, and print it: it cannot be shown again.
 
     Parameters
@@ -108,7 +108,7 @@ def add(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> None:
 
 
 @token.command
-def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> None:
+def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = None) -> None:
     """Let a visitor's token hold no more.
 
     Parameters
@@ -124,7 +124,7 @@ def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = "") -> No
 
 
 @token.command(name="list")
-def names(*, data: Data = None, database: DatabaseUrl = "") -> None:
+def names(*, data: Data = None, database: DatabaseUrl = None) -> None:
     """List who has a token."""
     from tuner.service import tokens
 
@@ -134,14 +134,14 @@ def names(*, data: Data = None, database: DatabaseUrl = "") -> None:
 
 
 @contextmanager
-def _database(data: Path | None, url: str) -> Iterator[Database]:
+def _database(data: Path | None, url: str | None) -> Iterator[Database]:
     """Open the database of a server, which may be running."""
     with _extra():
         from tuner.service.database import Database
     from tuner.disk import make_folder
     from tuner.service.settings import ServiceSettings, default_data
 
-    settings = ServiceSettings(data=data or default_data(), database=url)
+    settings = ServiceSettings(data=data or default_data(), database=url or "")
     make_folder(settings.data)
     opened = Database(settings.database_url)
     try:

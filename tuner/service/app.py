@@ -11,7 +11,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
-from starlette.responses import Response
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp
 
 from tuner.errors import InputError
@@ -21,6 +21,8 @@ from tuner.service.metrics import Metrics
 from tuner.service.safety import Guard
 from tuner.service.service import Service
 from tuner.service.shapes import API, Problem
+from tuner.service.web.pages import web
+from tuner.service.web.rendering import render
 from tuner.validation import complaint
 from tuner.versions import installed
 
@@ -53,6 +55,7 @@ def create_app(service: Service) -> FastAPI:
     app.state.doors = Doors(service.settings.limits.uploads_at_once, INSPECTIONS_AT_ONCE)
     app.include_router(api)
     app.include_router(watching)
+    app.include_router(web)
     app.add_exception_handler(InputError, _refused)
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _http)
@@ -61,10 +64,12 @@ def create_app(service: Service) -> FastAPI:
     return app
 
 
-async def refused(_: Request, error: InputError) -> ASGIApp:
+async def refused(request: Request, error: InputError) -> ASGIApp:
     """Return the answer to a request that cannot be met."""
     status = error.STATUS if isinstance(error, ServiceError) else 422
-    return _problem(status, error.where, error.what, error.remedy)
+    if status == 401 and _is_for_people(request) and request.method == "GET":
+        return RedirectResponse("/login", status_code=303)
+    return _problem(request, status, error.where, error.what, error.remedy)
 
 
 async def _refused(request: Request, error: Exception) -> Response:
@@ -74,18 +79,18 @@ async def _refused(request: Request, error: Exception) -> Response:
     return answer
 
 
-async def _invalid(_: Request, error: Exception) -> Response:
+async def _invalid(request: Request, error: Exception) -> Response:
     """Return the first complaint about a request's form, as a sentence."""
     assert isinstance(error, RequestValidationError)
     first = dict(error.errors()[0])
     first["loc"] = tuple(part for part in first["loc"] if part != "body")
     if first["type"] == "json_invalid":
-        return _problem(422, "the request", "is not JSON", "correct it")
+        return _problem(request, 422, "the request", "is not JSON", "correct it")
     what, remedy = complaint(first)  # type: ignore[arg-type]
-    return _problem(422, "the request", what, remedy)
+    return _problem(request, 422, "the request", what, remedy)
 
 
-async def _http(_: Request, error: Exception) -> Response:
+async def _http(request: Request, error: Exception) -> Response:
     """Return what the framework refuses: an unknown address or method, a body that is no JSON."""
     assert isinstance(error, HTTPException)
     words = {
@@ -95,20 +100,28 @@ async def _http(_: Request, error: Exception) -> Response:
     }
     fallback = (HTTPStatus(error.status_code).phrase.lower(), "correct it")
     what, remedy = words.get(error.status_code, fallback)
-    answer = _problem(error.status_code, "the request", what, remedy)
+    answer = _problem(request, error.status_code, "the request", what, remedy)
     answer.headers.update(error.headers or {})
     return answer
 
 
 async def _fault(request: Request, error: Exception) -> Response:
     logger.error("%s %s", request.method, request.url.path, exc_info=error)
-    return _problem(
-        500, "the server", "met a fault of ours", "see its log, and report what was asked of it"
-    )
+    remedy = "see its log, and report what was asked of it"
+    return _problem(request, 500, "the server", "met a fault of ours", remedy)
 
 
-def _problem(status: int, where: str, what: str, remedy: str) -> JSONResponse:
+def _is_for_people(request: Request) -> bool:
+    """Return whether a request is answered with a page: it is none to the interface."""
+    is_call = request.url.path.startswith((API, "/healthz", "/metrics"))
+    return not is_call and "text/html" in request.headers.get("accept", "")
+
+
+def _problem(request: Request, status: int, where: str, what: str, remedy: str) -> Response:
+    """Return a refusal as a page, or as JSON."""
     detail = " ".join(f"{where}: {what}; {remedy}".split())
+    if _is_for_people(request):
+        return render("problem.html.jinja", status, title="This does not work", sentence=detail)
     problem = Problem(where=where, what=what, remedy=remedy, detail=detail)
     headers = {"retry-after": "5"} if status in (429, 503) else {}
     if status == 401:

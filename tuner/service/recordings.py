@@ -17,7 +17,7 @@ from tuner.service.database import Database
 from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, shown
 from tuner.service.incoming import Upload
 from tuner.service.inspecting import inspect
-from tuner.service.naming import file_name
+from tuner.service.naming import file_name, stems
 from tuner.service.settings import ServiceSettings
 from tuner.service.store import Store
 from tuner.service.tables import RecordingRow
@@ -90,6 +90,11 @@ def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> Re
             if last:
                 raise
     raise AssertionError
+
+
+def flight_name(name: str) -> str:
+    """Return what the flight of a recording is called in a job."""
+    return stems([file_name(name)])[0]
 
 
 def latest(database: Database, most: int) -> Sequence[RecordingRow]:

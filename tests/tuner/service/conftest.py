@@ -36,7 +36,16 @@ def _quick_worker(monkeypatch, request):
 @pytest.fixture(autouse=True)
 def _quick_inspection(monkeypatch, request):
     if "real_inspection" not in request.fixturenames:
-        found = {"started": None, "duration": 3.0, "problem": None, "topics": []}
+        found = {
+            "started": None,
+            "duration": 3.0,
+            "problem": None,
+            "topic_map": "table",
+            "topics": [],
+            "missions": [],
+            "coefficients": [],
+            "notes": [],
+        }
         monkeypatch.setattr(recordings, "inspect", lambda *_: dict(found))
 
 

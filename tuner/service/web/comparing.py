@@ -1,0 +1,103 @@
+"""Two jobs side by side: coefficients and how far apart they are, and the flights of both."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pydantic import ValidationError
+
+from tuner.files import MAX_BYTES
+from tuner.result import RMSE_UNITS, CoefficientResult, FlightResult, RunResult
+from tuner.service import jobs
+from tuner.service.database import Database
+from tuner.service.errors import NotKnownError, NotNowError
+from tuner.service.store import Store
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A coefficient of two jobs.
+
+    Attributes
+    ----------
+    name, a, b
+        See there.
+    change
+        Of the second from the first, relative; None where that has no sense.
+    sigmas
+        The change in standard errors of both together; None where neither has one.
+    """
+
+    name: str
+    a: CoefficientResult
+    b: CoefficientResult
+    change: float | None
+    sigmas: float | None
+
+
+@dataclass(frozen=True)
+class FlightPair:
+    """A flight that both jobs have: axis -> RMSE of the first and of the second."""
+
+    name: str
+    splits: tuple[str, str]
+    rmse: tuple[tuple[float | None, float | None], ...]
+
+
+def result_of(database: Database, store: Store, job: str) -> RunResult:
+    """Return the result of a job that is done.
+
+    Raises
+    ------
+    NotKnownError, NotNowError
+        There is no such job, or it has no result that can be read.
+    """
+    row = jobs.job(database, job)
+    file = next((file for file in row.files if file.name == RunResult.FILE), None)
+    if file is None:
+        raise NotNowError(f"job {row.id}", f"is {row.state}", "compare jobs that are done")
+    if not store.has(file.sha256):
+        raise NotKnownError(f"job {row.id}", "has lost its result", "submit it again")
+    with store.reading(file.sha256) as stream:
+        content = stream.read(MAX_BYTES)
+    try:
+        return RunResult.model_validate_json(content)
+    except ValidationError:
+        raise NotNowError(
+            f"job {row.id}", "was made by another version of tune", "submit it again"
+        ) from None
+
+
+def pairs(a: RunResult, b: RunResult) -> list[Pair]:
+    """Return the coefficients of both, those first that lie furthest apart."""
+    both = [
+        _pair(name, one, b.coefficients[name])
+        for name, one in a.coefficients.items()
+        if name in b.coefficients and (one.fitted or b.coefficients[name].fitted)
+    ]
+    return sorted(both, key=lambda pair: -(pair.sigmas or 0.0))
+
+
+def _pair(name: str, a: CoefficientResult, b: CoefficientResult) -> Pair:
+    error = math.hypot(a.std_error or 0.0, b.std_error or 0.0)
+    return Pair(
+        name,
+        a,
+        b,
+        change=(b.best - a.best) / abs(a.best) if a.best else None,
+        sigmas=abs(b.best - a.best) / error if error else None,
+    )
+
+
+def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
+    """Return the flights of both, by content."""
+    others = {flight.sha256: flight for flight in b.flights}
+    return [
+        _flights(flight, others[flight.sha256]) for flight in a.flights if flight.sha256 in others
+    ]
+
+
+def _flights(a: FlightResult, b: FlightResult) -> FlightPair:
+    rmse = tuple((getattr(a.rmse_best, x), getattr(b.rmse_best, x)) for x in RMSE_UNITS)
+    return FlightPair(a.name, (a.split, b.split), rmse)

@@ -1,0 +1,315 @@
+"""The pages and what their forms do; each form answers with a page, so that none needs a script."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+import anyio.to_thread
+from fastapi import APIRouter, Query, Request
+from pydantic import ValidationError
+from starlette.datastructures import FormData
+from starlette.responses import HTMLResponse, RedirectResponse, Response
+
+from tuner.errors import InputError
+from tuner.result import RMSE_UNITS
+from tuner.service import jobs, recordings, tokens
+from tuner.service.errors import NoTokenError, ServiceError
+from tuner.service.history import history, vehicles
+from tuner.service.http import Served, service_of, upload
+from tuner.service.request import JobRequest
+from tuner.service.safety import COOKIE
+from tuner.service.service import Service
+from tuner.service.shapes import API
+from tuner.service.states import State
+from tuner.service.tables import JobRow, RecordingRow
+from tuner.service.web import comparing
+from tuner.service.web.drawing import history_bars, rmse_curve
+from tuner.service.web.rendering import render
+from tuner.service.web.uploaded import typed_settings
+from tuner.validation import config_error
+from tuner.yaml_files.shipped import configs_folder
+
+web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
+
+KEPT = 60
+"""s for which a browser keeps style and script"""
+LATEST = 30
+"""Recordings and jobs that are offered to choose from."""
+LOG_LINES = 400
+USES = ("fit", "holdout", "leave out")
+_STATIC = {
+    "style.css": ("tuner.report:templates/page.css", "tuner.service.web:static/style.css"),
+    "page.js": ("tuner.service.web:static/page.js",),
+}
+
+
+@web.get("/static/{name}")
+def static(name: str) -> Response:
+    """Return the style, which is the report's and a little more, or the script."""
+    if name not in _STATIC:
+        return render(
+            "problem.html.jinja", 404, title="Not here", sentence="There is no such file."
+        )
+    parts = (place.split(":") for place in _STATIC[name])
+    text = "\n".join((files(package) / path).read_text("utf-8") for package, path in parts)
+    kind = "text/css" if name.endswith(".css") else "text/javascript"
+    return Response(text, media_type=kind, headers={"cache-control": f"max-age={KEPT}"})
+
+
+@web.get("/")
+def start(
+    service: Served, r: Annotated[list[str] | None, Query(max_length=1000)] = None
+) -> Response:
+    """Show where recordings are dropped and a job begins."""
+    chosen = [recordings.recording(service.database, digest) for digest in dict.fromkeys(r or ())]
+    return _start(service, [(row, "fit") for row in chosen])
+
+
+def _start(
+    service: Service,
+    chosen: Sequence[tuple[RecordingRow, str]],
+    *,
+    given: Mapping[str, str] | None = None,
+    problem: str = "",
+    status: int = 200,
+) -> Response:
+    """Return the start page, with what was filled in before."""
+    ids = {row.sha256 for row, _ in chosen}
+    given = given or {}
+    blank = dict.fromkeys(("name", "vehicle", "mass", "settings"), "")
+    shipped = [file.stem for file in (configs_folder() / "vehicles").glob("*.yaml")]
+    names = sorted({*shipped, *vehicles(service.database)})
+    latest = [row for row in recordings.latest(service.database, LATEST) if row.sha256 not in ids]
+    return render(
+        "start.html.jinja",
+        status,
+        chosen=chosen,
+        latest=latest,
+        vehicles=names,
+        given=blank | dict(given),
+        key=secrets.token_hex(16),
+        problem=problem,
+        jobs=jobs.page(service.database, limit=5),
+        limit=service.settings.limits.upload_bytes,
+    )
+
+
+@web.post("/recordings")
+async def add_recording(request: Request) -> Response:
+    """Take a recording in: for the script its card, for a form the start page with it."""
+    is_script = request.headers.get("x-requested-with") == "script"
+    try:
+        row, _ = await upload(request)
+    except InputError as error:
+        sentence, status = str(error), error.STATUS if isinstance(error, ServiceError) else 422
+        if is_script:
+            return render("refused.html.jinja", status, sentence=sentence)
+        return await anyio.to_thread.run_sync(
+            lambda: _start(service_of(request), [], problem=sentence, status=status)
+        )
+    if is_script:
+        return render("card.html.jinja", row=row, use="fit")
+    return RedirectResponse(f"/?r={row.sha256}", status_code=303)
+
+
+@web.get("/recordings/{recording}/card")
+def show_card(service: Served, recording: str) -> Response:
+    """Return what a stored recording holds, and how to use it."""
+    row = recordings.recording(service.database, recording)
+    return render("card.html.jinja", row=row, use="fit")
+
+
+@web.post("/jobs")
+async def start_job(request: Request) -> Response:
+    """Submit what the form of the start page says, and show the job."""
+    async with request.form(max_files=0, max_fields=1000, max_part_size=2**20) as form:
+        service = service_of(request)
+        return await anyio.to_thread.run_sync(_submit, service, form)
+
+
+def _submit(service: Service, form: FormData) -> Response:
+    text = {key: value for key, value in form.items() if isinstance(value, str)}
+    uses = {
+        key.removeprefix("use-"): use
+        for key, use in text.items()
+        if key.startswith("use-") and use in USES
+    }
+    chosen = [(recordings.recording(service.database, d), use) for d, use in uses.items()]
+    used = [(row, use) for row, use in chosen if use != "leave out"]
+    try:
+        row, _ = jobs.submit(
+            service.database,
+            _request(text, used),
+            service.settings.limits,
+            submission=text.get("key") or None,
+        )
+    except InputError as error:
+        status = error.STATUS if isinstance(error, ServiceError) else 422
+        return _start(service, chosen, given=text, problem=str(error), status=status)
+    service.dispatcher.call()
+    return RedirectResponse(f"/jobs/{row.id}", status_code=303)
+
+
+def _request(text: Mapping[str, str], used: Sequence[tuple[RecordingRow, str]]) -> JobRequest:
+    """Return the request that a form makes."""
+    if not used:
+        raise InputError("recordings", "are none", "drop some, or choose one to fit")
+    values: dict[str, Any] = {
+        "recordings": [row.sha256 for row, _ in used],
+        "settings": typed_settings(text.get("settings", "")),
+        "name": text.get("name", "").strip(),
+    }
+    held = [row.name for row, use in used if use == "holdout"]
+    if held:
+        values["holdout"] = [recordings.flight_name(name) for name in held]
+    if vehicle := text.get("vehicle", "").strip():
+        values["vehicle"] = vehicle
+    if mass := text.get("mass", "").strip():
+        try:
+            values["mass"] = float(mass.replace(",", "."))
+        except ValueError:
+            raise InputError("mass", f"'{mass}' is no number", "give kg, as 2.243") from None
+    try:
+        return JobRequest.model_validate(values)
+    except ValidationError as error:
+        raise config_error(error, Path("the form")) from None
+
+
+@web.get("/jobs")
+def list_jobs(
+    service: Served,
+    vehicle: Annotated[str, Query(max_length=200)] = "",
+    state: str = "",
+    after: str = "",
+    fragment: bool = False,
+) -> Response:
+    """Show a page of jobs; as a fragment its table alone."""
+    wanted = State(state) if state in set(State) else None
+    rows = jobs.page(
+        service.database,
+        vehicle=vehicle or None,
+        state=wanted,
+        after=after or None,
+        limit=jobs.PAGE + 1,
+    )
+    shown = rows[: jobs.PAGE]
+    values = {
+        "jobs": shown,
+        "next": shown[-1].id if len(rows) > len(shown) else None,
+        "by": {"vehicle": vehicle, "state": state, "after": after},
+    }
+    if fragment:
+        return render("job_table.html.jinja", **values)
+    counts, named = jobs.counts(service.database), vehicles(service.database)
+    return render("jobs.html.jinja", counts=counts, vehicles=named, **values)
+
+
+@web.get("/jobs/{job}")
+def show_job(service: Served, job: str) -> Response:
+    """Show a job: live until it ends, then with its report."""
+    row = jobs.job(service.database, job)
+    others = [
+        other
+        for other in jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
+        if other.id != row.id
+    ]
+    return render("job.html.jinja", others=others, **_live(service, row))
+
+
+@web.get("/jobs/{job}/live")
+def show_live(service: Served, job: str) -> Response:
+    """Return the part of a job's page that moves."""
+    return render("live.html.jinja", **_live(service, jobs.job(service.database, job)))
+
+
+def _live(service: Service, row: JobRow) -> dict[str, object]:
+    events = jobs.events(service.database, row, most=20_000)
+    iterations = [
+        (int(event.content["number"]), float(event.content["position_rmse"]))
+        for event in events
+        if event.kind == "iteration" and event.content.get("position_rmse") is not None
+    ]
+    log = [str(event.content["text"]) for event in events if event.kind == "message"]
+    return {
+        "job": row,
+        "curve": rmse_curve(iterations),
+        "iterations": len(iterations),
+        "log": log[-LOG_LINES:],
+        "event": row.events,
+        "files": f"{API}/jobs/{row.id}/files",
+        "ended": jobs.is_finished(row),
+    }
+
+
+@web.post("/jobs/{job}/cancel")
+def cancel_job(service: Served, job: str) -> Response:
+    """Cancel a job, and show it."""
+    return RedirectResponse(f"/jobs/{jobs.cancel(service.database, job).id}", status_code=303)
+
+
+@web.post("/jobs/{job}/retry")
+def retry_job(service: Served, job: str) -> Response:
+    """Try a job again, and show it."""
+    row = jobs.retry(service.database, job)
+    service.dispatcher.call()
+    return RedirectResponse(f"/jobs/{row.id}", status_code=303)
+
+
+@web.get("/vehicles")
+def list_vehicles(service: Served) -> Response:
+    """List the vehicles that have jobs."""
+    return render("vehicles.html.jinja", vehicles=vehicles(service.database))
+
+
+@web.get("/vehicles/{name}")
+def show_vehicle(service: Served, name: str) -> Response:
+    """Show every coefficient of a vehicle over time."""
+    found = history(service.database, name)
+    charts = [(key, of, history_bars(of)) for key, of in found.coefficients.items()]
+    return render("vehicle.html.jinja", vehicle=name, charts=charts)
+
+
+@web.get("/compare")
+def compare(service: Served, a: str = "", b: str = "") -> Response:
+    """Show two jobs side by side."""
+    rows = [jobs.job(service.database, job) for job in (a, b)]
+    first, second = (comparing.result_of(service.database, service.store, row.id) for row in rows)
+    return render(
+        "compare.html.jinja",
+        a=rows[0],
+        b=rows[1],
+        pairs=comparing.pairs(first, second),
+        flights=comparing.flight_pairs(first, second),
+        units=RMSE_UNITS,
+    )
+
+
+@web.get("/login")
+def login_page() -> Response:
+    """Ask for a token."""
+    return render("login.html.jinja", problem="")
+
+
+@web.post("/login")
+async def login(request: Request) -> Response:
+    """Keep a visitor's token in a cookie that no script reads and no other site sends."""
+    async with request.form(max_files=0, max_fields=10, max_part_size=1000) as form:
+        token = str(form.get("token", "")).strip()
+    service = service_of(request)
+    if await anyio.to_thread.run_sync(tokens.owner, service.database, token) is None:
+        error = NoTokenError("the token", "is none of this server", "ask who runs it for one")
+        return render("login.html.jinja", 401, problem=str(error))
+    answer = RedirectResponse("/", status_code=303)
+    answer.set_cookie(
+        COOKIE,
+        token,
+        httponly=True,
+        samesite="strict",
+        secure=request.url.scheme == "https",
+        max_age=30 * 86400,
+    )
+    return answer
