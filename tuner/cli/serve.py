@@ -35,7 +35,8 @@ Data = Annotated[
     Parameter(help="Keep everything in this folder. Default: ~/.local/share/multirotor-tune."),
 ]
 DatabaseUrl = Annotated[
-    str | None, Parameter(help="Use this database, as postgresql://user@host/name. Default: SQLite.")
+    str | None,
+    Parameter(help="Use this database, as postgresql://user@host/name. Default: SQLite."),
 ]
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from tuner.service.shapes import CoefficientHistory, Point
 
 WIDTH, HEIGHT = 640.0, 240.0
-LEFT, RIGHT, TOP, BOTTOM = 64.0, 12.0, 10.0, 28.0
+LEFT, RIGHT, TOP, BOTTOM = 92.0, 12.0, 10.0, 28.0
 MOST_POINTS = 600
 """Points of a curve: more would not be seen."""
 
@@ -52,12 +52,16 @@ class Bars:
     y_ticks: tuple[Tick, ...]
 
 
-def rmse_curve(iterations: Sequence[tuple[int, float]]) -> Curve | None:
-    """Return the RMSE (m) against the iteration, on a logarithmic axis in mm.
+def rmse_curve(rmse: Sequence[float]) -> Curve | None:
+    """Return the RMSE (m) of each iteration in turn, on a logarithmic axis in mm.
 
     None where there is nothing to draw yet.
     """
-    known = [(n, 1000 * value) for n, value in iterations if value > 0 and math.isfinite(value)]
+    known = [
+        (number, 1000 * value)
+        for number, value in enumerate(rmse, start=1)
+        if value > 0 and math.isfinite(value)
+    ]
     if not known:
         return None
     step = -(-len(known) // MOST_POINTS)

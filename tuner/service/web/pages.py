@@ -229,7 +229,7 @@ def show_live(service: Served, job: str) -> Response:
 def _live(service: Service, row: JobRow) -> dict[str, object]:
     events = jobs.events(service.database, row, most=20_000)
     iterations = [
-        (int(event.content["number"]), float(event.content["position_rmse"]))
+        float(event.content["position_rmse"])
         for event in events
         if event.kind == "iteration" and event.content.get("position_rmse") is not None
     ]
