@@ -49,6 +49,7 @@ def _serve(
     database: DatabaseUrl = None,
     store: str | None = None,
     workers: int = 2,
+    cluster: str | None = None,
     max_upload: float = 4.0,
     memory: float = 8.0,
 ) -> None:
@@ -63,7 +64,10 @@ def _serve(
     store
         Keep recordings and results in this folder or fsspec URL. Default: in the data folder.
     workers
-        Work on so many jobs at the same time.
+        Work on so many jobs at the same time, each in a process of its own on this machine.
+    cluster
+        Have a Dask cluster do the work instead: the address of its scheduler, or a cluster file.
+        Its machines must reach the store, and --workers is what the cluster has.
     max_upload
         Take recordings of up to so many GiB.
     memory
@@ -90,7 +94,13 @@ def _serve(
         hosts=LOOPBACK if is_loopback(host) else (),
         limits=limits,
     )
-    run(settings, host=host, port=port, say=lambda text: print(text, flush=True))
+    run(
+        settings,
+        host=host,
+        port=port,
+        say=lambda text: print(text, flush=True),
+        cluster=cluster,
+    )
 
 
 @token.command

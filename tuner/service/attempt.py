@@ -257,13 +257,25 @@ def _stored(result: Path, store: Store) -> list[dict[str, Any]]:
     for file in sorted(result.rglob("*")):
         if file.is_symlink() or not file.is_file() or file.match(CHECKPOINTS):
             continue
-        digest, size = digest_of(file), file.stat().st_size
-        with full_disk():
-            copy = file.with_name(f".{file.name}.copy")
-            try:
-                shutil.copyfile(file, copy)
-                store.take(copy, digest)
-            finally:
-                copy.unlink(missing_ok=True)
-        rows.append({"name": file.relative_to(result).as_posix(), "sha256": digest, "size": size})
+        name, size = file.relative_to(result).as_posix(), file.stat().st_size
+        rows.append({"name": name, "sha256": put(file, store), "size": size})
     return rows
+
+
+def put(file: Path, store: Store) -> str:
+    """Put a copy of a file into a store, and return its digest.
+
+    Raises
+    ------
+    NoSpaceError
+        The disk is full.
+    """
+    with full_disk():
+        copy = file.with_name(f".{file.name}.copy")
+        try:
+            shutil.copyfile(file, copy)
+            digest = digest_of(copy)
+            store.take(copy, digest)
+        finally:
+            copy.unlink(missing_ok=True)
+    return digest

@@ -10,11 +10,14 @@ import threading
 import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
+from tuner.engine.engine import Engine
 from tuner.errors import InputError
 from tuner.runtime import cores
 from tuner.service.attempt import DiedError, Events, UnwantedError, attempt, outcome_of, prepare
+from tuner.service.elsewhere import Errand, sent
 from tuner.service.errors import NoSpaceError, UnavailableError
 from tuner.service.queue import Claim, Outcome, Queue
 from tuner.service.settings import ServiceSettings
@@ -38,9 +41,14 @@ class Dispatcher:
         The job table.
     store
         Recordings and results.
+    engine
+        What machines of a cluster do the work; None for processes of this machine.
     """
 
-    def __init__(self, settings: ServiceSettings, jobs: Queue, store: Store) -> None:
+    def __init__(
+        self, settings: ServiceSettings, jobs: Queue, store: Store, engine: Engine | None = None
+    ) -> None:
+        self._engine = engine
         self._settings = settings
         self._jobs = jobs
         self._store = store
@@ -111,17 +119,7 @@ class Dispatcher:
         """Work on a job until it ends, dies, or is wanted no more."""
         folder = self._settings.work / claim.id
         try:
-            asked = prepare(folder, claim, self._store)
-            last = attempt(
-                folder,
-                claim,
-                asked,
-                limits=self._settings.limits,
-                cores=self._cores(slot),
-                report=_Reporting(self._jobs, claim, self._settings.lease_seconds),
-                is_unwanted=self._stopping.is_set,
-            )
-            outcome = outcome_of(last, folder, self._store)
+            outcome = self._worked_on(claim, slot, folder)
         except UnwantedError:
             if self._stopping.is_set():
                 self._put_back(claim, "The server was stopped; the job waits for it.")
@@ -135,6 +133,26 @@ class Dispatcher:
             outcome = Outcome(State.FAILED, str(error), exit_status=2)
         if self._commit(claim, outcome) and outcome.state == State.DONE:
             shutil.rmtree(folder, ignore_errors=True)
+
+    def _worked_on(self, claim: Claim, slot: int, folder: Path) -> Outcome:
+        """Return what an attempt comes to, here or elsewhere."""
+        limits, lease = self._settings.limits, self._settings.lease_seconds
+        report = _Reporting(self._jobs, claim, lease)
+        is_unwanted = self._stopping.is_set
+        if self._engine is not None:
+            errand = Errand(claim, self._settings.store_url, limits)
+            return sent(errand, self._engine, report, is_unwanted)
+        asked = prepare(folder, claim, self._store)
+        last = attempt(
+            folder,
+            claim,
+            asked,
+            limits=limits,
+            cores=self._cores(slot),
+            report=report,
+            is_unwanted=is_unwanted,
+        )
+        return outcome_of(last, folder, self._store)
 
     def _mourn(self, claim: Claim, death: DiedError) -> None:
         """Put the job of a worker that died back, or give it up after too many deaths."""

@@ -16,7 +16,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from tuner.errors import InputError
 from tuner.service.errors import TooLargeError
 from tuner.service.naming import last_part
-from tuner.service.settings import Limits
+from tuner.service.settings import Limits, size_in_words
 from tuner.service.store import full_disk
 
 BUFFER = 2**20
@@ -122,7 +122,7 @@ class _Receiver:
 
 def too_large(most: int) -> TooLargeError:
     """Return the refusal of a file that is too large."""
-    what = f"is larger than the {most / 2**30:g} GiB that this server takes"
+    what = f"is larger than the {size_in_words(most)} that this server takes"
     return TooLargeError("the recording", what, "split it, or leave out topics such as images")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from tuner.errors import RecordingError
 from tuner.service.limiting import limit_process
-from tuner.service.settings import Limits
+from tuner.service.settings import Limits, size_in_words
 
 SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
 MOST_JSON = 20_000_000
@@ -50,7 +50,7 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
         what = f"takes more than {limits.inspection_seconds:g} s to read"
         raise RecordingError(file.name, what, SMALLER) from None
     if done.returncode == 3:
-        what = f"needs more than {limits.inspection_memory_bytes / 2**30:g} GiB of memory to read"
+        what = f"needs more than {size_in_words(limits.inspection_memory_bytes)} of memory to read"
         raise RecordingError(file.name, what, SMALLER)
     if done.returncode != 0 or len(done.stdout) > MOST_JSON:
         raise RecordingError(

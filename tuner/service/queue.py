@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy import CursorResult, insert, select, update
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, undefer
 
 from tuner.service.database import Database
 from tuner.service.states import State
@@ -40,6 +40,8 @@ class Claim:
         What is to be fitted.
     flights
         Name of each recording in the job -> its digest.
+    checkpoint
+        Name -> digest of what a search elsewhere has put into the store.
     """
 
     number: int
@@ -48,6 +50,7 @@ class Claim:
     deaths: int
     request: Mapping[str, Any]
     flights: Mapping[str, str]
+    checkpoint: Mapping[str, str]
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,7 @@ class Queue:
         with self._database.writing() as session:
             waiting = (
                 select(JobRow)
+                .options(undefer(JobRow.request), undefer(JobRow.checkpoint))
                 .where(JobRow.state == State.QUEUED)
                 .order_by(JobRow.number)
                 .limit(1)
@@ -109,7 +113,9 @@ class Queue:
             row.started = row.started or now
             flights = {flight.name: flight.sha256 for flight in row.flights}
             add_event(session, row.number, "state", {"state": State.RUNNING})
-            return Claim(row.number, row.id, word, row.deaths, row.request, flights)
+            return Claim(
+                row.number, row.id, word, row.deaths, row.request, flights, row.checkpoint or {}
+            )
 
     def report(
         self,

@@ -27,6 +27,7 @@ from tuner.service.errors import (
 from tuner.service.metrics import Metrics
 from tuner.service.rates import RateLimit
 from tuner.service.service import Service
+from tuner.service.settings import size_in_words
 
 COOKIE = "tune_token"
 OPEN_TO_ALL = ("/healthz", "/login", "/static/")
@@ -126,7 +127,7 @@ class Guard:
             body += message.get("body", b"")
             more = message.get("more_body", False)
             if len(body) > most:
-                what = f"is larger than {most / 2**20:g} MiB"
+                what = f"is larger than {size_in_words(most)}"
                 raise TooLargeError("the request", what, "send recordings as uploads")
         parts: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
 

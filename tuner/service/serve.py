@@ -5,10 +5,12 @@ from __future__ import annotations
 import ipaddress
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from types import FrameType
 
 import uvicorn
 
+from tuner.engine.choose import engine_for
 from tuner.errors import InputError
 from tuner.service import tokens
 from tuner.service.app import create_app
@@ -48,7 +50,14 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def serve(settings: ServiceSettings, *, host: str, port: int, say: Callable[[str], None]) -> None:
+def serve(
+    settings: ServiceSettings,
+    *,
+    host: str,
+    port: int,
+    say: Callable[[str], None],
+    cluster: str | None = None,
+) -> None:
     """Run a server until it is told to end (SIGINT or SIGTERM).
 
     Parameters
@@ -59,15 +68,28 @@ def serve(settings: ServiceSettings, *, host: str, port: int, say: Callable[[str
         To listen to; port 0 takes a free one.
     say
         Gets sentences for who has started it.
+    cluster
+        A cluster file, or the address of a scheduler, whose machines do the work; the store must
+        be one that they reach. None for processes of this machine.
 
     Raises
     ------
     InputError
         Something cannot be used, the address is taken, or tokens are demanded and there are none.
     """
-    service = Service.open(settings)
+    if cluster is not None:
+        with engine_for(None, cluster) as engine:
+            wide = replace(settings, workers=engine.at_once)
+            _serve(Service.open(wide, engine), host=host, port=port, say=say)
+        return
+    _serve(Service.open(settings), host=host, port=port, say=say)
+
+
+def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]) -> None:
+    """Run a service that is open until it is told to end."""
+    settings = service.settings
     if settings.demands_tokens and not tokens.names(service.database):
-        service.database.close()
+        service.close()
         raise InputError(
             "--host",
             f"{host} can be reached from other machines, and nobody has a token",

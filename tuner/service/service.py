@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import IO
 
 from tuner.disk import make_folder, write_text
+from tuner.engine.engine import Engine
 from tuner.errors import InputError
 from tuner.service.database import Database
 from tuner.service.dispatcher import Dispatcher
@@ -38,8 +39,15 @@ class Service:
     _lock: IO[str] | None = None
 
     @classmethod
-    def open(cls, settings: ServiceSettings) -> Service:
+    def open(cls, settings: ServiceSettings, engine: Engine | None = None) -> Service:
         """Open the store and the database, and make the folders.
+
+        Parameters
+        ----------
+        settings
+            See there.
+        engine
+            A cluster that does the work; None for this machine.
 
         Raises
         ------
@@ -54,7 +62,7 @@ class Service:
         database = Database(settings.database_url)
         database.migrate()
         jobs = Queue(database, _identity(settings.data), settings.lease_seconds)
-        return cls(settings, database, store, Dispatcher(settings, jobs, store), _lock=lock)
+        return cls(settings, database, store, Dispatcher(settings, jobs, store, engine), _lock=lock)
 
     def start(self) -> None:
         """Begin to work."""

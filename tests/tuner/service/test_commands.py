@@ -1,0 +1,205 @@
+"""The commands that ask a server, and the client of Python."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+import tuner
+from tests.tuner.service.conftest import submit, upload
+from tuner.cli import main
+from tuner.client import folder as folder_module
+from tuner.client.job_request import request_of
+from tuner.config import Options
+from tuner.errors import InputError, ServerFaultError
+from tuner.result import Run
+
+
+@pytest.fixture
+def server(client, monkeypatch):
+    address = str(client.base_url)
+    monkeypatch.setenv("TUNE_SERVER", address)
+    return address
+
+
+@pytest.mark.usefixtures("server")
+def test_submitting_and_waiting_shows_and_ends_as_the_local_command(table, tmp_path, capsys):
+    out = tmp_path / "run"
+    assert main(["submit", "--flights", str(table), "--wait", "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert "begins at 0" in shown
+    assert "whole length: iteration 5, horizon 1 s, position RMSE 20.00 mm" in shown
+    assert "RMSE with the initial → with the best coefficients" in shown
+    assert f"written to {out}/" in shown
+    assert (out / "plots" / "one.svg").exists()
+    assert json.loads((out / "result.json").read_text())["status"] == "converged"
+
+
+@pytest.mark.usefixtures("server")
+def test_a_job_is_submitted_listed_watched_fetched_and_cancelled(client, table, tmp_path, capsys):
+    assert main(["submit", "--flights", str(table), "--name", "[bold]first"]) == 0
+    job = capsys.readouterr().out.split()[1].rstrip(":")
+    assert main(["watch", job]) == 0
+    assert f"tune fetch {job}" in capsys.readouterr().out
+    assert main(["jobs", "--state", "done"]) == 0
+    assert "[bold]first" in capsys.readouterr().out
+    assert main(["jobs", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["jobs"][0]["id"] == job
+    assert main(["fetch", job, "--out", str(tmp_path / "run")]) == 0
+    assert "motor_constant" in capsys.readouterr().out
+    slow = submit(client, upload(client, table.read_bytes()), namespace="slow")
+    assert main(["fetch", slow, "--out", str(tmp_path / "none")]) == 2
+    assert main(["cancel", slow]) == 0
+    capsys.readouterr()
+    assert main(["cancel", slow]) == 2
+    assert capsys.readouterr().err == (
+        f"tune: job {slow}: is cancelled; there is nothing left to cancel\n"
+    )
+    assert main(["watch", slow]) == 2
+    assert "was cancelled" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("server")
+@pytest.mark.parametrize(
+    ("wish", "status", "error"),
+    [
+        ("refuse", 2, "tune: flights: nothing moves; fly a circle\n"),
+        ("fault", 1, "this is a fault of ours: ZeroDivisionError: division by zero\n"),
+    ],
+)
+def test_a_job_that_fails_ends_the_command_as_it_would_here(table, capsys, wish, status, error):
+    arguments = ["submit", "--flights", str(table), "--namespace", wish, "--wait", "--quiet"]
+    assert main(arguments) == status
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.endswith(error)
+    assert err.count("\n") == 1
+
+
+@pytest.mark.usefixtures("server")
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["jobs", "--server", "nowhere"], "--server: 'nowhere' is no address; write http://"),
+        (["jobs", "--server", "http://127.0.0.1:1"], "cannot be reached"),
+        (["watch", "nobody"], "job nobody: is not known here; list the jobs with tune jobs"),
+        (["jobs", "--after", "nobody"], "job nobody: is not known here"),
+        (["submit", "--flights", "no.bag"], "no.bag: does not exist; check the path"),
+        (["watch-folder", "nowhere"], "nowhere: is no folder"),
+        (["serve", "--port", "99999"], "--port: 99999 is no port"),
+        (["serve", "--workers", "0"], "--workers: is 0; give a number above zero"),
+        (["serve", "token", "remove", "bob"], "'bob' has none"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(arguments, expected, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1
+    assert expected in err
+
+
+def test_the_client_gives_what_fit_gives(server, table, tmp_path, updated):
+    client = tuner.connect(server)
+    run = client.fit([table], vehicle=updated, mass=2.3, out=tmp_path / "run", name="from Python")
+    assert isinstance(run, Run)
+    assert run.folder == tmp_path / "run"
+    assert run.result.coefficients["motor_constant"].best == 1e-7
+    assert client.jobs()["jobs"][0]["name"] == "from Python"
+    assert client.history("hovergames_updated")["coefficients"]["motor_constant"]["points"]
+    with pytest.raises(InputError, match="nothing moves; fly a circle"):
+        client.fit([table], namespace="refuse", out=tmp_path / "refused")
+    with pytest.raises(ServerFaultError, match="ZeroDivisionError"):
+        client.fit([table], namespace="fault", out=tmp_path / "fault")
+    client.close()
+
+
+def test_a_recording_that_the_server_has_is_not_sent_again(server, table):
+    client, sent = tuner.connect(server), []
+    for _ in range(2):
+        client.submit(Options([str(table)]), on_upload=sent.append)
+    assert sent == [table]
+    client.close()
+
+
+def test_files_that_options_name_travel_as_their_contents(table, tmp_path, updated):
+    from tuner.config import write_vehicle  # noqa: PLC0415
+
+    lab = tmp_path / "lab"
+    lab.mkdir()
+    for name in ("a.csv", "b.csv"):
+        (lab / name).write_bytes(table.read_bytes())
+    write_vehicle(updated, lab / "own.yaml")
+    (lab / "tune.yaml").write_text("vehicle: own.yaml\ncontroller: hovergames_sitl\nholdout: [b]\n")
+    flights, request = request_of(Options([str(lab / "*.csv")], mass=2.2))
+    assert [path.name for path in flights] == ["a.csv", "b.csv"]
+    assert request["mass"] == 2.2
+    assert request["settings"]["vehicle"]["mass"] == updated.mass
+    assert request["settings"]["controller"] == "hovergames_sitl"
+    assert request["settings"]["holdout"] == ["b"]
+    assert "holdout" not in request
+    _, request = request_of(Options([str(lab / "a.csv")], holdout=[str(lab / "b.csv")]))
+    assert request["holdout"] == ["b"]
+
+
+@pytest.mark.usefixtures("server")
+def test_a_folder_s_new_recordings_become_one_job_once(client, table, tmp_path, capsys):
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / name).write_bytes(table.read_bytes() + name.encode())
+    arguments = ["watch-folder", str(tmp_path), "--settle", "0.1", "--once"]
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.startswith("a.csv, b.csv: job ")
+    assert main(arguments) == 0
+    assert capsys.readouterr().out == ""
+    (tmp_path / "c.csv").write_bytes(table.read_bytes() + b"c")
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.startswith("c.csv: job ")
+    (tmp_path / folder_module.Submitted.FILE).unlink()  # as after a crash before it was noted
+    jobs = len(client.get("/api/v1/jobs").json()["jobs"])
+    assert jobs == 2
+
+
+def test_a_recording_that_still_grows_is_waited_for(tmp_path, table):
+    (tmp_path / "a.csv").write_bytes(b"time")
+    first = folder_module._new(tmp_path)
+    time.sleep(0.01)
+    (tmp_path / "a.csv").write_bytes(table.read_bytes())
+    assert folder_module._new(tmp_path) != first
+
+
+def test_plain_tune_loads_nothing_of_the_service():
+    script = (
+        "import sys\nfrom tuner.cli import main\nmain(['--help'])\nimport tuner.job.run\n"
+        "heavy = {'fastapi', 'sqlalchemy', 'uvicorn', 'httpx', 'alembic', 'prometheus_client'}\n"
+        "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or None)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "said"),
+    [
+        ("fastapi", ["serve"], "tune serve: needs fastapi, which is not installed; pip install"),
+        ("sqlalchemy", ["serve", "token", "list"], "needs sqlalchemy"),
+        ("httpx", ["jobs"], "--server: needs httpx; pip install 'multirotor-tune[service]'"),
+    ],
+)
+def test_a_missing_extra_is_named_in_one_line(package, arguments, said):
+    script = (
+        f"import sys\nsys.modules['{package}'] = None\nfrom tuner.cli import main\n"
+        f"sys.exit(main({arguments!r}))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2, done.stderr
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1

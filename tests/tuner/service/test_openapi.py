@@ -1,0 +1,71 @@
+"""The HTTP interface asked whatever its own description allows, by Schemathesis."""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import suppress
+from dataclasses import replace
+
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis.errors import Unsatisfiable
+from schemathesis.checks import CHECKS, load_all_checks
+
+from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
+from tuner.service.service import Service
+from tuner.service.settings import ServiceSettings
+
+EXAMPLES = 25
+"""Requests for each operation, and as many that break its description."""
+load_all_checks()
+NAMES = (
+    "not_a_server_error",
+    "status_code_conformance",
+    "content_type_conformance",
+    "response_schema_conformance",
+    "response_headers_conformance",
+)
+
+
+@pytest.fixture
+def served(tmp_path, table):
+    """A server with a job that is done, which has a name that requests may hit upon."""
+    limits = replace(LIMITS, requests_in_a_burst=10**9)
+    service = Service.open(ServiceSettings(tmp_path / "data", limits=limits))
+    with listening(service) as client:
+        job = ended(client, submit(client, upload(client, table.read_bytes())))
+        yield client, job["id"]
+    service.close()
+
+
+def test_no_answer_is_a_fault_or_undocumented(served):
+    client, job = served
+    schema = schemathesis.openapi.from_url(f"{client.base_url}/api/v1/openapi.json")
+    checks = [CHECKS.get_one(name) for name in NAMES]
+    statuses: Counter[int] = Counter()
+
+    def ask(case: schemathesis.Case) -> None:
+        if "job" in case.path_parameters and case.method == "GET" and len(statuses) % 2:
+            case.path_parameters["job"] = job
+        answer = case.call(session=None)
+        statuses[answer.status_code] += 1
+        case.validate_response(answer, checks=checks)
+
+    for result in schema.get_all_operations():
+        operation = result.ok()
+        for mode in (schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE):
+            strategy = operation.as_strategy(generation_mode=mode)
+            run = settings(
+                max_examples=EXAMPLES,
+                phases=[Phase.generate],
+                suppress_health_check=list(HealthCheck),
+                deadline=None,
+                derandomize=True,
+            )
+            # what has no parameters cannot be asked wrongly
+            with suppress(Unsatisfiable):
+                run(given(strategy)(ask))()
+    assert sum(statuses.values()) > 300
+    assert max(statuses) < 500
+    assert {200, 404, 422} <= set(statuses)

@@ -1,0 +1,272 @@
+"""Servers that are killed, claims that run out, databases that are locked or gone."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
+from tuner.errors import InputError
+from tuner.service import database as database_module
+from tuner.service import jobs
+from tuner.service.database import Database
+from tuner.service.queue import Outcome, Queue
+from tuner.service.request import JobRequest
+from tuner.service.service import Service
+from tuner.service.states import State
+from tuner.service.tables import Base, RecordingRow
+
+ROOT = Path(__file__).parents[3]
+KILLS = 20
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])
+
+
+@contextmanager
+def server(data: Path, port: int, database: str = "") -> Iterator[subprocess.Popen]:
+    """Start a server, and wait until it answers."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.tuner.service.serving", str(data), str(port), database],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        until = time.monotonic() + 60
+        while True:
+            try:
+                if httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200:
+                    break
+            except httpx.TransportError:
+                assert process.poll() is None
+                assert time.monotonic() < until
+                time.sleep(0.05)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def killed_again_and_again(data: Path, table: Path, kills: int, database: str = "") -> list[dict]:
+    """Submit a job a life, kill the server at a random moment of each, and return all jobs."""
+    port, chance, ids = free_port(), random.Random(7), []
+    for _ in range(kills):
+        with server(data, port, database) as process:
+            with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client:
+                recording = upload(client, table.read_bytes())
+                ids.append(submit(client, recording, namespace="slow"))
+                while (
+                    len(ids) == 1 and not client.get(f"/api/v1/jobs/{ids[0]}").json()["iteration"]
+                ):
+                    time.sleep(0.02)
+                time.sleep(chance.uniform(0.0, 1.5))
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+    with (
+        server(data, port, database),
+        httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client,
+    ):
+        return [ended(client, job, within=120) for job in ids]
+
+
+def check_all_done_once(found: list[dict]) -> None:
+    """Nothing is lost, nothing failed, and nothing came to another result by being interrupted."""
+    assert [job["state"] for job in found] == ["done"] * len(found)
+    assert all(job["iteration"] == 40 for job in found)
+    assert any("has gone; it goes on" in line for job in found for line in job["log"])
+
+
+def results_in(data: Path) -> dict[str, int]:
+    """Return how often each result stands in a table, and that its sum is the whole one."""
+    with sqlite3.connect(data / "tune.sqlite") as table:
+        rows = table.execute("SELECT job, best FROM points").fetchall()
+        ends = table.execute(
+            "SELECT job, COUNT(*) FROM events WHERE kind = 'state' AND content LIKE '%done%' "
+            "GROUP BY job"
+        ).fetchall()
+    table.close()
+    assert {best for _, best in rows} == {sum(range(40)) * 1e-8}
+    assert {count for _, count in ends} == {1}
+    return dict(ends)
+
+
+def test_a_server_that_is_killed_loses_nothing_and_does_nothing_twice(tmp_path, table):
+    found = killed_again_and_again(tmp_path / "data", table, kills=1)
+    check_all_done_once(found)
+    assert len(results_in(tmp_path / "data")) == 1
+
+
+@pytest.mark.slow
+def test_a_server_that_is_killed_at_twenty_random_moments(tmp_path, table):
+    found = killed_again_and_again(tmp_path / "data", table, kills=KILLS)
+    check_all_done_once(found)
+    assert len(results_in(tmp_path / "data")) == KILLS
+
+
+def test_workers_end_with_their_server_and_a_stopped_server_leaves_its_jobs(tmp_path, table):
+    data, port = tmp_path / "data", free_port()
+    with server(data, port) as process, httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+        job = submit(client, upload(client, table.read_bytes()), namespace="slow")
+        while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
+            time.sleep(0.05)
+        began = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        process.wait(timeout=15)
+        assert time.monotonic() - began < 10
+    with sqlite3.connect(data / "tune.sqlite") as rows:
+        assert rows.execute("SELECT state, deaths, claim FROM jobs").fetchall() == [
+            ("queued", 0, None)
+        ]
+    rows.close()
+    with server(data, port), httpx.Client(base_url=f"http://127.0.0.1:{port}") as client:
+        assert ended(client, job)["state"] == "done"
+
+
+def enter(service: Service, count: int = 1, **more: object) -> list[str]:
+    """Enter jobs without a server."""
+    with service.database.writing() as session:
+        row = RecordingRow(sha256="0" * 64, name="a.csv", size=1, uploaded=0.0, inspection={})
+        session.merge(row)
+    request = JobRequest(recordings=("0" * 64,), **more)
+    return [jobs.submit(service.database, request, LIMITS)[0].id for _ in range(count)]
+
+
+def test_many_servers_share_one_table_and_no_job_is_claimed_twice(idle):
+    entered = enter(idle, 24)
+    queues = [Queue(idle.database, f"server {n}", 30.0) for n in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        claims = list(pool.map(lambda n: queues[n % 8].claim(), range(32)))
+    taken = [claim.id for claim in claims if claim is not None]
+    assert sorted(taken) == sorted(entered)
+
+
+def test_only_the_attempt_that_the_table_names_can_commit(idle):
+    (job,) = enter(idle)
+    first = Queue(idle.database, "first", lease=0.01)
+    second = Queue(idle.database, "second", lease=30.0)
+    old = first.claim()
+    time.sleep(0.05)
+    assert second.recover(own=False) == 1
+    new = second.claim()
+    points = [{"coefficient": "mass", "unit": "kg", "best": 1.0}]
+    assert not first.report(old, [("message", {"text": "late"})], {"iteration": 9})
+    assert not first.finish(old, Outcome(State.DONE, exit_status=0, points=points))
+    assert not first.give_back(old, message="late")
+    assert second.finish(new, Outcome(State.DONE, exit_status=0, points=points))
+    assert not second.finish(new, Outcome(State.FAILED, "again"))
+    row = jobs.job(idle.database, job)
+    assert (row.state, row.iteration, row.error) == ("done", None, None)
+    assert [e.content for e in jobs.events(idle.database, row) if e.kind == "message"] == [
+        {"text": "The server that worked on this job has gone; it goes on from its checkpoint."}
+    ]
+
+
+def test_a_lease_that_is_renewed_is_not_taken_away(idle):
+    enter(idle)
+    first, second = Queue(idle.database, "a", 0.2), Queue(idle.database, "b", 0.2)
+    claim = first.claim()
+    for _ in range(4):
+        time.sleep(0.1)
+        assert first.report(claim, [], {})
+        assert second.recover(own=False) == 0
+
+
+@pytest.mark.usefixtures("service")
+def test_a_folder_has_one_server(settings):
+    with pytest.raises(InputError, match="is used by another server; stop that one"):
+        Service.open(settings)
+
+
+def test_the_migrations_make_the_tables_of_this_program(idle):
+    from alembic.autogenerate import compare_metadata  # noqa: PLC0415
+    from alembic.migration import MigrationContext  # noqa: PLC0415
+
+    with idle.database.reading() as session:
+        context = MigrationContext.configure(session.connection())
+        assert compare_metadata(context, Base.metadata) == []
+
+
+def test_a_locked_database_is_told_and_nothing_is_lost(client, service, table, monkeypatch):
+    recording = upload(client, table.read_bytes())
+    monkeypatch.setattr(database_module, "LOCKED_FOR", 0.1)
+    job = submit(client, recording, namespace="slow")
+    while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
+        time.sleep(0.02)
+    service.database.close()  # connections made from now on wait for a tenth of a second only
+    other = sqlite3.connect(service.settings.data / "tune.sqlite", isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    refused = client.post("/api/v1/jobs", json={"recordings": [recording]})
+    assert refused.status_code == 503
+    assert refused.json()["detail"] == (
+        "the database: is locked by another program; close that, or try again in a minute"
+    )
+    assert client.get("/api/v1/jobs").status_code == 200  # readers go on
+    time.sleep(0.5)
+    other.execute("ROLLBACK")
+    other.close()
+    assert ended(client, job)["state"] == "done"
+    assert ended(client, submit(client, recording))["state"] == "done"
+
+
+def test_a_database_that_is_gone_is_told_and_comes_back(settings, table, tmp_path):
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    url = f"sqlite:///{folder / 'tune.sqlite'}"
+    service = Service.open(replace(settings, database=url))
+    with listening(service) as client:
+        job = submit(client, upload(client, table.read_bytes()), namespace="slow")
+        service.database.close()
+        folder.rename(tmp_path / "away")
+        service.database.close()
+        health = client.get("/healthz")
+        assert health.status_code == 503
+        assert health.json()["database"] == "cannot be reached"
+        assert client.get("/api/v1/jobs").json()["detail"].startswith("the database: cannot be")
+        page = client.get("/jobs", headers={"accept": "text/html"})
+        assert (page.status_code, "cannot be reached" in page.text) == (503, True)
+        time.sleep(1.0)
+        (tmp_path / "away").rename(folder)
+        assert ended(client, job)["state"] == "done"
+    service.close()
+
+
+def test_a_disk_that_fills_while_a_result_is_stored_fails_the_job_and_a_retry_ends_it(
+    client, table, monkeypatch
+):
+    recording = upload(client, table.read_bytes())
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    with monkeypatch.context() as full:
+        full.setattr("tuner.service.attempt.shutil.copyfile", refuse)
+        job = ended(client, submit(client, recording))
+    assert (job["state"], job["exit_status"], job["files"]) == ("failed", 2, [])
+    assert "has no space left; free some space and try again" in job["error"]
+    client.post(f"/api/v1/jobs/{job['id']}/retry")
+    again = ended(client, job["id"])
+    assert again["state"] == "done"
+    assert again["log"][-1] == "begins at 5"
+
+
+@pytest.mark.parametrize("url", ["mysql://x/y", "nonsense", "sqlite+nothing://"])
+def test_another_kind_of_database_is_refused_in_words(url):
+    with pytest.raises(InputError, match="--database: is no URL of SQLite or PostgreSQL"):
+        Database(url)

@@ -1,0 +1,126 @@
+"""A job worked on by a machine of a cluster: its files come from the store and go back there.
+
+The machine has a folder of its own for as long as it works. What its search has found so far goes
+into the store as well, so that any other machine can go on from it.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from concurrent.futures import TimeoutError as NotYet
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from tuner.engine.engine import Engine
+from tuner.engine.engine import Report as Channel
+from tuner.service.attempt import (
+    BEAT,
+    CHECKPOINTS,
+    DiedError,
+    Events,
+    Report,
+    UnwantedError,
+    attempt,
+    outcome_of,
+    prepare,
+    put,
+)
+from tuner.service.queue import Claim, Outcome
+from tuner.service.settings import Limits
+from tuner.service.store import Store
+from tuner.service.worker import RESULT
+
+
+@dataclass(frozen=True)
+class Errand:
+    """What a machine elsewhere is to do: the claim on a job, and the store's URL."""
+
+    claim: Claim
+    store: str
+    limits: Limits
+
+
+def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
+    """Work on a job, on the machine that an engine has chosen for it.
+
+    Raises
+    ------
+    DiedError
+        Its process died.
+    """
+    store, claim = Store(errand.store), errand.claim
+    kept = dict(claim.checkpoint)
+    with tempfile.TemporaryDirectory(prefix="tune-job-") as name:
+        folder = Path(name)
+        (folder / RESULT).mkdir()
+        for file, digest in kept.items():
+            store.fetch(digest, folder / RESULT / file)
+        asked = prepare(folder, claim, store)
+
+        def relay(events: Events, standing: Mapping[str, Any]) -> bool:
+            for file in (folder / RESULT).glob(CHECKPOINTS):
+                kept[file.name] = put(file, store)
+            report({"events": list(events), "standing": dict(standing), "checkpoint": dict(kept)})
+            return True
+
+        last = attempt(
+            folder,
+            claim,
+            asked,
+            limits=errand.limits,
+            cores=(),
+            report=relay,
+            is_unwanted=lambda: False,
+        )
+        return outcome_of(last, folder, store)
+
+
+def sent(
+    errand: Errand, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
+) -> Outcome:
+    """Have a job worked on elsewhere, and return what came of it.
+
+    Raises
+    ------
+    UnwantedError
+        The attempt holds its job no more, or the server is ending; the machine stops working.
+    DiedError
+        The process of the job died, or the machine did.
+    """
+    from tuner.engine.dask_engine import EngineError  # noqa: PLC0415 (an extra)
+
+    heard: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    future = engine.submit(fit_elsewhere, errand, heard.put)
+    try:
+        while True:
+            outcome = None
+            try:
+                outcome = future.result(timeout=BEAT)
+            except NotYet:
+                if future.done():
+                    raise
+            except EngineError as error:
+                raise DiedError(f"{error.where} {error.what}") from None
+            events, standing = _all(heard)
+            if is_unwanted() or not report(events, standing):
+                raise UnwantedError
+            if outcome is not None:
+                return outcome
+    finally:
+        future.cancel()
+
+
+def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
+    """Return what was heard since the last time."""
+    events: list[tuple[str, Mapping[str, Any]]] = []
+    standing: dict[str, Any] = {}
+    while True:
+        try:
+            message = heard.get_nowait()
+        except Empty:
+            return events, standing
+        events += [(kind, content) for kind, content in message["events"]]
+        standing |= {**message["standing"], "checkpoint": message["checkpoint"]}
