@@ -13,5 +13,6 @@ def cancel(job: JobName, /, *, server: Server = None, token: Token = None) -> No
     job
         Its id.
     """
-    client_of(server, token).cancel(job)
+    with client_of(server, token) as client:
+        client.cancel(job)
     print(f"job {job}: cancelled")

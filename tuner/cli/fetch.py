@@ -28,6 +28,7 @@ def fetch(
     """
     from tuner.cli.results import print_run
 
-    run = client_of(server, token).fetch(job, out)
+    with client_of(server, token) as client:
+        run = client.fetch(job, out)
     if not quiet:
         print_run(run.folder, run.result)

@@ -35,7 +35,8 @@ def jobs(
 
     from tuner.cli.tables import console
 
-    page = client_of(server, token).jobs(vehicle=vehicle, state=state, after=after)
+    with client_of(server, token) as client:
+        page = client.jobs(vehicle=vehicle, state=state, after=after)
     if json:
         from json import dumps
 

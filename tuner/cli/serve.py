@@ -112,9 +112,9 @@ def add(name: str, /, *, data: Data = None, database: DatabaseUrl = None) -> Non
     name
         Whose it is.
     """
-    from tuner.service import tokens
-
     with _database(data, database) as opened:
+        from tuner.service import tokens
+
         print(tokens.add(opened, name))
 
 
@@ -127,9 +127,9 @@ def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = None) -> 
     name
         Whose it is.
     """
-    from tuner.service import tokens
-
     with _database(data, database) as opened:
+        from tuner.service import tokens
+
         tokens.remove(opened, name)
         print(f"{name} has no token any more")
 
@@ -137,9 +137,9 @@ def remove(name: str, /, *, data: Data = None, database: DatabaseUrl = None) -> 
 @token.command(name="list")
 def names(*, data: Data = None, database: DatabaseUrl = None) -> None:
     """List who has a token."""
-    from tuner.service import tokens
-
     with _database(data, database) as opened:
+        from tuner.service import tokens
+
         for name in tokens.names(opened):
             print(name)
 

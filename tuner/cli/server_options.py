@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
@@ -28,8 +30,9 @@ Token = Annotated[
 JobName = Annotated[str, Parameter(help="Take this job, by its id.")]
 
 
-def client_of(server: str | None, token: str | None) -> Client:
-    """Return a client of the server that the options name.
+@contextmanager
+def client_of(server: str | None, token: str | None) -> Iterator[Client]:
+    """Yield a client of the server that the options name.
 
     Raises
     ------
@@ -39,7 +42,11 @@ def client_of(server: str | None, token: str | None) -> Client:
     from tuner.client.client import Client
     from tuner.client.connection import Connection
 
-    return Client(Connection(server, token))
+    client = Client(Connection(server, token))
+    try:
+        yield client
+    finally:
+        client.close()
 
 
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:

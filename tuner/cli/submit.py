@@ -88,20 +88,20 @@ def submit(
         method=method,
         seed=seed,
     )
-    client = client_of(server, token)
-    folder = folder_for(out) if wait else None
-    job = client.submit(options, name=name, force=force, cross_validate=cross_validate)
-    if folder is None:
-        print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
-        return
-    try:
-        with listening(quiet=quiet) as listener:
-            show(client.follow(job), listener)
-    except KeyboardInterrupt:
-        if not quiet:
-            print(f"Job {job} goes on at the server: tune watch {job}, or tune cancel {job}.")
-        raise
-    ended_well(client.job(job))
-    run = client.fetch(job, folder)
+    with client_of(server, token) as client:
+        folder = folder_for(out) if wait else None
+        job = client.submit(options, name=name, force=force, cross_validate=cross_validate)
+        if folder is None:
+            print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
+            return
+        try:
+            with listening(quiet=quiet) as listener:
+                show(client.follow(job), listener)
+        except KeyboardInterrupt:
+            if not quiet:
+                print(f"Job {job} goes on at the server: tune watch {job}, or tune cancel {job}.")
+            raise
+        ended_well(client.job(job))
+        run = client.fetch(job, folder)
     if not quiet:
         print_run(folder, run.result)

@@ -19,9 +19,9 @@ def watch(
     from tuner.cli.progress import listening
     from tuner.client.client import ended_well
 
-    client = client_of(server, token)
-    with listening(quiet=quiet) as listener:
-        show(client.follow(job), listener)
-    ended_well(client.job(job))
+    with client_of(server, token) as client:
+        with listening(quiet=quiet) as listener:
+            show(client.follow(job), listener)
+        ended_well(client.job(job))
     if not quiet:
         print(f"Job {job} is done; its result comes with: tune fetch {job}")

@@ -35,10 +35,5 @@ def watch_folder(
     """
     from tuner.client.folder import watch
 
-    watch(
-        client_of(server, token),
-        folder,
-        settle=settle,
-        once=once,
-        say=lambda t: print(t, flush=True),
-    )
+    with client_of(server, token) as client:
+        watch(client, folder, settle=settle, once=once, say=lambda text: print(text, flush=True))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping
-from concurrent.futures import TimeoutError as NotYet
+from concurrent.futures import wait
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -96,19 +96,14 @@ def sent(
     future = engine.submit(fit_elsewhere, errand, heard.put)
     try:
         while True:
-            outcome = None
-            try:
-                outcome = future.result(timeout=BEAT)
-            except NotYet:
-                if future.done():
-                    raise
-            except EngineError as error:
-                raise DiedError(f"{error.where} {error.what}") from None
+            has_ended = wait([future], timeout=BEAT).done
             events, standing = _all(heard)
             if is_unwanted() or not report(events, standing):
                 raise UnwantedError
-            if outcome is not None:
-                return outcome
+            if has_ended:
+                return future.result()
+    except EngineError as error:
+        raise DiedError(f"{error.where} {error.what}") from None
     finally:
         future.cancel()
 

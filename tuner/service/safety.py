@@ -150,6 +150,6 @@ def _check_origin(headers: Headers) -> None:
 def _add_headers(headers: MutableHeaders) -> None:
     headers.setdefault("content-security-policy", PAGE_POLICY)
     headers.setdefault("x-content-type-options", "nosniff")
-    headers.setdefault("referrer-policy", "no-referrer")
+    headers.setdefault("referrer-policy", "same-origin")  # without one, forms have no origin
     headers.setdefault("cache-control", "no-store")
     headers.setdefault("cross-origin-resource-policy", "same-origin")

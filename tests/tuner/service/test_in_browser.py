@@ -116,7 +116,8 @@ def test_the_curve_and_the_list_move_by_themselves(browser, client, table):
 
 def test_all_of_it_can_be_done_from_the_keyboard_without_a_script(browser, client, table):
     recording = upload(client, table.read_bytes())
-    with visiting(browser, client, scripts=False) as page:
+    complaints: list[str] = []
+    with visiting(browser, client, scripts=False, complaints=complaints) as page:
         page.goto(f"/?r={recording}")
         page.keyboard.press("Tab")
         assert page.locator(":focus").inner_text() == "Skip to the content"
@@ -135,6 +136,7 @@ def test_all_of_it_can_be_done_from_the_keyboard_without_a_script(browser, clien
         ended(client, job)
         page.reload()
         page.get_by_role("link", name="Open the report").wait_for()
+    assert ["status of 422" in line for line in complaints] == [True]  # the browser's own line
 
 
 def test_an_upload_that_is_refused_or_cancelled_says_so(browser, client, tmp_path):
