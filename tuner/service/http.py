@@ -76,6 +76,12 @@ _FORM = {
     }
 }
 
+_EVENT = {
+    "type": "object",
+    "properties": {name: {"type": "string"} for name in ("id", "event", "data")},
+    "required": ["event", "data"],
+}
+
 api = APIRouter(prefix=API, responses=dict(PROBLEMS), tags=["tuning"])
 watching = APIRouter(tags=["watching"])
 
@@ -206,7 +212,7 @@ def get_job(service: Served, job: str) -> FullJobAnswer:
     "/jobs/{job}/events",
     response_class=StreamingResponse,
     responses={
-        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}},
+        200: {"content": {"text/event-stream": {"schema": _EVENT}}},
         **NOT_FOUND,
     },
 )

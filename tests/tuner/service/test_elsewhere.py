@@ -12,7 +12,7 @@ from tests.tuner.service.conftest import ended, listening, submit, upload
 from tuner.engine.engine import Engine
 from tuner.service.service import Service
 
-pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+pytest.importorskip("tuner.engine.dask_engine", reason="needs the extra 'cluster'")
 
 
 class StoppedError(Exception):
