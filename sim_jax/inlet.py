@@ -3,7 +3,7 @@
 An inlet is a class. What it does not override, the loop's own stages do::
 
     position control ──> rate control ──>   motors   ──>   rigid body
-     next_setpoints      next_command   next_rotor_speeds  next_motion
+     next_setpoints      next_command   next_rotor_speeds  felt, next_motion
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from sim_jax.control.position import ReferencePoint
 from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
 from sim_jax.state import Setpoints, State
 from sim_jax.trees import like, replaced, row_of, where
 from sim_jax.vector import Vec3
@@ -73,6 +74,14 @@ class Inlet(eqx.Module):
     ) -> tuple[PerRotor, PerRotor]:
         """Return the rotor speeds in rad/s after a step, and those that act during it."""
         return stages.motors(state, step)
+
+    def felt(self, motion: Motion, step: Step) -> Motion:
+        """Return the motion in which forces act during a step, of which an inlet may know a part.
+
+        An integrator asks for forces in a motion that it predicts within the step.
+        """
+        del step
+        return motion
 
     def next_motion(self, moved: Motion, step: Step) -> Motion:
         """Return the motion after a step, of which an inlet may replace a part."""
@@ -172,6 +181,55 @@ class RotorSpeedInlet(Inlet):
         return {len(self.speed)}
 
 
+class AttitudeInlet(Inlet):
+    """Recorded attitude and body rate are followed, and translation alone is simulated.
+
+    What turns the vehicle (inertia, moments, control) then has no effect at all; leaves are
+    (physics steps + 1, \\*batch).
+    """
+
+    attitude: Quaternion
+    """Body to world."""
+    body_rate: Vec3
+    """rad/s, body FLU."""
+    drive: Inlet
+    """What turns the rotors: motor commands or rotor speeds that are fed in."""
+
+    @property
+    def needs_mixer(self) -> bool:
+        return self.drive.needs_mixer
+
+    def next_setpoints(self, stages: Stages, state: State, step: Step) -> Setpoints:
+        return self.drive.next_setpoints(stages, state, step)
+
+    def next_command(self, stages: Stages, state: State, step: Step) -> State:
+        return self.drive.next_command(stages, state, step)
+
+    def next_rotor_speeds(
+        self, stages: Stages, state: State, step: Step
+    ) -> tuple[PerRotor, PerRotor]:
+        return self.drive.next_rotor_speeds(stages, state, step)
+
+    def felt(self, motion: Motion, step: Step) -> Motion:
+        """Return the motion with the body rate of mid-step, whatever moments would make of it."""
+        mean = 0.5 * (row_of(self.body_rate, step) + row_of(self.body_rate, step + 1))
+        return Motion(
+            motion.position, motion.velocity, motion.attitude, like(mean, motion.body_rate)
+        )
+
+    def next_motion(self, moved: Motion, step: Step) -> Motion:
+        attitude, body_rate = row_of((self.attitude, self.body_rate), step + 1)
+        return Motion(
+            moved.position,
+            moved.velocity,
+            like(attitude, moved.attitude),
+            like(body_rate, moved.body_rate),
+        )
+
+    def rotor_counts(self) -> set[int]:
+        return self.drive.rotor_counts()
+
+
 class MixedInlet(Inlet):
     """Each vehicle of a batch has its own inlet; the loop is stepped once for every part."""
 
@@ -194,6 +252,9 @@ class MixedInlet(Inlet):
         self, stages: Stages, state: State, step: Step
     ) -> tuple[PerRotor, PerRotor]:
         return self._of_each(lambda part: part.next_rotor_speeds(stages, state, step))
+
+    def felt(self, motion: Motion, step: Step) -> Motion:
+        return self._of_each(lambda part: part.felt(motion, step))
 
     def next_motion(self, moved: Motion, step: Step) -> Motion:
         return self._of_each(lambda part: part.next_motion(moved, step))

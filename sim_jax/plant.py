@@ -191,7 +191,8 @@ class Plant(eqx.Module):
             changes = zip(speeds, state.rotor_speed, strict=True)
             accelerations = tuple((end - begin) / self.schedule.step for end, begin in changes)
 
-        def wrench_at(motion: Motion) -> Wrench:
+        def wrench_at(predicted: Motion) -> Wrench:
+            motion = self.inlet.felt(predicted, step)
             air = Air.around(self.vehicle, motion, self.environment, accelerations)
             return total_wrench(self.vehicle, motion, acting, air)
 

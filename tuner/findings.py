@@ -23,6 +23,13 @@ class Code(StrEnum):
     MISSING_SIGNALS = "missing_signals"  # names: the signals
     POSE_GAP = "pose_gap"  # seconds
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
+    INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal
+    MOTOR_ORDER = "motor_order"  # names: the recorded columns, from 1, in the vehicle's order
+    SPINS_REVERSED = "spins_reversed"
+    SETPOINTS_SCALED = "setpoints_scaled"  # gain, correlation; names: the axis, the law guessed
+    SETPOINTS_BIASED = "setpoints_biased"  # bias (rad/s); names: the axis
+    SETPOINTS_FOREIGN = "setpoints_foreign"  # axis -> correlation
+    HEADING_FLOWN = "heading_flown"  # correlation
     STILL_AXES = "still_axes"  # names: the axes
     NO_YAW = "no_yaw"  # rate (rad/s)
     IMPLAUSIBLE_BOUNDS = "implausible_bounds"  # lower, upper, plausible_lower, plausible_upper
@@ -41,6 +48,10 @@ class Code(StrEnum):
     STARTS_DISAGREE = "starts_disagree"  # starts, changed: 1 if CMA-ES ended lower, else 0
     FLIGHTS_FAR_OFF = "flights_far_off"  # far_off, flights, changed
     GROUND_CONFLICT = "ground_conflict"  # deviation (standard errors), ground, flights; names: unit
+    SCALES_WITH_MASS = "scales_with_mass"  # mass (kg); names: the coefficients
+    NO_TACHOMETER = "no_tachometer"
+    YAW_OPEN = "yaw_open"
+    VEHICLE_NOT_GIVEN = "vehicle_not_given"
     BENCH_CONFLICT = "bench_conflict"  # deviation (standard errors); names: the coefficients
 
 

@@ -15,7 +15,9 @@ from tuner.errors import InputError, RecordingError, did_you_mean
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
-from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.allocation import with_commands
+from tuner.objective.choice import choose_inlet
+from tuner.objective.inlets import INLETS
 from tuner.objective.windows import require_windows
 from tuner.simulation.trajectory import with_named_reference
 from tuner.yaml_files.section import build
@@ -37,6 +39,8 @@ class Recording:
         Whether it is evaluated and never fitted.
     conditions
         What surrounded it, of `tuner.coefficients.conditions`, as far as that is known.
+    because
+        Why it does not enter at the most upstream place whose signals were recorded.
     """
 
     flight: Flight
@@ -44,6 +48,7 @@ class Recording:
     time_offset: float | None = 0.0
     holdout: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
+    because: Finding | None = None
 
 
 def read_recordings(
@@ -84,7 +89,7 @@ def read_usable(
     -------
     tuple
         The recordings, and a finding for each flight that is left out because it does not hold
-        what its inlet needs.
+        what its inlet needs, or that enters further down than its signals would let it.
 
     Raises
     ------
@@ -116,9 +121,13 @@ def read_usable(
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
     if left_out and (not recordings or none_to_fit):
         raise left_out[0][1]
-    return tuple(recordings), tuple(
-        Finding(Code.LEFT_OUT, "warning", flight.name, names=(error.what, error.remedy))
-        for flight, error in left_out
+    chosen = (recording.because for recording in recordings if recording.because is not None)
+    return tuple(recordings), (
+        *(
+            Finding(Code.LEFT_OUT, "warning", flight.name, names=(error.what, error.remedy))
+            for flight, error in left_out
+        ),
+        *chosen,
     )
 
 
@@ -165,12 +174,15 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if flight_settings is not None:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
-    chosen = inlet_for(flight, inlet)
+    flight = with_commands(flight, settings.vehicle)
+    choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
+    chosen = choice.inlet
     if not INLETS[chosen].closed_loop:
-        require_windows(flight, job.search.window, INLETS[chosen].fed)
+        require_windows(flight, job.search.window, INLETS[chosen].fed(flight))
     if INLETS[chosen].has_mixer:
         check_mixer(settings.vehicle)
-    return Recording(flight, chosen, None if offset == "free" else float(offset), holdout)
+    late = None if offset == "free" else float(offset)
+    return Recording(flight, chosen, late, holdout, because=choice.because)
 
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:

@@ -32,7 +32,7 @@ CRAFT = without_losses(vehicle())
 START = moving_start(CRAFT)
 
 
-class AttitudeInlet(Inlet):
+class HeldAttitude(Inlet):
     """Motor commands 0..1 and the attitude are fed in; leaves are (physics steps + 1, \\*batch)."""
 
     command: PerRotor
@@ -55,17 +55,17 @@ def fly(inlet: Inlet) -> Motion:
 
 
 @pytest.fixture(scope="module")
-def added() -> AttitudeInlet:
+def added() -> HeldAttitude:
     """Hover commands and an attitude that stays, of a vehicle that turns as it starts."""
 
     def constant(leaf: jax.Array) -> jax.Array:
         return jnp.full(SAMPLES + 1, leaf)
 
-    return AttitudeInlet(*jax.tree.map(constant, (START.command, START.motion.attitude)))
+    return HeldAttitude(*jax.tree.map(constant, (START.command, START.motion.attitude)))
 
 
 def test_the_attitude_is_the_one_that_is_fed_in_and_the_velocity_follows_from_it(
-    added: AttitudeInlet,
+    added: HeldAttitude,
 ) -> None:
     motion = fly(added)
     for kept, first in zip(
@@ -79,7 +79,7 @@ def test_the_attitude_is_the_one_that_is_fed_in_and_the_velocity_follows_from_it
         np.testing.assert_allclose(getattr(motion.velocity, axis), wanted, atol=1e-12)
 
 
-def test_it_shares_a_batch_with_the_simulators_own(added: AttitudeInlet) -> None:
+def test_it_shares_a_batch_with_the_simulators_own(added: HeldAttitude) -> None:
     own = ActuatorInlet(added.command)
     together = fly(MixedInlet((added, own), jnp.asarray([0, 1])))
     for number, inlet in enumerate((added, own)):

@@ -84,11 +84,12 @@ def tune(
         print(job_script_for(cluster))
         return
     from tuner.cli.progress import listening
-    from tuner.cli.results import print_run
+    from tuner.cli.results import print_bench, print_run
     from tuner.runtime import configure
 
     configure()
-    from tuner.config import Options
+    from tuner.config import Options, settle
+    from tuner.job.inertial import fit_without_pose, without_pose
     from tuner.job.run import run
 
     options = Options(
@@ -106,6 +107,14 @@ def tune(
         seed=seed,
         bench=bench,
     )
+    if bare := without_pose(settle(options)):
+        with listening(quiet=quiet) as listener:
+            measured = fit_without_pose(
+                settle(options), bare, out=out, listener=listener, command=TYPED.get()
+            )
+        if not quiet:
+            print_bench(measured)
+        return
     with engine_for(workers, cluster), listening(quiet=quiet) as listener:
         folder, result = run(
             options,

@@ -167,6 +167,20 @@ SURROUNDING_ROWS = (
         neutral=0.0,
         group="battery_decline",
     ),
+    *(
+        Coefficient(
+            name=f"accelerometer_{axis}",
+            unit="m/s²",
+            meaning=f"bias of the recorded specific force along {direction}",
+            source="accelerometer bias, and the tilt of the sensor in the body",
+            scope="flight",
+            scale="linear",
+            prior_sd=0.5,
+            neutral=0.0,
+            group="accelerometer",
+        )
+        for axis, direction in (("x", "forward"), ("y", "left"), ("z", "up"))
+    ),
     # by how much the start of a window differs from the recorded state
     Coefficient(
         name="position",

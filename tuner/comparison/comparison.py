@@ -134,8 +134,9 @@ class _Group:
         self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self._windowed:
-            fed = INLETS[inlet].fed
-            self._windows = [windows_of(flight, seconds, fed=fed) for flight in flights]
+            self._windows = [
+                windows_of(flight, seconds, fed=INLETS[inlet].fed(flight)) for flight in flights
+            ]
             self._segments = window_segments(
                 flights,
                 inlets=[inlet] * len(flights),
@@ -306,7 +307,7 @@ def _flown(
         states=states,
         conditions=conditions,
     )
-    trace = trace_of(rollout, model, segments)
+    trace = trace_of(rollout, model, segments, conditions)
     rate = float(schedule.log_rate)
     acted = acting(
         model.vehicle,

@@ -24,10 +24,10 @@ from tuner.yaml_files.section import (
 from tuner.yaml_files.shipped import Kind, find_config
 
 #: Recorded signals whose residuals a fit can weigh, in this order everywhere.
-CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
+CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acceleration")
 
 #: Where a recording can be fed into the simulated loop, the upstream places first.
-InletName = Literal["reference", "body_rate", "actuator", "rotor_speed"]
+InletName = Literal["reference", "body_rate", "actuator", "rotor_speed", "attitude"]
 InletChoice = Literal["auto", InletName]
 Method = Literal["auto", "gradient", "cma", "hybrid"]
 

@@ -29,7 +29,10 @@ _NEEDS: Mapping[str, Sequence[str]] = {
     "body_rate": (*_POSE, "rate_setpoint", "thrust_setpoint"),
     "actuator": (*_POSE, "command"),
     "rotor_speed": (*_POSE, "rotor_speed"),
+    "attitude": _POSE,
 }
+_DRIVES = ("rotor_speed", "command", "thrust_setpoint")
+"""Of which the attitude inlet needs one: what turns the rotors."""
 
 
 def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tuple[Inlet, ...]:
@@ -52,6 +55,8 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
             if need in needs and columns is not None and len(columns) < 4:
                 lacking = [str(i) for i in range(4) if i not in columns]
                 missing.append(f"{need} of rotors {', '.join(lacking)}")
+        if name == "attitude" and not any(len(measured.get(d, ())) in (1, 4) for d in _DRIVES):
+            missing.append(" or ".join(_DRIVES))
         available.append(Inlet(name, tuple(missing)))
     return tuple(available)
 

@@ -130,7 +130,7 @@ class Inlet:
     Attributes
     ----------
     name
-        ``reference``, ``body_rate``, ``actuator`` or ``rotor_speed``.
+        ``reference``, ``body_rate``, ``actuator``, ``rotor_speed`` or ``attitude``.
     missing
         What it lacks for that; nothing if it can.
     """

@@ -131,6 +131,14 @@ def require_pose(recording: Recording, topics: TopicMap, places: Mapping[str, Pl
             "give a topic map for these columns (--topics FILE)",
         )
     names = [topic.name for topic in recording.topics if topic.count]
+    if all(source.topic == "*" for source in sources):
+        held = [field for name in names for field in recording.fields(name)]
+        raise RecordingError(
+            recording.path,
+            f"holds no {what}, only {', '.join(held[:12]) or 'nothing'}",
+            "log the vehicle's estimate of it, or motion capture; body rate, acceleration and "
+            "motor commands together are fitted without one (tune --flights)",
+        )
     wanted = list(dict.fromkeys(source.topic for source in sources))
     for topic in wanted:
         for name in names:

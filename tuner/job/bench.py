@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from pydantic import JsonValue
 
 from tuner.bench.bench_json import bench_record
 from tuner.bench.combine import Combination, combine
@@ -101,18 +102,59 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
     start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
     folder = folder_for(out)
     measurements, combination, vehicle = _estimate(path, plan, start)
+    header = f"From the ground measurements of {path.name}; the rest as in {start.name}."
+    return written(
+        folder,
+        given,
+        vehicle.replace(name=f"{start.name}_bench"),
+        measurements,
+        combination,
+        findings=conflicts_of(combination),
+        settings={"command": command, "bench": plan.model_dump(mode="json")},
+        source={"bench": path.name},
+        header=header,
+        began=began,
+    )
+
+
+def written(
+    folder: Path,
+    given: VehicleFile,
+    vehicle: VehicleFile,
+    measurements: tuple[Measurement, ...],
+    combination: Combination,
+    *,
+    findings: tuple[Finding, ...],
+    settings: Mapping[str, JsonValue],
+    source: Mapping[str, str],
+    header: str,
+    began: float,
+) -> BenchResult:
+    """Write a result folder of measurements, and return what it holds.
+
+    Parameters
+    ----------
+    folder
+        Is made.
+    given, vehicle
+        As the user has it, and with the measured coefficients.
+    measurements, combination, findings
+        What was measured, what it says together, and what a user should know of it.
+    settings, source
+        For ``result.json``, beside the vehicle, and for ``best_fit.yaml``.
+    header
+        First line of ``best_fit.yaml``.
+    began
+        s of `time.perf_counter` at the start.
+    """
     result = RunResult(
         status=Status.CONVERGED,
         seed=0,
         versions=versions(),
-        settings={
-            "command": command,
-            "vehicle": given.model_dump(mode="json"),
-            "bench": plan.model_dump(mode="json"),
-        },
+        settings={**settings, "vehicle": given.model_dump(mode="json")},
         coefficients=_coefficients(given, vehicle, combination, measurements),
         flights=(),
-        findings=_findings(combination),
+        findings=findings,
         search=SearchResult(
             method="bench",
             evaluations=0,
@@ -125,10 +167,8 @@ def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchRes
         ),
     )
     make_folder(folder)
-    source = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", "bench": path.name}
-    named = vehicle.replace(name=f"{start.name}_bench", source=source)
-    header = f"From the ground measurements of {path.name}; the rest as in {start.name}."
-    write_vehicle(named, folder / BEST_FIT_FILE, header=header)
+    made_by = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", **source}
+    write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
     bench_record(combination, measurements).write(folder)
     result.write(folder)
     render(folder)
@@ -140,9 +180,7 @@ def _estimate(
 ) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
     """Return each measurement, what they say together, and the vehicle that follows."""
     names, base = names_of(plan.experiments), path.parent
-    neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
-    values = neutral | values_of(start)
-    known = {name: scaled_of(name, v) for name, v in values.items() if _has_scale(name, v)}
+    known = known_of(start)
     measured = {
         name: measure(name, experiment, start, base)
         for name, experiment in zip(names, plan.experiments, strict=True)
@@ -156,18 +194,25 @@ def _estimate(
     vehicle = start
     for _ in range(1 if not spins else RELINEARISATIONS):
         if measured:
-            vehicle = _vehicle(path, start, combine(tuple(measured.values()), known))
+            vehicle = vehicle_of(path, start, combine(tuple(measured.values()), known))
         measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
     measurements = tuple(measured[name] for name in names)
     combination = combine(measurements, known)
-    return measurements, combination, _vehicle(path, start, combination)
+    return measurements, combination, vehicle_of(path, start, combination)
+
+
+def known_of(vehicle: VehicleFile) -> dict[str, float]:
+    """Return coefficient -> scaled coordinate in a vehicle file, or where its term vanishes."""
+    neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
+    values = neutral | values_of(vehicle)
+    return {name: scaled_of(name, v) for name, v in values.items() if _has_scale(name, v)}
 
 
 def _has_scale(name: str, value: float) -> bool:
     return value > 0 or COEFFICIENTS[name].scale == "linear"
 
 
-def _vehicle(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
+def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
     """Return the vehicle with the measured coefficients.
 
     Raises
@@ -238,7 +283,10 @@ def _judged(
 ) -> tuple[Verdict, Reason]:
     """Return how well the experiments determine a coefficient, and why."""
     if not combination.determined[place]:
-        partners = [n for m in measurements if name in m.names for n in m.names if n != name]
+        rows = [row for m in measurements for row in m.rows if name in row]
+        partners = [n for row in rows for n in row if n != name]
+        places = {n: i for i, n in enumerate(combination.names)}
+        partners.sort(key=lambda n: bool(combination.determined[places[n]]))
         partner = partners[0] if partners else None
         reason = Reason(code=ReasonCode.COMBINATION_MEASURED, correlated_with=partner)
         return Verdict.NOT_IDENTIFIABLE, reason
@@ -266,7 +314,8 @@ def _weight(name: str, measurement: Measurement, combination: Combination) -> fl
     return total
 
 
-def _findings(combination: Combination) -> tuple[Finding, ...]:
+def conflicts_of(combination: Combination) -> tuple[Finding, ...]:
+    """Return the experiments that the others contradict."""
     return tuple(
         Finding(
             Code.BENCH_CONFLICT,

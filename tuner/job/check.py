@@ -13,6 +13,8 @@ from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.inlets import INLETS, sparse
+from tuner.objective.motor_order import order_findings
+from tuner.objective.setpoints import setpoint_findings
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
 
@@ -43,7 +45,14 @@ def check(job: Job) -> tuple[Finding, ...]:
         ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
     """
     return (
-        *said_once((*_recordings(job), *_sparse_inputs(job))),
+        *said_once(
+            (
+                *_recordings(job),
+                *_sparse_inputs(job),
+                *_motor_orders(job),
+                *_controllers(job),
+            )
+        ),
         *_excitation(job),
         *_bounds(job),
         *_starts_on_bounds(job),
@@ -105,6 +114,22 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
 
 
+def _motor_orders(job: Job) -> Iterator[Finding]:
+    """Warn of commands that turn the vehicle as those of other rotors would."""
+    for flight in job.fitted:
+        if not {"command", "body_rate"} <= set(flight.series):
+            continue
+        span = (0.0, flight.duration)
+        yield from order_findings(flight.name, flight.series, job.settings.vehicle, span)
+
+
+def _controllers(job: Job) -> Iterator[Finding]:
+    """Warn of flights whose set-points are not those of the controller file that simulates them."""
+    for flight, inlet in zip(job.fitted, job.inlets, strict=True):
+        if INLETS[inlet].closed_loop:
+            yield from setpoint_findings(flight, job.settings.controller)
+
+
 def _is_default(origin: Mapping[str, str], setting: str) -> bool:
     return origin.get(setting, "").startswith("default")
 
@@ -122,7 +147,8 @@ def _excitation(job: Job) -> Iterator[Finding]:
         ),
         default=0.0,
     )
-    if rate < TURNS:
+    turns = {"inertia_zz", "moment_constant"} & set(job.space.free)
+    if rate < TURNS and turns:
         yield Finding(Code.NO_YAW, "warning", "excitation", {"rate": rate})
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -129,7 +129,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         settings.controller,
         job,
         settings.bench,
-        bypassed=bypassed_by(inlets),
+        bypassed=bypassed_by(inlets, fitted),
     )
     if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
         require_voltage(fitted)
@@ -144,7 +144,13 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     def problem(segments: Segments, seconds: float, limits: Limits) -> Objective:
         samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
         return Objective(
-            model, segments, space, schedule, samples, limits, conditions=_conditions(job)
+            model,
+            segments,
+            space,
+            schedule,
+            samples,
+            limits,
+            conditions=_conditions(job, segments.measured),
         )
 
     windows = None
@@ -174,9 +180,14 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     return Job(settings, recordings, noise, space, windows)
 
 
-def _conditions(job: JobFile) -> tuple[str, ...]:
-    """Return what the job estimates of each flight's surroundings: what its terms name."""
+def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
+    """Return what the job estimates of each flight's surroundings.
+
+    What its terms name, and the accelerometer's bias where that is compared.
+    """
     named = set() if isinstance(job.terms, str) else set(job.terms)
+    if "acceleration" in channels:
+        named.add("accelerometer")
     return tuple(name for name, row in conditions().items() if named & {name, row.group})
 
 

@@ -16,15 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from sim_jax.control.mixer import ROTORS
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import (
     ActuatorInlet,
+    AttitudeInlet,
     BodyRateInlet,
     Inlet,
     MixedInlet,
     ReferenceInlet,
     RotorSpeedInlet,
 )
+from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.config.job import InletName
@@ -33,6 +36,30 @@ from tuner.flights.flight import SIGNALS, Array, Flight, Series
 from tuner.flights.resample import without_gaps
 from tuner.padding import padded_size
 
+OF_MOTORS = (
+    "actuator_latency",
+    "input_scaling",
+    "zero_position_armed",
+    "input_offset",
+    "quadratic",
+    "time_constant_up",
+    "time_constant_down",
+    "time_constant_slope",
+    "battery_exponent",
+)
+"""Coefficients between a motor command and a rotor's speed."""
+TURNING = (
+    "inertia_xx",
+    "inertia_yy",
+    "inertia_zz",
+    "moment_constant",
+    "rolling_moment_coefficient",
+    "flapping_moment_coefficient",
+    "rotor_inertia",
+    *(f"angular_drag_{axis}" for axis in "xyz"),
+    *(f"torque_trim_{axis}" for axis in "xyz"),
+)
+"""Coefficients that turn the vehicle, and do nothing else."""
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""
 
@@ -45,7 +72,7 @@ class RecordedInlet(ABC):
     """The simulator's inlet."""
     needs: ClassVar[tuple[str, ...]]
     """Signals that a recording must hold, the characteristic one first."""
-    silences: ClassVar[tuple[str, ...]] = ()
+    silences: ClassVar[tuple[str, ...]] = ("acceleration",)
     """Channels that are fed in or left out, so that the simulation says nothing about them."""
     ignores: ClassVar[tuple[str, ...]]
     """Parts of a segment's start (`tuner.objective.initial_conditions.STATES`) that do not act."""
@@ -59,10 +86,15 @@ class RecordedInlet(ABC):
     remedy: ClassVar[str] = "use inlet: auto"
     """What to do where a signal is missing."""
 
-    @property
-    def fed(self) -> tuple[str, ...]:
-        """Signals without which a stretch of a flight cannot be simulated."""
+    def fed(self, flight: Flight) -> tuple[str, ...]:
+        """Return the signals without which a stretch of a flight cannot be simulated."""
+        del flight
         return () if self.closed_loop else self.needs
+
+    def bypassed(self, flight: Flight) -> frozenset[str]:
+        """Return the coefficients of which the simulation of a flight says nothing."""
+        del flight
+        return frozenset(self.bypasses)
 
     def can_be_fed(self, flight: Flight) -> bool:
         """Return whether a flight holds every column of what the inlet needs."""
@@ -128,12 +160,14 @@ class RecordedReference(RecordedInlet):
     remedy = "name its trajectory in the job file"
 
     def is_preferred(self, flight: Flight) -> bool:
-        """Return whether a reference with velocities is known.
+        """Return whether a reference with velocities is known, flown by controllers like ours.
 
         Without velocities it is a list of set-points to some other controller, not the reference of
-        ours, so that it is only used where it is asked for.
+        ours, and a controller that commands torques is no PX4: then it is only used where it is
+        asked for.
         """
-        return self.can_be_fed(flight) and flight.has("reference_velocity")
+        foreign = flight.has("commanded_torque")
+        return self.can_be_fed(flight) and flight.has("reference_velocity") and not foreign
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ReferenceInlet:
         """Lay the reference out tick by tick, its last point repeated."""
@@ -179,7 +213,7 @@ class RecordedCommand(RecordedInlet):
     name = "actuator"
     feeds = ActuatorInlet
     needs = ("command",)
-    silences = ("command",)
+    silences = ("command", "acceleration")
     bypasses = ("estimate_latency", "gyro_cutoff")
     ignores = ("rate_integral",)
 
@@ -204,20 +238,8 @@ class RecordedRotorSpeed(RecordedInlet):
     name = "rotor_speed"
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
-    silences = ("command", "rotor_speed")
-    bypasses = (
-        "estimate_latency",
-        "gyro_cutoff",
-        "actuator_latency",
-        "input_scaling",
-        "zero_position_armed",
-        "input_offset",
-        "quadratic",
-        "time_constant_up",
-        "time_constant_down",
-        "time_constant_slope",
-        "battery_exponent",
-    )
+    silences = ("command", "rotor_speed", "acceleration")
+    bypasses = ("estimate_latency", "gyro_cutoff", *OF_MOTORS)
     ignores = ("rotor_speed", "rate_integral")
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
@@ -231,6 +253,73 @@ class RecordedRotorSpeed(RecordedInlet):
         return RotorSpeedInlet(tuple(speed * (1.0 + more) for speed, more in pairs))
 
 
+class _RecordedThrust(RecordedInlet):
+    """Thrust set-points as commands that are the same for all rotors: a drive, no inlet."""
+
+    name = "attitude"
+    feeds = ActuatorInlet
+    needs = ("thrust_setpoint",)
+    ignores = ()
+
+    def update_rate(self, schedule: Schedule) -> float:
+        """Return the rate of the position controller."""
+        return schedule.position_control_rate
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ActuatorInlet:
+        """Lay the set-points out step by step, for each of four rotors."""
+        (thrust,) = self._resampled("thrust_setpoint", flights, schedule)
+        return ActuatorInlet((thrust,) * ROTORS)
+
+
+class RecordedAttitude(RecordedInlet):
+    """Attitude and body rate, which are followed; what turns the rotors simulates the thrust.
+
+    For recordings whose commands say nothing about what turns the vehicle: logged too seldom, by
+    another mixer, or not at all. The accelerometer, where recorded, is a channel.
+    """
+
+    name = "attitude"
+    feeds = AttitudeInlet
+    needs = ("attitude",)
+    silences = ("attitude", "body_rate", "command", "rotor_speed")
+    bypasses = ("estimate_latency", "gyro_cutoff", *TURNING)
+    ignores = ("attitude", "body_rate", "rate_integral", "trim")
+    remedy = "record motor commands, rotor speeds or thrust set-points beside the pose"
+
+    #: What turns the rotors, the most direct first.
+    DRIVES: ClassVar[tuple[RecordedInlet, ...]] = (
+        RecordedRotorSpeed(),
+        RecordedCommand(),
+        _RecordedThrust(),
+    )
+
+    def can_be_fed(self, flight: Flight) -> bool:
+        """Return whether a flight holds its attitude and something that turns the rotors."""
+        return super().can_be_fed(flight) and any(d.can_be_fed(flight) for d in self.DRIVES)
+
+    def drive(self, flight: Flight) -> RecordedInlet:
+        """Return what turns the rotors of a flight that can be fed."""
+        return next(drive for drive in self.DRIVES if drive.can_be_fed(flight))
+
+    def fed(self, flight: Flight) -> tuple[str, ...]:
+        """Return the attitude and what turns the rotors."""
+        return (*self.needs, *self.drive(flight).needs)
+
+    def bypassed(self, flight: Flight) -> frozenset[str]:
+        """Return what turns the vehicle, and the motors where rotor speeds are fed in."""
+        return frozenset(self.bypasses) | self.drive(flight).bypassed(flight)
+
+    def lay(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
+        """Lay attitudes and body rates out step by step, beside what turns the rotors."""
+        with_rate = [_with_body_rate(flight) for flight in flights]
+        attitude = jnp.stack(self._resampled("attitude", flights, schedule))
+        return AttitudeInlet(
+            Quaternion.of(attitude).normalized(),
+            Vec3(*self._resampled("body_rate", with_rate, schedule)),
+            _laid([self.drive(flight) for flight in flights], flights, schedule),
+        )
+
+
 #: Every inlet, the upstream ones first.
 INLETS: Mapping[InletName, RecordedInlet] = {
     inlet.name: inlet
@@ -239,6 +328,7 @@ INLETS: Mapping[InletName, RecordedInlet] = {
         RecordedBodyRate(),
         RecordedCommand(),
         RecordedRotorSpeed(),
+        RecordedAttitude(),
     )
 }
 
@@ -258,7 +348,7 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
         raise RecordingError(
             flight.path,
             "holds neither a reference with velocities, nor rate set-points, nor four motor "
-            "commands, nor four rotor speeds",
+            "commands, nor four rotor speeds, nor thrust set-points",
             "name its trajectory in the job file",
         )
     (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)
@@ -270,9 +360,10 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
     return inlet.name
 
 
-def bypassed_by(names: Collection[InletName]) -> frozenset[str]:
-    """Return the coefficients that act on no flight that enters through one of some inlets."""
-    return frozenset.intersection(*(frozenset(INLETS[name].bypasses) for name in names))
+def bypassed_by(names: Sequence[InletName], flights: Sequence[Flight]) -> frozenset[str]:
+    """Return the coefficients that act on no flight, each entering through its own inlet."""
+    pairs = zip(names, flights, strict=True)
+    return frozenset.intersection(*(INLETS[name].bypassed(flight) for name, flight in pairs))
 
 
 def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:
@@ -285,37 +376,61 @@ def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Sc
     flights, schedule
         As of `RecordedInlet.lay`.
     """
-    used = [inlet for inlet in INLETS.values() if inlet.name in names]
+    return _laid([INLETS[name] for name in names], flights, schedule)
+
+
+def _laid(
+    recorded: Sequence[RecordedInlet], flights: Sequence[Flight], schedule: Schedule
+) -> Inlet:
+    """Lay what was recorded side by side, each segment's by its own of F recorded inlets."""
+    used = list(dict.fromkeys(recorded))
     if len(used) == 1:
         return used[0].lay(flights, schedule)
     parts = []
     for inlet in used:
+        example = flights[recorded.index(inlet)]
         feeding = [
-            flight if name == inlet.name else _zeroed(flight, inlet.needs)
-            for name, flight in zip(names, flights, strict=True)
+            flight if own is inlet else _zeroed(flight, {*inlet.needs, *inlet.fed(example)})
+            for own, flight in zip(recorded, flights, strict=True)
         ]
         parts.append(inlet.lay(feeding, schedule))
-    order = [inlet.name for inlet in used]
-    return MixedInlet(tuple(parts), jnp.asarray([order.index(name) for name in names]))
+    return MixedInlet(tuple(parts), jnp.asarray([used.index(inlet) for inlet in recorded]))
 
 
 def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:
     """Return what feeds an inlet of the simulator."""
-    (recorded,) = (r for r in INLETS.values() if isinstance(inlet, r.feeds))
+    (recorded,) = (r for r in INLETS.values() if type(inlet) is r.feeds)
     return recorded
 
 
-def _zeroed(flight: Flight, signals: Sequence[str]) -> Flight:
-    """Return a flight whose signals are zero throughout."""
-    widths = {name: SIGNALS[name][0] for name in signals}
+def _zeroed(flight: Flight, names: Collection[str]) -> Flight:
+    """Return a flight whose signals are zero throughout, its attitude level."""
+    rows = {name: np.zeros(SIGNALS[name][0]) for name in names}
+    if "attitude" in rows:
+        rows["attitude"][0] = 1.0
     ends = np.array([0.0, flight.duration])
+    signals = {name: np.tile(row, (len(flight.time), 1)) for name, row in rows.items()}
+    series = {name: Series(ends, np.tile(row, (2, 1))) for name, row in rows.items()}
     return replace(
-        flight,
-        signals=dict(flight.signals)
-        | {name: np.zeros((len(flight.time), width)) for name, width in widths.items()},
-        series=dict(flight.series)
-        | {name: Series(ends, np.zeros((2, width))) for name, width in widths.items()},
+        flight, signals={**flight.signals, **signals}, series={**flight.series, **series}
     )
+
+
+def _with_body_rate(flight: Flight) -> Flight:
+    """Return a flight with a body rate: the attitude's change, where no gyro was recorded."""
+    if flight.has("body_rate"):
+        return flight
+    turns = flight.series["attitude"]
+    w, x, y, z = turns.values.T
+    dw, dx, dy, dz = np.gradient(turns.values, turns.time, axis=0).T
+    rate = 2.0 * np.column_stack(
+        [
+            w * dx - x * dw - y * dz + z * dy,
+            w * dy + x * dz - y * dw - z * dx,
+            w * dz - x * dy + y * dx - z * dw,
+        ]
+    )
+    return replace(flight, series={**flight.series, "body_rate": Series(turns.time, rate)})
 
 
 def sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:

@@ -17,6 +17,7 @@ FLOOR = {
     "body_rate": 1e-3,
     "rotor_speed": 0.3,
     "command": 2e-4,
+    "acceleration": 0.02,
 }
 
 

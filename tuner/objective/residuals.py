@@ -12,11 +12,15 @@ from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
+from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import moved, spun_up, trimmed
@@ -61,11 +65,16 @@ def fly(
         states=states,
         conditions=conditions,
     )
-    return trace_of(flown, model, segments)
+    return trace_of(flown, model, segments, conditions)
 
 
-def trace_of(flown: Rollout, model: Model, segments: Segments) -> Trace:
-    """Return what simulated segments are compared by."""
+def trace_of(
+    flown: Rollout,
+    model: Model,
+    segments: Segments,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> Trace:
+    """Return what simulated segments are compared by; ``conditions`` as of `simulate_segments`."""
     motion, markers = flown.log.motion, markers_of(model.vehicle)
     position, attitude = motion.position, motion.attitude
     if markers is not None:
@@ -77,6 +86,11 @@ def trace_of(flown: Rollout, model: Model, segments: Segments) -> Trace:
         "rotor_speed": flown.log.rotor_speed,
         "command": flown.log.command,
     }
+    if "acceleration" in segments.measured:
+        environment = environment_of(model, segments, conditions)
+        logged["acceleration"] = accelerometer(
+            model.vehicle, motion, flown.log.rotor_speed, environment, conditions
+        )
     return Trace(
         {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
     )
@@ -131,6 +145,23 @@ def simulate_segments(
         horizon=horizon,
         limits=limits,
     )
+
+
+def accelerometer(
+    vehicle: Vehicle,
+    motion: Motion,
+    rotor_speed: PerRotor,
+    environment: Environment,
+    biases: Mapping[str, Float[Array, " F"]],
+) -> tuple[Array, Array, Array]:
+    """Return what an accelerometer at the centre of mass reads, m/s² along the body's axes.
+
+    That is the specific force: all that acts but gravity, over the mass; plus its bias.
+    """
+    air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
+    pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
+    x, y, z = (getattr(pull, axis) + biases.get(f"accelerometer_{axis}", 0.0) for axis in "xyz")
+    return x, y, z
 
 
 def environment_of(

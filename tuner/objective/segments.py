@@ -33,7 +33,11 @@ CLOCK_OF = {
     "body_rate": 1,
     "rotor_speed": 1,
     "command": 1,
+    "acceleration": 1,
 }
+
+#: What comparisons are made of, whether or not it is fed in.
+POSE = ("position", "attitude")
 
 #: What a recording may get wrong by a constant: its clocks, in s, and its gyro, in rad/s.
 OFFSETS = tuple(recording_offsets())
@@ -117,6 +121,8 @@ def segments_of(
         A flight holds no reference.
     """
     schedule = Schedule() if schedule is None else schedule
+    silent = INLETS["reference"].silences
+    noise = {channel: sigma for channel, sigma in noise.items() if channel not in silent}
     for flight in flights:
         if not flight.has("reference_position"):
             raise RecordingError(
@@ -163,7 +169,7 @@ def window_segments(
     cut = [
         (number, window)
         for number, (flight, name) in enumerate(zip(flights, inlets, strict=True))
-        for window in windows_of(flight, seconds, fed=INLETS[name].fed)
+        for window in windows_of(flight, seconds, fed=INLETS[name].fed(flight))
     ]
     pieces = [window.flight for _, window in cut]
     start = start_of([piece.initial for piece in pieces], resting=False)
@@ -172,7 +178,7 @@ def window_segments(
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
-        if any(channel not in INLETS[name].silences for name in inlets)
+        if channel in POSE or any(channel not in INLETS[name].silences for name in inlets)
     }
     weights = {
         flight.name: dict((weights or {}).get(flight.name, {}))

@@ -12,7 +12,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
-from tuner.flights.flight import Flight, InitialState
+from tuner.flights.flight import Flight, InitialState, Series
 
 #: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1
@@ -93,10 +93,13 @@ def recent_command(flight: Flight, lag: float) -> NDArray[np.float64]:
     """Return the command (4,) that each rotor without tachometer has followed until time 0.
 
     It is averaged with a weight that falls by a factor e every ``lag`` s into the past; NaN for a
-    rotor whose speed was measured.
+    rotor whose speed was measured. Thrust set-points stand for commands that were not recorded.
     """
     command = np.full(4, np.nan)
     series = flight.series.get("command")
+    if series is None and "thrust_setpoint" in flight.series:
+        thrust = flight.series["thrust_setpoint"]
+        series = Series(thrust.time, np.repeat(thrust.values, 4, axis=1))
     if series is None:
         return command
     for rotor in np.flatnonzero(~np.isfinite(flight.initial.rotor_speed)):

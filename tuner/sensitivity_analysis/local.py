@@ -29,6 +29,7 @@ AXES = {
     "body_rate": (("x", "y", "z"), "rad/s", 1.0),
     "rotor_speed": (("1", "2", "3", "4"), "rad/s", 1.0),
     "command": (("1", "2", "3", "4"), "", 1.0),
+    "acceleration": (("x", "y", "z"), "m/s²", 1.0),
 }
 
 

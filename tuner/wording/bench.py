@@ -35,6 +35,10 @@ REMARKS: Mapping[str, str] = {
         "{explained:.0%} of what remains."
     ),
     "points": "{points:.0f} points.",
+    "explained": (
+        "The commands explain {roll:.0f}, {pitch:.0f} and {yaw:.0f} % of the angular acceleration "
+        "about x, y and z, and {thrust:.0f} % of the specific force along z."
+    ),
     "theory": (
         "Thrust coefficient {thrust_coefficient:.4f}, power coefficient {power_coefficient:.4f}; "
         "propellers on a vehicle differ from their table by tens of percent, which the standard "

@@ -123,6 +123,54 @@ TEXTS: Mapping[Code, tuple[str, str]] = {
         ),
         "Check its geometry (levers, arms, wires), its units and its calibration.",
     ),
+    Code.SETPOINTS_BIASED: (
+        "The recorded {first} rate set-points are {bias:+.3f} rad/s off the controller file's.",
+        "",
+    ),
+    Code.HEADING_FLOWN: (
+        (
+            "The recorded yaw rate set-points do not follow from the controller file (correlation "
+            "{correlation:.2f}): the heading was commanded otherwise, as by hand, so that the "
+            "reference says nothing of it."
+        ),
+        "Feed in its rate set-points (inlet: body_rate) if yaw matters.",
+    ),
+    Code.MOTOR_ORDER: (
+        (
+            "The recorded motors are not in the order of the vehicle file's rotors: how they turn "
+            "the vehicle makes them {names} of the columns that the topic map lists."
+        ),
+        "List the topic map's fields in that order.",
+    ),
+    Code.SPINS_REVERSED: (
+        "The recorded motors yaw the vehicle against the rotors' spins in the vehicle file.",
+        "Check the spins there, which motors drive which rotors, and the sign of the gyro's z.",
+    ),
+    Code.SCALES_WITH_MASS: (
+        (
+            "Without a pose the flights show {coefficients} over the mass alone; they hold for "
+            "{mass:g} kg, and go with it."
+        ),
+        "Weigh the vehicle (--mass): that, or one measured inertia, closes the scale.",
+    ),
+    Code.NO_TACHOMETER: (
+        (
+            "No rotor speed was recorded: the curve from command to rotor speed stays as it is, "
+            "and motor_constant goes with the inverse square of input_scaling."
+        ),
+        "One tachometer reading at a known command closes that; thrust and torque do not need it.",
+    ),
+    Code.YAW_OPEN: (
+        "The flights show moment_constant over inertia_zz, and not each of them.",
+        "Measure one of the two: a bifilar pendulum gives inertia_zz (tune bench).",
+    ),
+    Code.VEHICLE_NOT_GIVEN: (
+        (
+            "No vehicle was given, so that these flights were taken for its own: without a pose "
+            "mass and arms come from the vehicle file."
+        ),
+        "Give the vehicle with --vehicle, and what it weighs with --mass.",
+    ),
     Code.STARTS_DISAGREE: (
         "No two of {starts:.0f} starts ended in the same minimum; {second_search}.",
         "",
@@ -205,6 +253,47 @@ def _saturation_remedy(finding: Finding) -> str:
     return f"Set mixer.saturation_feedback: {flag} in the controller file."
 
 
+def _inlet_chosen(finding: Finding) -> str:
+    inlet, signal = finding.names
+    what = signal.replace("_", " ")
+    followed = {
+        "attitude": "its recorded attitude is followed and only its translation simulated",
+        "rotor_speed": "it is simulated from its rotor speeds",
+    }[inlet]
+    return (
+        f"The {what}, logged at {finding.numbers['recorded']:.0f} Hz, does not explain how the "
+        f"vehicle turned (correlation {finding.numbers['correlation']:.2f} with its angular "
+        f"acceleration), so that {followed}."
+    )
+
+
+def _inlet_remedy(finding: Finding) -> str:
+    _, signal = finding.names
+    return f"Log the {signal.replace('_', ' ')} as often as its loop runs."
+
+
+def _setpoints_scaled(finding: Finding) -> str:
+    axis, law = finding.names
+    so = f", as those of the {law} law would be" if law else ""
+    factor = f"{finding.numbers['gain']:.1f}"
+    return f"The recorded {axis} rate set-points are {factor} times the controller file's{so}."
+
+
+def _setpoints_remedy(finding: Finding) -> str:
+    _, law = finding.names
+    if law:
+        return f"Set attitude.law: {law} in the controller file."
+    return "Check the gains of position and attitude control in the controller file."
+
+
+def _setpoints_foreign(finding: Finding) -> str:
+    alike = " and ".join(f"{value:.2f} in {axis}" for axis, value in finding.numbers.items())
+    return (
+        "The recorded rate set-points do not follow from reference, state and controller file "
+        f"(correlation {alike}): another controller flew, or another reference."
+    )
+
+
 def _flight_unmatched(finding: Finding) -> str:
     multiples = ", ".join(
         f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
@@ -221,12 +310,20 @@ SENTENCES: Mapping[Code, Callable[[Finding], str]] = {
     Code.SALVAGED: _salvaged,
     Code.SATURATION_FEEDBACK: _saturation_feedback,
     Code.FLIGHT_UNMATCHED: _flight_unmatched,
+    Code.INLET_CHOSEN: _inlet_chosen,
+    Code.SETPOINTS_SCALED: _setpoints_scaled,
+    Code.SETPOINTS_FOREIGN: _setpoints_foreign,
 }
 REMEDIES: Mapping[Code, Callable[[Finding], str]] = {
     Code.RECORDING: lambda _: "",
     Code.LEFT_OUT: lambda finding: as_sentence(finding.names[1]),
     Code.SALVAGED: lambda _: "Record the flight again if what was lost matters.",
     Code.SATURATION_FEEDBACK: _saturation_remedy,
+    Code.INLET_CHOSEN: _inlet_remedy,
+    Code.SETPOINTS_SCALED: _setpoints_remedy,
+    Code.SETPOINTS_FOREIGN: lambda _: (
+        "Give the controller that flew (--controller), or enter below it (inlet: body_rate)."
+    ),
     Code.FLIGHT_UNMATCHED: lambda _: (
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ."
     ),

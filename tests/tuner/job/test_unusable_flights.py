@@ -70,20 +70,23 @@ def test_a_flight_most_of_whose_commands_are_corrupt_is_left_out_by_name(flight,
         read_usable(holding)
 
 
-def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated):
+def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated, flight):
     names = space_of(
-        updated, ControllerFile(), JobFile(), bypassed=bypassed_by(["rotor_speed"])
+        updated, ControllerFile(), JobFile(), bypassed=bypassed_by(["rotor_speed"], [flight])
     ).names
     assert {"inertia_xx", "motor_constant", "moment_constant"} <= set(names)
     assert not set(names) & set(INLETS["rotor_speed"].bypasses)
-    assert bypassed_by(["rotor_speed", "reference"]) == frozenset()
-    assert bypassed_by(["rotor_speed", "actuator"]) == {"estimate_latency", "gyro_cutoff"}
+    assert bypassed_by(["rotor_speed", "reference"], [flight] * 2) == frozenset()
+    assert bypassed_by(["rotor_speed", "actuator"], [flight] * 2) == {
+        "estimate_latency",
+        "gyro_cutoff",
+    }
     with pytest.raises(ConfigError, match="leaves no coefficient that acts"):
         space_of(
             updated,
             ControllerFile(),
             JobFile(free=("input_scaling",)),
-            bypassed=bypassed_by(["rotor_speed"]),
+            bypassed=bypassed_by(["rotor_speed"], [flight]),
         )
 
 

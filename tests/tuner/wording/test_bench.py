@@ -2,12 +2,14 @@ import re
 from pathlib import Path
 
 import tuner.bench
+import tuner.inertial
 from tuner.bench.bench_json import ExperimentRecord, RemarkRecord
 from tuner.wording.bench import REMARKS, numbers_in_words, remarks_in_words
 
 
 def test_every_remark_has_a_sentence():
-    sources = Path(tuner.bench.__file__).parent.glob("*.py")
+    folders = [Path(package.__file__).parent for package in (tuner.bench, tuner.inertial)]
+    sources = [path for folder in folders for path in folder.glob("*.py")]
     codes = {code for path in sources for code in re.findall(r'Remark\("(\w+)"', path.read_text())}
     assert codes == set(REMARKS)
 

@@ -30,6 +30,33 @@ MADE = {
     Code.SPARSE_INPUT: Finding(
         Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
     ),
+    Code.INLET_CHOSEN: Finding(
+        Code.INLET_CHOSEN,
+        "info",
+        "a",
+        {"correlation": 0.02, "recorded": 45, "gyro": 49},
+        ("attitude", "command"),
+    ),
+    Code.SETPOINTS_SCALED: Finding(
+        Code.SETPOINTS_SCALED,
+        "warning",
+        "a",
+        {"gain": 2.0, "correlation": 0.98},
+        ("roll", "rotation_matrix"),
+    ),
+    Code.SETPOINTS_BIASED: Finding(Code.SETPOINTS_BIASED, "info", "a", {"bias": 0.08}, ("pitch",)),
+    Code.SETPOINTS_FOREIGN: Finding(
+        Code.SETPOINTS_FOREIGN, "warning", "a", {"roll": 0.1, "pitch": 0.2}
+    ),
+    Code.HEADING_FLOWN: Finding(Code.HEADING_FLOWN, "warning", "a", {"correlation": 0.1}),
+    Code.MOTOR_ORDER: Finding(Code.MOTOR_ORDER, "warning", "a", names=("2", "4", "1", "3")),
+    Code.SPINS_REVERSED: Finding(Code.SPINS_REVERSED, "warning", "a"),
+    Code.SCALES_WITH_MASS: Finding(
+        Code.SCALES_WITH_MASS, "info", "mass", {"mass": 0.03}, ("motor_constant", "inertia_xx")
+    ),
+    Code.NO_TACHOMETER: Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
+    Code.YAW_OPEN: Finding(Code.YAW_OPEN, "info", "inertia_zz"),
+    Code.VEHICLE_NOT_GIVEN: Finding(Code.VEHICLE_NOT_GIVEN, "warning", "hovergames"),
     Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
     Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),
     Code.IMPLAUSIBLE_BOUNDS: Finding(

@@ -1,0 +1,123 @@
+"""Flights without a pose: what gyro, accelerometer and commands say agrees with what flew."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.tuner.flights.micro_sd import log_of
+from tuner.config import (
+    ControllerFile,
+    Options,
+    TrajectorySettings,
+    read_vehicle,
+    settle,
+    values_of,
+    with_values,
+)
+from tuner.errors import RecordingError
+from tuner.findings import Code
+from tuner.flights.inertial import read_inertial
+from tuner.job.inertial import fit_without_pose, without_pose
+from tuner.result import BEST_FIT_FILE
+from tuner.simulation.simulate import simulate
+
+LATENCY = 0.004
+WRONG = {"motor_constant": 1.3, "inertia_xx": 0.7, "inertia_yy": 1.2, "time_constant_up": 2.0}
+SHOWN = ("motor_constant", "inertia_xx", "inertia_yy", "time_constant_up", "time_constant_down")
+G = 9.80665
+ORDER = (1, 3, 4, 2)
+"""Where the Crazyflie's motors m1 to m4 stand in PX4's order, from 1."""
+
+
+@pytest.fixture(scope="module")
+def flown(updated):
+    return with_values(updated, {"actuator_latency": LATENCY})
+
+
+@pytest.fixture(scope="module")
+def simulation(flown):
+    shape = TrajectorySettings(name="lemniscate", radius=1.0, omega=1.0, speed_scale=4.0)
+    return next(iter(simulate(flown, ControllerFile(), shape, duration=14.0, rate=400.0)))
+
+
+def log_file(simulation, path, *, order=ORDER):
+    """Write what a Crazyflie's memory card would hold, noise included, and nothing of the pose."""
+    generator, signals = np.random.default_rng(3), simulation.signals
+    rate = np.degrees(signals["body_rate"]) + generator.normal(0.0, 0.1, (len(simulation.time), 3))
+    force = signals["acceleration"] / G + generator.normal(0.0, 0.02, rate.shape)
+    columns = {f"gyro.{axis}": ("f", rate[:, i]) for i, axis in enumerate("xyz")}
+    columns |= {f"acc.{axis}": ("f", force[:, i]) for i, axis in enumerate("xyz")}
+    for rotor, place in enumerate(order):
+        pwm = 65535 * signals["command"][:, rotor]
+        columns[f"motor.m{place}"] = ("I", pwm)
+    return log_of(simulation.time, dict(sorted(columns.items())), path)
+
+
+def settings_for(path, vehicle):
+    return settle(Options([str(path)], vehicle=vehicle))
+
+
+def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
+    truth = values_of(flown)
+    start = with_values(flown, {n: truth[n] * factor for n, factor in WRONG.items()})
+    path = log_file(simulation, tmp_path / "log00", order=(1, 3, 4, 2))
+    settings = settings_for(path, with_values(start, {"actuator_latency": 0.0}))
+    (flight,) = without_pose(settings)
+    assert flight.flying[0][1] > 13.0
+    fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
+    result = fitted.result.coefficients
+    for name in SHOWN:
+        error = result[name].std_error
+        assert error is not None, name
+        assert abs(result[name].best - truth[name]) < 3.0 * error, name
+        assert error < 0.25 * truth[name], name
+    assert abs(result["actuator_latency"].best - LATENCY) < 0.004
+    assert result["motor_constant"].best == pytest.approx(truth["motor_constant"], rel=0.02)
+    over = result["moment_constant"].best / result["inertia_zz"].best
+    assert over == pytest.approx(truth["moment_constant"] / truth["inertia_zz"], rel=0.03)
+    assert result["moment_constant"].std_error is None  # each by itself stays open
+    assert not result["mass"].fitted
+    codes = {finding.code for finding in fitted.result.findings}
+    assert codes == {Code.SCALES_WITH_MASS, Code.NO_TACHOMETER, Code.YAW_OPEN}
+    again = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
+    assert again["inertia_xx"] == result["inertia_xx"].best
+
+
+@pytest.mark.slow
+def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(simulation, flown, tmp_path):
+    path = log_file(simulation, tmp_path / "log00")
+    settings = settings_for(path, flown)
+    light = fit_without_pose(settings, without_pose(settings), out=tmp_path / "light")
+    settings = settings_for(path, flown.replace(mass=2.0 * flown.mass))
+    heavy = fit_without_pose(settings, without_pose(settings), out=tmp_path / "heavy")
+    for name in ("motor_constant", "inertia_xx", "inertia_yy"):
+        pair = [run.result.coefficients[name].best for run in (light, heavy)]
+        assert pair[1] / pair[0] == pytest.approx(2.0, rel=1e-6), name
+
+
+def test_commands_of_other_motors_are_refused_in_one_line(simulation, flown, tmp_path):
+    # motor 3 is logged where the map expects motor 1, and so on
+    path = log_file(simulation, tmp_path / "log00", order=(3, 1, 2, 4))
+    settings = settings_for(path, flown)
+    # the map lists m1, m3, m4, m2: the rotors from front right on are now m3, m1, m2, m4
+    with pytest.raises(RecordingError, match="2, 1, 4 and 3 of the columns that the topic map"):
+        fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_rotors_that_spin_the_other_way_are_noticed(simulation, flown, tmp_path):
+    rate = simulation.signals["body_rate"] * [1.0, 1.0, -1.0]
+    mirrored = replace(simulation, signals={**simulation.signals, "body_rate": rate})
+    settings = settings_for(log_file(mirrored, tmp_path / "log00"), flown)
+    with pytest.raises(RecordingError, match=r"(?s)yaw.*spins"):
+        fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+
+
+def test_a_log_on_the_ground_is_refused(tmp_path):
+    time = np.arange(2000) / 400
+    nothing = np.zeros(2000)
+    columns = {f"{kind}.{axis}": ("f", nothing) for kind in ("gyro", "acc") for axis in "xyz"}
+    columns |= {f"motor.m{i}": ("I", nothing) for i in range(1, 5)}
+    with pytest.raises(RecordingError, match="the motors only idle"):
+        read_inertial(log_of(time, columns, tmp_path / "log00"))

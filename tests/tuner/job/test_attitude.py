@@ -1,0 +1,130 @@
+"""A log too sparse to fly by: its attitude is followed; thrust, drag and battery come out of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.tuner.job.test_windows import stage_for
+from tuner.config import ControllerFile, JobFile, Options, settle, values_of, with_values
+from tuner.config.job import FlightSettings, Search
+from tuner.findings import Code
+from tuner.flights.flight import Series
+from tuner.job.prepare import job_of
+from tuner.job.search import search
+from tuner.objective.choice import choose_inlet
+from tuner.objective.inlets import TURNING
+from tuner.recordings import recordings_of
+from tuner.wording.findings import one_line
+
+EXPONENT = 0.8
+FULL = 16.6
+KEPT = ("position", "attitude", "velocity", "acceleration", "battery_voltage")
+WRONG = {"motor_constant": 1.15, "rotor_drag_coefficient": 0.6}
+FREE = (*WRONG, "battery_exponent")
+
+
+def every(series, hertz, *, late=0.0):
+    """Return a series read at a lower rate, by a logger that is out of step with it."""
+    time = np.arange(series.time[0] + late, series.time[-1], 1.0 / hertz)
+    place = np.searchsorted(series.time, time, side="right") - 1
+    return Series(time, series.values[place])
+
+
+def sparse_log(flight, vehicle):
+    """Return a flight as a slow logger keeps it, its battery running down.
+
+    The same rotor speeds at a falling voltage took commands that rise. Fast corrections against
+    gusts, which the vehicle does not show, hide in the commands what turned it.
+    """
+    command, motor = flight.series["command"], vehicle.motor
+    volts = FULL * (1.0 - 0.01 * (command.time - command.time[0]))
+    speed = motor.zero_position_armed + motor.input_scaling * command.values
+    needed = speed / ((volts / FULL) ** EXPONENT)[:, None]
+    raised = (needed - motor.zero_position_armed) / motor.input_scaling
+    roll, pitch = 0.02 * np.random.default_rng(5).normal(size=(2, len(raised), 1))
+    raised += roll * [-1, 1, 1, -1] + pitch * [-1, 1, -1, 1]
+    series = {name: flight.series[name] for name in KEPT if name in flight.series}
+    series |= {
+        "command": every(Series(command.time, raised), 45.0, late=0.004),
+        "body_rate": every(flight.series["body_rate"], 49.0, late=0.009),
+        "acceleration": every(flight.series["acceleration"], 49.0, late=0.009),
+        "battery_voltage": Series(command.time[::40], volts[::40, None]),
+    }
+    known = {"rotor_speed": np.full(4, np.nan)}
+    return replace(
+        flight,
+        name="sparse",
+        series=series,
+        signals={name: np.ones((len(flight.time), s.values.shape[1])) for name, s in series.items()}
+        | {"position": flight.signals["position"], "attitude": flight.signals["attitude"]},
+        initial=replace(flight.initial, **known),
+    )
+
+
+@pytest.fixture(scope="module")
+def sparse(full_flight, updated):
+    return sparse_log(full_flight, updated)
+
+
+def settings_of(vehicle, bag, **job):
+    settings = settle(Options([str(bag)], vehicle=vehicle, controller="hovergames"))
+    return replace(settings, job=JobFile(search=Search(method="gradient", window=1.0), **job))
+
+
+def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, updated):
+    choice = choose_inlet(sparse, "auto", updated, ControllerFile())
+    assert choice.inlet == "attitude"
+    assert choice.because.code is Code.INLET_CHOSEN
+    line = one_line(choice.because)
+    assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
+    assert "its recorded attitude is followed" in line
+    assert choose_inlet(sparse, "actuator", updated, ControllerFile()).inlet == "actuator"
+
+
+def test_auto_keeps_commands_that_explain_the_turns(full_flight, updated):
+    names = ("position", "attitude", "velocity", "body_rate", "command")
+    dense = replace(
+        full_flight,
+        series={name: full_flight.series[name] for name in names},
+        signals={name: full_flight.signals[name] for name in names},
+    )
+    assert choose_inlet(dense, "auto", updated, ControllerFile()).because is None
+    assert choose_inlet(dense, "auto", updated, ControllerFile()).inlet == "actuator"
+
+
+def test_thrust_drag_and_battery_come_back_from_a_sparse_log(sparse, updated, full_bag, tmp_path):
+    truth = values_of(updated) | {"battery_exponent": EXPONENT}
+    start = with_values(updated, {n: truth[n] * factor for n, factor in WRONG.items()})
+    # fast commands to rotors that rise faster than they fall would raise their mean speed
+    lag = {"time_constant_down": truth["time_constant_up"]}
+    start = with_values(start, lag).replace(battery={"reference_voltage": FULL})
+    settings = settings_of(start, full_bag, free=(*FREE, "inertia_xx"))
+    job = job_of(settings, recordings_of(settings, [sparse]))
+    assert job.inlets == ("attitude",)
+    assert job.space.names == FREE  # inertia does nothing here, and nobody fits it
+    assert not set(job.space.free) & set(TURNING)
+    assert "acceleration" in job.objective.segments.measured
+    fitted = search(job, tmp_path, resume=False, on_progress=lambda *_: None)
+    found = job.space.numbers(fitted.point.coefficients)
+    assert found["motor_constant"] == pytest.approx(truth["motor_constant"], rel=0.01)
+    assert found["battery_exponent"] == pytest.approx(EXPONENT, rel=0.05)
+    assert found["rotor_drag_coefficient"] == pytest.approx(
+        truth["rotor_drag_coefficient"], rel=0.05
+    )
+
+
+@pytest.mark.slow
+def test_flights_followed_in_attitude_share_a_fit_with_others(
+    sparse, full_flight, updated, full_bag
+):
+    flights = {full_flight.name: FlightSettings(inlet="actuator")}
+    settings = settings_of(updated, full_bag, flights=flights)
+    job = job_of(settings, recordings_of(settings, [full_flight, sparse]))
+    assert job.inlets == ("actuator", "attitude")
+    assert "inertia_xx" in job.space.names  # it acts on one of them
+    sums = job.objective.sums(job.objective.start(job.space.initial), stage_for(job))
+    followed = np.asarray(job.objective.segments.flight) == 1
+    by_inertia = np.abs(np.asarray(sums.gradient)[job.space.names.index("inertia_xx")])
+    assert np.all(by_inertia[followed] == 0.0)
+    assert np.all(by_inertia[~followed] > 0.0)

@@ -1,0 +1,68 @@
+"""Recorded rate set-points against those of the controller file: factor, delay, bias, heading."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuner.config import ControllerFile
+from tuner.findings import Code
+from tuner.flights.flight import Series
+from tuner.objective.choice import choose_inlet
+from tuner.objective.setpoints import match_setpoints, setpoint_findings
+from tuner.wording.findings import one_line
+
+OURS = ControllerFile()
+
+
+def with_setpoints(flight, change):
+    series = flight.series["rate_setpoint"]
+    changed = Series(series.time, change(series.values))
+    return replace(flight, series={**flight.series, "rate_setpoint": changed})
+
+
+def test_the_controller_that_flew_is_recognised(flight):
+    match = match_setpoints(flight, OURS)
+    assert match.is_ours
+    assert match.heading_is_ours
+    for axis in match.axes[:2]:
+        assert axis.gain == pytest.approx(1.0, abs=0.05)
+        assert axis.correlation > 0.98
+        assert abs(axis.bias) < 0.01
+    assert setpoint_findings(flight, OURS) == ()
+    assert choose_inlet(flight, "auto", None, OURS).inlet == "reference"
+
+
+def test_another_law_is_said_before_the_search(flight):
+    lee = OURS.replace(attitude=OURS.attitude.replace(law="rotation_matrix"))
+    findings = setpoint_findings(flight, lee)
+    assert {finding.code for finding in findings} == {Code.SETPOINTS_SCALED}
+    line = one_line(findings[0])
+    assert "roll rate set-points are 0.5 times the controller file's" in line
+    assert "as those of the quaternion law would be" in line
+
+
+def test_a_gain_and_a_bias_are_told_apart(flight):
+    tripled = with_setpoints(flight, lambda values: values * [1.0, 3.0, 1.0])
+    (finding,) = setpoint_findings(tripled, OURS)
+    assert (finding.code, finding.names) == (Code.SETPOINTS_SCALED, ("pitch", ""))
+    assert finding.numbers["gain"] == pytest.approx(3.0, rel=0.05)
+    (finding,) = setpoint_findings(with_setpoints(flight, lambda v: v + np.eye(3)[0] * 0.2), OURS)
+    assert (finding.code, finding.names) == (Code.SETPOINTS_BIASED, ("roll",))
+    assert finding.numbers["bias"] == pytest.approx(0.2, abs=0.01)
+
+
+def test_set_points_of_another_controller_enter_below_the_reference(flight):
+    foreign = with_setpoints(flight, lambda values: values[::-1] * [1.0, -1.0, 1.0])
+    choice = choose_inlet(foreign, "auto", None, OURS)
+    assert choice.inlet == "body_rate"
+    assert choice.because.code is Code.SETPOINTS_FOREIGN
+    assert choose_inlet(foreign, "reference", None, OURS).inlet == "reference"
+
+
+def test_a_heading_flown_by_hand_is_recognised(flight):
+    time = flight.series["rate_setpoint"].time
+    stick = 0.5 * np.sign(np.sin(1.3 * time))[:, None] * [0.0, 0.0, 1.0]
+    flown = with_setpoints(flight, lambda values: values * [1.0, 1.0, 0.0] + stick)
+    codes = [finding.code for finding in setpoint_findings(flown, OURS)]
+    assert codes == [Code.HEADING_FLOWN]

@@ -1,0 +1,1 @@
+"""What gyro, accelerometer and motor commands identify without a pose."""

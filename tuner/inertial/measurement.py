@@ -1,0 +1,158 @@
+"""A flight without a pose as a measurement of coefficients: what it says, and what it leaves open.
+
+Thrust over mass and torque over inertia are all that specific force and body rate show. With the
+weighed mass and the vehicle file's curve of rotor speed over command, that is the motor constant
+and two moments of inertia; about z the moment constant over the third. Without a tachometer the
+curve stays as it is, and the motor constant goes with the inverse square of its scale.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tuner.bench.measurement import Curve, Measurement, Remark
+from tuner.config import ControllerFile, VehicleFile
+from tuner.errors import RecordingError
+from tuner.flights.flight import Array
+from tuner.flights.inertial import InertialFlight
+from tuner.inertial.fit import OUTPUTS, Response, fit_response
+from tuner.inertial.signals import SLOWEST, stretches_of
+from tuner.model import model_of
+from tuner.objective.explained import levers
+from tuner.objective.motor_order import order_findings
+from tuner.wording.findings import remedy, sentence
+from tuner.wording.phrases import clause
+
+NUMBERS = (
+    ("time_constant_up",),
+    ("time_constant_down",),
+    ("actuator_latency",),
+    ("motor_constant", "inertia_xx"),
+    ("motor_constant", "inertia_yy"),
+    ("motor_constant", "moment_constant", "inertia_zz"),
+    ("motor_constant",),
+)
+"""The coefficients of each number of a `Response`: inertias divide, the others multiply."""
+ENOUGH = 0.1
+"""Share of an output's variance below which nothing is taken from it."""
+DIM = 0.5
+"""Relative standard error from which a gain says nothing."""
+TITLES = {
+    "roll": "angular acceleration about x, rad/s²",
+    "pitch": "angular acceleration about y, rad/s²",
+    "yaw": "angular acceleration about z, rad/s²",
+    "thrust": "specific force along z, m/s²",
+}
+
+
+def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measurement:
+    """Return what a flight without a pose says of a vehicle of known mass and geometry.
+
+    Raises
+    ------
+    RecordingError
+        It was logged too slowly or flown too short, or its commands turn the vehicle the other way.
+    """
+    stretches = stretches_of(flight.series, flight.flying)
+    if not stretches:
+        raise RecordingError(
+            flight.path,
+            "holds no pose, and its gyro, accelerometer and commands are too slow or too short to "
+            "be fitted without one",
+            f"log them at {SLOWEST:.0f} Hz or more for some seconds of flight",
+        )
+    longest = max(flight.flying, key=lambda span: span[1] - span[0])
+    for finding in order_findings(flight.name, flight.series, vehicle, longest):
+        raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
+    arms = levers(vehicle)
+    motor = model_of(vehicle, ControllerFile()).vehicle.motor
+    response = fit_response(stretches, motor, arms)
+    used = _used(response)
+    wrong = [name for name in used if name in OUTPUTS and response.gains[name] <= 0.0]
+    if wrong:
+        raise RecordingError(
+            flight.path,
+            f"its commands turn the vehicle against the vehicle file in {', '.join(wrong)}",
+            "check the motor order in the topic map, and the rotors' spins in the vehicle file",
+        )
+    return _measurement(flight.name, response, used, vehicle)
+
+
+def _used(response: Response) -> tuple[str, ...]:
+    """Return the names of the numbers that the flight shows at all."""
+    error = dict(zip(response.names, np.sqrt(np.diag(response.covariance)), strict=True))
+    shown = {
+        name
+        for name in OUTPUTS
+        if response.explained[name] > ENOUGH and error[name] < DIM * abs(response.gains[name])
+    }
+    lags = {name for name in ("up", "down") if error[name] < DIM} | {"late"}
+    return tuple(name for name in response.names if name in shown | lags)
+
+
+def _measurement(
+    name: str, response: Response, used: Sequence[str], vehicle: VehicleFile
+) -> Measurement:
+    lags, gains = response.lags, response.gains
+    values = {
+        "up": math.log(lags.up),
+        "down": math.log(lags.down),
+        "late": lags.late,
+        "roll": math.log(max(gains["roll"], 1e-300)),
+        "pitch": math.log(max(gains["pitch"], 1e-300)),
+        "yaw": math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
+        "thrust": math.log(max(gains["thrust"] * vehicle.mass, 1e-300)),
+    }
+    places = [response.names.index(number) for number in used]
+    # gains enter by their logarithms
+    slope = np.array([1.0 / gains[number] if number in OUTPUTS else 1.0 for number in used])
+    covariance = response.covariance[np.ix_(places, places)] * np.outer(slope, slope)
+    rows = [
+        {c: -1.0 if c.startswith("inertia") else 1.0 for c in NUMBERS[place]} for place in places
+    ]
+    return Measurement(
+        experiment=name,
+        rows=tuple(rows),
+        value=np.array([values[number] for number in used]),
+        covariance=covariance,
+        remarks=(
+            Remark("explained", {name: 100.0 * response.explained[name] for name in OUTPUTS}),
+        ),
+        curves=tuple(_curve(response, output) for output in OUTPUTS),
+    )
+
+
+def _curve(response: Response, output: str) -> Curve:
+    measured, modelled = response.curves[output]
+    everything = np.ones(len(measured), dtype=np.bool_)
+    return Curve(
+        TITLES[output],
+        "time, s",
+        TITLES[output].split(", ")[0],
+        response.time,
+        measured,
+        everything,
+        response.time,
+        modelled,
+    )
+
+
+def agreeing(
+    measurements: Sequence[Measurement], chi_square: float, freedom: int
+) -> tuple[Measurement, ...]:
+    """Return the measurements with covariances as wide as their disagreement (Birge ratio).
+
+    Batteries, propellers and air differ from flight to flight by more than one flight shows.
+    """
+    ratio = chi_square / freedom if freedom > 0 else 1.0
+    if ratio <= 1.0:
+        return tuple(measurements)
+    return tuple(replace(m, covariance=_scaled(m.covariance, ratio)) for m in measurements)
+
+
+def _scaled(covariance: Array, ratio: float) -> Array:
+    return np.asarray(covariance * ratio)

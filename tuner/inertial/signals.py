@@ -1,0 +1,103 @@
+"""Gyro, accelerometer and commands on one clock, in the band in which rotors turn a vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from tuner.flights.flight import Array, Series
+
+CUTOFF = 30.0
+"""Hz of the low-pass that measured and modelled signals pass alike: above it are propellers' and
+frames' vibrations, below it what motors of tens of ms can follow."""
+FASTEST = 1000.0
+"""Hz of the common clock, at most."""
+SLOWEST = 4.0 * CUTOFF
+"""Hz below which a log does not show the band."""
+TRIMMED = 0.5
+"""s at both ends of a stretch that are left out: take-off, landing and the filters' ends."""
+BLOCK = 1.0
+"""s, longer than residuals are alike: the standard errors count such blocks, not samples."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A stretch of flight, uniformly sampled.
+
+    Attributes
+    ----------
+    time
+        (n,) s.
+    body_rate
+        (n, 3) rad/s.
+    force
+        (n, 3) m/s², the specific force that the accelerometer shows.
+    command
+        (n, 4) 0..1.
+    """
+
+    time: Array
+    body_rate: Array
+    force: Array
+    command: Array
+
+    @property
+    def step(self) -> float:
+        """The s between two samples."""
+        return float(self.time[1] - self.time[0])
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Which samples are far enough from the ends to be compared."""
+        ends = self.time[0] + TRIMMED, self.time[-1] - TRIMMED
+        return np.asarray((self.time > ends[0]) & (self.time < ends[1]), dtype=np.bool_)
+
+
+def stretches_of(
+    series: Mapping[str, Series], flying: tuple[tuple[float, float], ...]
+) -> tuple[Stretch, ...]:
+    """Return the stretches in the air on the clock of the slowest of the three signals."""
+    names = ("body_rate", "acceleration", "command")
+    rate = min(FASTEST, *(1.0 / float(np.median(np.diff(series[name].time))) for name in names))
+    if rate < SLOWEST:
+        return ()
+    stretches = []
+    for begin, end in flying:
+        count = int((end - begin) * rate)
+        if count > 4 * TRIMMED * rate:
+            time = begin + np.arange(count) / rate
+            stretches.append(Stretch(time, *(_on(time, series[name]) for name in names)))
+    return tuple(stretches)
+
+
+def smoothed(values: Array, step: float) -> Array:
+    """Return (n, k) values without what is above the band, not delayed."""
+    sections = signal.butter(2, CUTOFF, fs=1.0 / step, output="sos")
+    return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
+
+
+def derivative(values: Array, step: float) -> Array:
+    """Return the derivative in time of (n, k) values in the band."""
+    return np.asarray(np.gradient(smoothed(values, step), step, axis=0))
+
+
+def blocks_of(stretches: tuple[Stretch, ...]) -> NDArray[np.int64]:
+    """Return for every compared sample of all stretches the number of its block."""
+    numbers, first = [], 0
+    for stretch in stretches:
+        inside = stretch.time[stretch.inside]
+        block = first + ((inside - inside[0]) / BLOCK).astype(np.int64)
+        numbers.append(block)
+        first = int(block[-1]) + 1
+    return np.concatenate(numbers)
+
+
+def _on(time: Array, series: Series) -> Array:
+    known = np.isfinite(series.values).all(axis=1)
+    return np.column_stack(
+        [np.interp(time, series.time[known], column) for column in series.values[known].T]
+    )

@@ -1,0 +1,113 @@
+"""A fit of flights without motion capture: gyro, accelerometer and motor commands alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from tuner.bench.combine import combine
+from tuner.config import Settings, values_of
+from tuner.errors import RecordingError
+from tuner.findings import Code, Finding
+from tuner.flights.inertial import InertialFlight, read_inertial
+from tuner.inertial.measurement import agreeing, measure_inertial
+from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
+from tuner.job.folder import folder_for
+from tuner.job.listener import SILENT, Listener
+
+BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
+"""What a flight without a pose gives over the mass."""
+
+
+def without_pose(settings: Settings) -> tuple[InertialFlight, ...]:
+    """Return the flights of a job, if none of its recordings holds a pose; else none of them.
+
+    Raises
+    ------
+    RecordingError
+        Some recordings hold a pose and others do not.
+    """
+    job = settings.job
+    read = {
+        path: read_inertial(path, topics=job.topics, namespace=job.namespace)
+        for path in map(Path, settings.flights)
+    }
+    bare = {path: flight for path, flight in read.items() if flight is not None}
+    if bare and len(bare) < len(read):
+        raise RecordingError(
+            next(iter(bare)),
+            "holds no pose, others do",
+            "fit those without one by themselves, and give the result folder with --bench",
+        )
+    return tuple(bare.values())
+
+
+def fit_without_pose(
+    settings: Settings,
+    flights: Sequence[InertialFlight],
+    *,
+    out: Path | None = None,
+    listener: Listener = SILENT,
+    command: str = "",
+) -> BenchResult:
+    """Estimate coefficients from flights without a pose and write a result folder.
+
+    Parameters
+    ----------
+    settings
+        Of the job; its vehicle is of the weighed mass.
+    flights
+        At least one.
+    out
+        Result folder; None makes one under ``runs/`` named by the time.
+    listener
+        Whom to report to.
+    command
+        What the user typed, for the record.
+
+    Raises
+    ------
+    InputError
+        A flight cannot be used; nothing was written.
+    OutputError
+        The result folder cannot be written to.
+    """
+    began = time.perf_counter()
+    start, folder = settings.vehicle, folder_for(out)
+    measured = []
+    for flight in flights:
+        listener.on_message(f"{flight.name}: fitting body rate and specific force without a pose.")
+        measured.append(measure_inertial(flight, start))
+    known = known_of(start)
+    alone = combine(measured, known)
+    measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
+    combination = combine(measurements, known)
+    vehicle = vehicle_of(Path(flights[0].path), start, combination)
+    return written(
+        folder,
+        start,
+        vehicle.replace(name=f"{start.name}_inertial"),
+        measurements,
+        combination,
+        findings=(*_left_open(settings, combination.names), *conflicts_of(combination)),
+        settings={"command": command, "origin": dict(settings.origin)},
+        source={"flights": ", ".join(flight.name for flight in flights)},
+        header=f"From flights without a pose; the rest as in {start.name}.",
+        began=began,
+    )
+
+
+def _left_open(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Return what such flights leave open, and which number closes it."""
+    vehicle, scaled = settings.vehicle, tuple(name for name in BY_MASS if name in names)
+    mass = {"mass": values_of(vehicle)["mass"]}
+    findings = [
+        Finding(Code.SCALES_WITH_MASS, "info", "mass", mass, scaled),
+        Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
+    ]
+    if "moment_constant" in names:
+        findings.append(Finding(Code.YAW_OPEN, "info", "inertia_zz"))
+    if settings.origin.get("vehicle", "").startswith("default"):
+        findings.insert(0, Finding(Code.VEHICLE_NOT_GIVEN, "warning", vehicle.name))
+    return tuple(findings)

@@ -1,0 +1,91 @@
+"""Which inlet a recording can bear: seen from the data, and said why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from tuner.config import ControllerFile, VehicleFile
+from tuner.config.job import InletName
+from tuner.findings import Code, Finding
+from tuner.flights.flight import Flight
+from tuner.objective.explained import Explained, Source, explained
+from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.setpoints import match_setpoints, setpoint_findings
+
+EXPLAINS = 0.15
+"""Correlation of torque and angular acceleration about roll and pitch from which a recording of the
+rotors can be fed into a simulation that turns: real 100 Hz logs of commands that fly well have 0.3
+to 0.5, one at 41 Hz of a faster loop has 0.0."""
+
+REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
+FED_BY: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
+"""Inlet in which the simulated vehicle turns by what was recorded of its rotors -> that signal."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Where a flight enters the simulated loop.
+
+    Attributes
+    ----------
+    inlet
+        The place.
+    because
+        Why it is not the most upstream one whose signals were recorded; None if it is.
+    """
+
+    inlet: InletName
+    because: Finding | None = None
+
+
+def choose_inlet(
+    flight: Flight, requested: str, vehicle: VehicleFile, controller: ControllerFile
+) -> Choice:
+    """Return where a flight enters: as requested, or for ``auto`` as its recording can bear.
+
+    Parameters
+    ----------
+    flight
+        The recording.
+    requested
+        An inlet's name, or ``auto``.
+    vehicle, controller
+        Whose rotors turn it, and what commands them where the reference enters.
+
+    Raises
+    ------
+    RecordingError
+        The recording does not hold what the inlet needs.
+    """
+    first = inlet_for(flight, requested)
+    if requested == "auto" and first == "reference":
+        match = match_setpoints(flight, controller)
+        if match is not None and not match.is_ours:
+            (because,) = setpoint_findings(flight, controller)
+            below = replace(
+                flight, signals={n: s for n, s in flight.signals.items() if n not in REFERENCE}
+            )
+            return Choice(choose_inlet(below, "auto", vehicle, controller).inlet, because)
+    if requested != "auto" or first not in FED_BY:
+        return Choice(first)
+    doubt: Explained | None = None
+    for name, source in FED_BY.items():
+        if not INLETS[name].can_be_fed(flight):
+            continue
+        told = explained(flight, vehicle, source)
+        if told is None or told.tilting >= EXPLAINS:
+            return Choice(name, None if doubt is None else _finding(flight, name, doubt))
+        doubt = doubt or told
+    assert doubt is not None
+    if not INLETS["attitude"].can_be_fed(flight):
+        return Choice(first)
+    return Choice("attitude", _finding(flight, "attitude", doubt))
+
+
+def _finding(flight: Flight, inlet: InletName, doubt: Explained) -> Finding:
+    numbers = {
+        "correlation": round(doubt.tilting, 2) + 0.0,
+        "recorded": round(doubt.rate),
+        "gyro": round(doubt.gyro_rate),
+    }
+    return Finding(Code.INLET_CHOSEN, "info", flight.name, numbers, (inlet, doubt.source))

@@ -1,0 +1,148 @@
+"""How well what was recorded of the rotors explains how the vehicle turned.
+
+A multirotor's angular acceleration is its rotors' torque over its inertia. Where recorded commands,
+or rotor speeds, do not correlate with it, nothing that is fed by them can follow the attitude:
+they were logged too seldom for the loop that made them, or belong to other rotors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tuner.config import VehicleFile
+from tuner.flights.flight import Array, Flight, Series
+
+Source = Literal["command", "rotor_speed"]
+
+FASTEST = 250.0
+"""Hz at which signals are compared, at most."""
+LATEST = 0.06
+"""s by which a turn may follow a command: lag, latency and clocks."""
+SMOOTHED = 3
+"""Samples over which both are averaged against noise."""
+FEWEST = 100
+"""Samples below which nothing is said."""
+
+
+@dataclass(frozen=True)
+class Explained:
+    """What the rotors explain of a flight's angular acceleration.
+
+    Attributes
+    ----------
+    source
+        What was recorded of the rotors.
+    correlation
+        About body x, y and z, at the delay at which roll and pitch together are met best.
+    delay
+        s by which turns follow what was recorded.
+    rate, gyro_rate
+        Hz at which the rotors and the gyro were logged.
+    """
+
+    source: Source
+    correlation: tuple[float, float, float]
+    delay: float
+    rate: float
+    gyro_rate: float
+
+    @property
+    def tilting(self) -> float:
+        """The mean correlation about roll and pitch."""
+        return 0.5 * (self.correlation[0] + self.correlation[1])
+
+
+def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained | None:
+    """Return what a recorded signal of the rotors explains; None if too little was recorded."""
+    if not flight.has(source) or "body_rate" not in flight.series:
+        return None
+    clock = common_clock(flight.series, source, (0.0, flight.duration))
+    if clock is None:
+        return None
+    turning, torque = turning_and_torque(flight.series, vehicle, source, clock)
+    step = float(clock[1] - clock[0])
+    most = max(1, round(LATEST / step))
+    delays = [(delay, _correlation(turning, torque, delay)) for delay in range(-1, most + 1)]
+    delay, best = max(delays, key=lambda pair: pair[1][0] + pair[1][1])
+    return Explained(
+        source,
+        (best[0], best[1], best[2]),
+        delay * step,
+        _rate(flight.series[source]),
+        _rate(flight.series["body_rate"]),
+    )
+
+
+def common_clock(
+    series: Mapping[str, Series], source: Source, span: tuple[float, float]
+) -> Array | None:
+    """Return a uniform clock at the gyro's rate over what both signals cover of a span in s."""
+    gyro, rotors = series["body_rate"], series[source]
+    rate = min(FASTEST, _rate(gyro))
+    begin = max(span[0], gyro.time[0], rotors.time[0])
+    end = min(span[1], gyro.time[-1], rotors.time[-1])
+    count = int((end - begin) * rate)
+    return begin + np.arange(count) / rate if count >= FEWEST else None
+
+
+def turning_and_torque(
+    series: Mapping[str, Series], vehicle: VehicleFile, source: Source, clock: Array
+) -> tuple[Array, Array]:
+    """Return angular acceleration (n, 3) in rad/s² and torque (n, 3) over motor_constant."""
+    gyro, rotors = series["body_rate"], series[source]
+    rates = smoothed(values_on(clock, gyro))
+    turning = np.gradient(rates, clock, axis=0)
+    squares = squared_speed(vehicle, source, values_on(clock, rotors))
+    return turning, smoothed(squares) @ levers(vehicle)
+
+
+def squared_speed(vehicle: VehicleFile, source: Source, values: Array) -> Array:
+    """Return squared rotor speeds, (rad/s)², of commands by the vehicle's curve, or of speeds."""
+    if source == "rotor_speed":
+        return np.square(values)
+    motor = vehicle.motor
+    command = values + motor.input_offset
+    speed = motor.zero_position_armed + (motor.input_scaling + motor.quadratic * command) * command
+    return np.square(speed)
+
+
+def levers(vehicle: VehicleFile) -> Array:
+    """Return (rotors, 3) moments about x, y and z in m of one newton of thrust at each rotor."""
+    drag = vehicle.aerodynamics.moment_constant
+    rows = []
+    for rotor in vehicle.rotors:
+        x, y, _ = rotor.position
+        rows.append((y, -x, -drag if rotor.spin == "ccw" else drag))
+    return np.array(rows)
+
+
+def smoothed(values: Array) -> Array:
+    """Return (n, k) values averaged over `SMOOTHED` samples."""
+    kernel = np.ones(SMOOTHED) / SMOOTHED
+    return np.stack([np.convolve(column, kernel, "same") for column in values.T], axis=1)
+
+
+def _correlation(turning: Array, torque: Array, delay: int) -> tuple[float, ...]:
+    late, early = turning[max(0, delay) :], torque[: len(torque) - max(0, delay)]
+    if delay < 0:
+        late, early = turning[:delay], torque[-delay:]
+    a, b = late - late.mean(axis=0), early - early.mean(axis=0)
+    size = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
+    return tuple(((a * b).sum(axis=0) / np.where(size > 0, size, np.inf)).tolist())
+
+
+def values_on(clock: Array, series: Series) -> Array:
+    """Return a signal (n, k), linear between its samples."""
+    columns = []
+    for column in series.values.T:
+        known = np.isfinite(column)
+        columns.append(np.interp(clock, series.time[known], column[known]))
+    return np.column_stack(columns)
+
+
+def _rate(series: Series) -> float:
+    return float(1.0 / np.median(np.diff(series.time)))

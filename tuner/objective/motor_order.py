@@ -1,0 +1,141 @@
+"""The order of recorded motors and the spins of their rotors, seen from how they turn the vehicle.
+
+Each rotor's thrust turns the vehicle about the two axes that it is off, and its drag about the
+third. Of the orders in which the recorded columns may stand, one makes a torque that looks like the
+angular acceleration; of the two senses of spin, one makes the yaw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+from scipy import signal
+
+from tuner.config import VehicleFile
+from tuner.findings import Code, Finding
+from tuner.flights.flight import Array, Series
+from tuner.objective.explained import (
+    Source,
+    common_clock,
+    levers,
+    smoothed,
+    squared_speed,
+    values_on,
+)
+
+LAGS = (0.005, 0.015, 0.03, 0.06)
+"""s of the rotors' lag that are tried."""
+SLOW = 2.0
+"""Hz below which turns are left out."""
+ENOUGH = 0.4
+"""Correlation about roll and pitch from which an order is believed."""
+CLEARER = 0.3
+"""By how much the next best order must be less alike."""
+
+
+@dataclass(frozen=True)
+class MotorOrder:
+    """How recorded columns stand to the rotors of a vehicle file.
+
+    Attributes
+    ----------
+    rotors
+        For each recorded column the number, from 0, of the rotor that it drives.
+    reversed_spins
+        Whether all rotors spin against the vehicle file; None where yaw does not show it.
+    """
+
+    rotors: tuple[int, ...]
+    reversed_spins: bool | None
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The recorded columns, from 1, in the order in which a topic map is to list them."""
+        return tuple(str(1 + self.rotors.index(rotor)) for rotor in range(len(self.rotors)))
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the columns are in the vehicle's order and its spins are not reversed."""
+        return self.rotors == tuple(range(len(self.rotors))) and not self.reversed_spins
+
+
+def motor_order(
+    series: Mapping[str, Series],
+    vehicle: VehicleFile,
+    source: Source,
+    span: tuple[float, float],
+) -> MotorOrder | None:
+    """Return which rotor each recorded column drives; None where the recording does not show it.
+
+    Parameters
+    ----------
+    series
+        Signals, among them ``body_rate`` and the source.
+    vehicle
+        Where its rotors sit, and how they spin.
+    source
+        What was recorded of the rotors.
+    span
+        s of the flight.
+    """
+    clock = common_clock(series, source, span)
+    if clock is None or len(vehicle.rotors) != 4:
+        return None
+    step = float(clock[1] - clock[0])
+    turning = np.gradient(smoothed(values_on(clock, series["body_rate"])), step, axis=0)
+    squares = squared_speed(vehicle, source, values_on(clock, series[source]))
+    if 0.5 / step < 4.0 * SLOW:
+        return None
+    turning = _without_slow(turning, step)
+    lagged = [_without_slow(_lagged(squares, step, lag), step) for lag in LAGS]
+    arms = levers(vehicle)
+    orders = list(permutations(range(4)))
+    alike_of = {
+        order: max(_alike(turning, x, arms[list(order)]) for x in lagged) for order in orders
+    }
+    best, second = sorted(orders, key=alike_of.__getitem__, reverse=True)[:2]
+    if alike_of[best] < ENOUGH or alike_of[second] > alike_of[best] - CLEARER:
+        return None
+    by_yaw = [_correlations(turning, x, arms[list(best)])[2] for x in lagged]
+    yaw = max(by_yaw, key=abs)
+    return MotorOrder(best, bool(yaw < 0.0) if abs(yaw) > ENOUGH else None)
+
+
+def order_findings(
+    name: str, series: Mapping[str, Series], vehicle: VehicleFile, span: tuple[float, float]
+) -> tuple[Finding, ...]:
+    """Return what is wrong with the order of a flight's commands, and with the spins."""
+    order = motor_order(series, vehicle, "command", span)
+    if order is None or order.is_right:
+        return ()
+    if order.fields != tuple(sorted(order.fields)):
+        return (Finding(Code.MOTOR_ORDER, "warning", name, names=order.fields),)
+    return (Finding(Code.SPINS_REVERSED, "warning", name),)
+
+
+def _alike(turning: Array, squares: Array, arms: Array) -> float:
+    """Return the lesser correlation of torque and angular acceleration about x and y."""
+    roll, pitch, _ = _correlations(turning, squares, arms)
+    return float(min(roll, pitch))
+
+
+def _correlations(turning: Array, squares: Array, arms: Array) -> Array:
+    torque = squares @ arms
+    size = np.sqrt((turning * turning).sum(axis=0) * (torque * torque).sum(axis=0))
+    return np.asarray((turning * torque).sum(axis=0) / np.maximum(size, 1e-300))
+
+
+def _without_slow(values: Array, step: float) -> Array:
+    """Return (n, k) values without the turns in which drag has a part: those of laps."""
+    sections = signal.butter(2, SLOW, "highpass", fs=1.0 / step, output="sos")
+    return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
+
+
+def _lagged(squares: Array, step: float, lag: float) -> Array:
+    decay = float(np.exp(-step / lag))
+    first = squares[0] * decay
+    filtered, _ = signal.lfilter([1.0 - decay], [1.0, -decay], squares, axis=0, zi=first[None])
+    return smoothed(np.asarray(filtered))

@@ -1,0 +1,208 @@
+"""What was flown, held against the controller file: set-points computed from the recorded state.
+
+Position and attitude control are functions of reference and state. Both were recorded, so that the
+controller file says which rate set-points they make; the recorded ones tell by what factor, how
+late and how far off they are. A wrong law or gain shows as a factor; an axis that was commanded
+otherwise, or another controller, as no likeness at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.control import attitude
+from sim_jax.control.gains import Controller
+from sim_jax.control.position import (
+    ReferencePoint,
+    attitude_from_acceleration,
+    heading_of,
+    wanted_acceleration,
+)
+from sim_jax.rotation import Quaternion
+from sim_jax.vector import Vec3
+from tuner.config import ControllerFile
+from tuner.findings import Code, Finding
+from tuner.flights.flight import Array, Flight, Series
+from tuner.model import controller_of
+from tuner.objective.inlets import linear_interpolation, zero_order_hold
+
+POINTS = 1024
+"""Set-points that are looked at, spread over a flight: one compiled program serves all."""
+LATENCIES = np.arange(0.0, 0.0801, 0.004)
+"""s by which the state that a controller sees may be old."""
+ALIKE = 0.5
+"""Correlation below which recorded set-points are not those of the controller file."""
+FACTOR = 1.4
+"""Ratio of recorded to computed set-points beyond which a gain or law is doubted."""
+OFF = 0.05
+"""rad/s of steady difference that is worth a word."""
+MOVES = 0.05
+"""rad/s of spread below which an axis was not commanded."""
+AXES = ("roll", "pitch", "yaw")
+
+
+@dataclass(frozen=True)
+class AxisMatch:
+    """How the recorded rate set-points of an axis stand to the computed ones.
+
+    Attributes
+    ----------
+    gain
+        Recorded over computed.
+    bias
+        rad/s, recorded minus gain times computed.
+    correlation
+        Of both.
+    spread
+        rad/s, standard deviation of the recorded ones.
+    """
+
+    gain: float
+    bias: float
+    correlation: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class SetpointMatch:
+    """The axes of a flight, and how old the state was that its controller saw.
+
+    Attributes
+    ----------
+    axes
+        Roll, pitch, yaw.
+    latency
+        s.
+    """
+
+    axes: tuple[AxisMatch, AxisMatch, AxisMatch]
+    latency: float
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether roll and pitch, where they were commanded, follow from the controller file."""
+        tilting = [axis for axis in self.axes[:2] if axis.spread > MOVES]
+        return all(axis.correlation > ALIKE and axis.gain > 0.0 for axis in tilting)
+
+    @property
+    def heading_is_ours(self) -> bool:
+        """Whether yaw, if it was commanded, follows from it too."""
+        yaw = self.axes[2]
+        return yaw.spread < 2.0 * MOVES or yaw.correlation > ALIKE
+
+
+def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch | None:
+    """Return how recorded rate set-points follow from reference and state; None without them.
+
+    A yaw spin is commanded otherwise by design, and is recognised elsewhere.
+    """
+    needed = ("reference_position", "reference_velocity", "rate_setpoint", "position", "attitude")
+    if not all(flight.has(name) for name in needed) or flight.yaw_rate_setpoint is not None:
+        return None
+    recorded = flight.series["rate_setpoint"]
+    inside = (recorded.time > 0.2) & (recorded.time < flight.duration - 0.2)
+    if inside.sum() < 50:
+        return None
+    chosen = np.linspace(0, inside.sum() - 1, POINTS).astype(np.intp)
+    time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
+    computed = _computed(flight, controller, time)
+    scores = [
+        _axis(wanted[:, 0], c[:, 0]).correlation + _axis(wanted[:, 1], c[:, 1]).correlation
+        for c in computed
+    ]
+    best = int(np.argmax(scores))
+    roll, pitch, yaw = (_axis(wanted[:, i], computed[best][:, i]) for i in range(3))
+    return SetpointMatch((roll, pitch, yaw), float(LATENCIES[best]))
+
+
+def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Finding, ...]:
+    """Return which axes of a flight were commanded with another gain, bias or heading."""
+    match = match_setpoints(flight, controller)
+    if match is None:
+        return ()
+    if not match.is_ours:
+        correlations = {
+            name: round(axis.correlation, 2)
+            for name, axis in zip(AXES[:2], match.axes[:2], strict=True)
+        }
+        return (Finding(Code.SETPOINTS_FOREIGN, "warning", flight.name, correlations),)
+    findings = []
+    for name, axis in zip(AXES, match.axes, strict=True):
+        if axis.spread < MOVES or axis.correlation < ALIKE:
+            continue
+        if not 1.0 / FACTOR < axis.gain < FACTOR:
+            numbers = {"gain": round(axis.gain, 2), "correlation": round(axis.correlation, 2)}
+            names = (name, _guess(axis.gain, controller))
+            findings.append(Finding(Code.SETPOINTS_SCALED, "warning", flight.name, numbers, names))
+        elif abs(axis.bias) > OFF:
+            numbers = {"bias": round(axis.bias, 3)}
+            findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, numbers, (name,)))
+    if not match.heading_is_ours:
+        numbers = {"correlation": round(match.axes[2].correlation, 2)}
+        findings.append(Finding(Code.HEADING_FLOWN, "warning", flight.name, numbers))
+    return tuple(findings)
+
+
+def _guess(gain: float, controller: ControllerFile) -> str:
+    """Return what would explain a factor: the other attitude law, or a gain."""
+    law = controller.attitude.law
+    if law == "quaternion" and abs(gain - 2.0) < 0.3:
+        return "rotation_matrix"
+    if law == "rotation_matrix" and abs(gain - 0.5) < 0.08:
+        return "quaternion"
+    return ""
+
+
+def _axis(recorded: Array, computed: Array) -> AxisMatch:
+    r, c = recorded - recorded.mean(), computed - computed.mean()
+    power, size = float(c @ c), float(np.sqrt((c @ c) * (r @ r)))
+    gain = float(c @ r) / power if power > 0.0 else 0.0
+    return AxisMatch(
+        gain=gain,
+        bias=float(recorded.mean() - gain * computed.mean()),
+        correlation=float(c @ r) / size if size > 0.0 else 0.0,
+        spread=float(recorded.std()),
+    )
+
+
+def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
+    """Return the set-points (latencies, n, 3) of the controller file at some times in s."""
+    then = (time[None] - LATENCIES[:, None]).ravel()
+    state = {
+        name: linear_interpolation(flight.series[name], then) for name in ("position", "attitude")
+    }
+    state["velocity"] = linear_interpolation(_velocity(flight), then)
+    now = np.tile(time, len(LATENCIES))
+    for name in ("reference_position", "reference_velocity", "reference_acceleration"):
+        series = flight.series.get(name)
+        held = np.zeros((len(now), 3)) if series is None else zero_order_hold(series, now)
+        state[name] = held
+    rates = _rates(controller_of(controller), {k: jnp.asarray(v.T) for k, v in state.items()})
+    return np.asarray(rates).T.reshape(len(LATENCIES), len(time), 3)
+
+
+@jax.jit
+def _rates(controller: Controller, state: Mapping[str, jax.Array]) -> jax.Array:
+    position, velocity = Vec3.of(state["position"]), Vec3.of(state["velocity"])
+    estimate = Quaternion.of(state["attitude"]).normalized()
+    point = ReferencePoint(
+        *(Vec3.of(state[f"reference_{name}"]) for name in ("position", "velocity", "acceleration"))
+    )
+    heading = heading_of(controller.position, velocity)
+    wanted = wanted_acceleration(controller.position, point, position, velocity, heading)
+    goal = attitude_from_acceleration(wanted, heading)
+    return attitude.rate_setpoint(controller.attitude, estimate, goal).stacked()
+
+
+def _velocity(flight: Flight) -> Series:
+    """Return the recorded velocity, or the position's change."""
+    known = flight.series.get("velocity")
+    if known is not None:
+        return known
+    place = flight.series["position"]
+    return Series(place.time, np.gradient(place.values, place.time, axis=0))
