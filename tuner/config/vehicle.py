@@ -140,8 +140,8 @@ class Battery(Section):
     ----------
     reference_voltage
         V at which a command asks for the speed of `Motor`; with ``battery_exponent``, it asks for
-        less as the recorded voltage falls below. None takes the largest that the fitted flights
-        recorded.
+        less as the recorded voltage falls below. None takes that of the fullest battery without
+        load.
     """
 
     reference_voltage: Positive | None = None

@@ -16,12 +16,13 @@ from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
-from tuner.objective.battery import VOLTAGE, require_voltage, with_reference_voltage
+from tuner.objective.battery import require_voltage, with_reference_voltage
 from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, segments_of, window_segments
 from tuner.objective.start import begins_gently
+from tuner.objective.voltage import VOLTAGE
 from tuner.recordings import Recording
 
 #: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust

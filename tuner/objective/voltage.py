@@ -1,0 +1,214 @@
+"""The battery's voltage as the motors meet it, from recordings that hold it.
+
+A motor's speed goes with its voltage (thesis 10.4). Voltmeters are read some ten times a second
+with some tens of millivolts of noise, a hundredth of which would be thrust if it were flown as it
+stands. What the voltage itself does is a slow decline, and a sag with the load: the current of a
+rotor goes with its power, the cube of its speed. The sag follows rotor speeds or motor commands,
+which are recorded often and well, and one resistance per set of flights is all that is estimated of
+it (a partially linear model, Speckman 1988); the decline is a smoothing spline whose stiffness is
+chosen by generalised cross-validation (Craven and Wahba 1979).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import make_smoothing_spline
+
+from tuner.flights.flight import Array as Numbers
+from tuner.flights.flight import Flight, Series
+
+VOLTAGE = "battery_voltage"
+OFTEN = 20.0
+"""Hz to which faster readings are averaged first."""
+FEWEST = 5
+"""Readings that a smoothing spline needs; fewer are joined by lines."""
+TREND = 10.0
+"""s, the load's sag is what varies faster than such a polynomial trend follows."""
+SURE = 3.0
+"""Standard errors by which a resistance differs from none."""
+IDLE = 0.1
+"""Rotor speed at no command over that at full command, as armed motors idle (thesis 5.2)."""
+LAG = 0.03
+"""s by which rotors follow their commands, about; the sag follows the rotors."""
+SPIKE = 3.0
+"""Robust standard deviations of the load beyond which a reading does not speak of the resistance:
+a meter that reads ten times a second misses what a saturated command does."""
+
+
+@dataclass(frozen=True)
+class Voltage:
+    """A battery's voltage over a flight, without its meter's noise.
+
+    Attributes
+    ----------
+    time
+        (n,) s.
+    volts, without_load
+        (n,) V at the terminals, and what they would be if no rotor turned.
+    """
+
+    time: Numbers
+    volts: Numbers
+    without_load: Numbers
+
+
+def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
+    """Return each flight's voltage, None where it was not recorded.
+
+    All flights share one resistance, in V per unit of load; where they do not show that the voltage
+    falls with the load, the decline alone is smoothed.
+    """
+    readings = [
+        _averaged(flight.series[VOLTAGE]) if flight.has(VOLTAGE) else None for flight in flights
+    ]
+    loads = _loads(flights)
+    resistance = _resistance(
+        [
+            (reading, load)
+            for reading, load in zip(readings, loads, strict=True)
+            if reading is not None and load is not None
+        ]
+    )
+    return [
+        None if reading is None else _smoothed(reading, load, resistance)
+        for reading, load in zip(readings, loads, strict=True)
+    ]
+
+
+def _loads(flights: Sequence[Flight]) -> list[Series | None]:
+    """Return the mean cube of each flight's rotor speeds, or of its motor commands, over time.
+
+    Rotor speeds where all rotors of all flights were recorded. Over the mean of all flights, so
+    that a load (n, 1) is about one; None where a flight holds neither.
+    """
+    for signal in ("rotor_speed", "command"):
+        cubes = [_mean_cube(flight, signal) for flight in flights]
+        known = [cube for cube in cubes if cube is not None]
+        if known and (signal == "command" or len(known) == len(flights)):
+            mean = float(np.mean(np.concatenate([cube.values for cube in known])))
+            return [cube and Series(cube.time, cube.values / mean) for cube in cubes]
+    return [None] * len(flights)
+
+
+def _mean_cube(flight: Flight, signal: str) -> Series | None:
+    """Return the mean over the rotors (n, 1) of the cube of speeds, where all were recorded.
+
+    Motor commands are followed as rotors follow them.
+    """
+    if not flight.has(signal):
+        return None
+    series = flight.series[signal]
+    known = np.isfinite(series.values).all(axis=1)
+    time, speeds = series.time[known], np.abs(series.values[known])
+    if signal == "command" and len(time):
+        speeds = _followed(time, speeds + IDLE)
+    cubes = np.mean(speeds**3, axis=1, keepdims=True)
+    return Series(time, cubes) if cubes.sum() > 0.0 else None
+
+
+def _followed(time: Numbers, values: Numbers) -> Numbers:
+    """Return values (n, k) that held between stamps, after a first-order lag of `LAG`."""
+    followed = values.copy()
+    keep = np.exp(-np.diff(time) / LAG)[:, None]
+    for row in range(1, len(values)):
+        followed[row] = values[row - 1] + keep[row - 1] * (followed[row - 1] - values[row - 1])
+    return followed
+
+
+def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:
+    """Return by how many V the voltage falls per unit of load, from readings and loads.
+
+    Each flight's decline is a polynomial that both are cleared of; zero where the fall does not
+    exceed its standard error for sure.
+    """
+    falls, varied = [np.empty(0)], [np.empty(0)]
+    for reading, load in pairs:
+        drawn = np.interp(reading.time, load.time, _charge(load))
+        trend = _polynomials(drawn, drawn, _order(reading.time))
+        if len(reading.time) < trend.shape[1] + FEWEST:
+            continue
+        there = np.interp(reading.time, load.time, load.values[:, 0])
+        both = np.stack([reading.values[:, 0], there], axis=1)
+        left = both - trend @ np.linalg.lstsq(trend, both, rcond=None)[0]
+        spread = 1.4826 * np.median(np.abs(left[:, 1]))
+        calm = np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12)
+        falls.append(-left[calm, 0])
+        varied.append(left[calm, 1])
+    fall, vary = np.concatenate(falls), np.concatenate(varied)
+    information = float(vary @ vary)
+    if not information > 0.0:
+        return 0.0
+    resistance = float(vary @ fall) / information
+    error = np.sqrt(np.mean((fall - resistance * vary) ** 2) / information)
+    return resistance if resistance > SURE * error else 0.0
+
+
+def _smoothed(reading: Series, load: Series | None, resistance: float) -> Voltage:
+    """Return a voltage without most of its noise, on the load's stamps where they count."""
+    if load is None or resistance == 0.0:
+        decline = _spline(reading.time, reading.values[:, 0])(reading.time)
+        return Voltage(reading.time, decline, decline)
+    sag = resistance * load.values[:, 0]
+    without = reading.values[:, 0] + np.interp(reading.time, load.time, sag)
+    decline = _spline(reading.time, without)(np.clip(load.time, reading.time[0], reading.time[-1]))
+    return Voltage(load.time, decline - sag, decline)
+
+
+def _charge(load: Series) -> Numbers:
+    """Return the load's integral (n,): a battery declines by the charge that was drawn."""
+    means = 0.5 * (load.values[1:, 0] + load.values[:-1, 0])
+    return np.concatenate([[0.0], np.cumsum(means * np.diff(load.time))])
+
+
+def _order(time: Numbers) -> int:
+    """Return the largest degree of a decline over some time."""
+    return 1 + int(np.ceil(float(np.ptp(time)) / TREND))
+
+
+def _polynomials(span: Numbers, at: Numbers, order: int) -> Numbers:
+    """Return Legendre's polynomials over a span, at places clipped to it, (m, order + 1)."""
+    middle, half = 0.5 * (span[0] + span[-1]), max(0.5 * (span[-1] - span[0]), 1e-9)
+    place = np.clip((at - middle) / half, -1.0, 1.0)
+    return np.asarray(np.polynomial.legendre.legvander(place, order))
+
+
+def _polynomial(span: Numbers, values: Numbers, at: Numbers, order: int) -> Numbers:
+    """Return, at other places, the polynomial through noisy values whose degree they support.
+
+    That of the least n·log(sum of squares) + degree·log(n), the Bayesian information criterion.
+    """
+    count = len(span)
+    basis = _polynomials(span, span, max(0, min(order, count - FEWEST)))
+    left, best, chosen = values.astype(float), np.inf, np.zeros(1)
+    orthogonal, triangle = np.linalg.qr(basis)
+    shares = orthogonal.T @ values
+    for degree, share in enumerate(shares):
+        left = left - share * orthogonal[:, degree]
+        squares = max(float(left @ left), 1e-12 * float(values @ values), 1e-300)
+        criterion = count * np.log(squares) + degree * np.log(count)
+        if criterion < best:
+            best, chosen = criterion, shares[: degree + 1]
+    terms = len(chosen)
+    weights = np.linalg.solve(triangle[:terms, :terms], chosen)
+    return np.asarray(_polynomials(span, at, terms - 1) @ weights)
+
+
+def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
+    """Return the curve through noisy values, its stiffness chosen by cross-validation."""
+    if len(time) < FEWEST:
+        return lambda at: np.asarray(np.interp(at, time, values))
+    spline = make_smoothing_spline(time, values)
+    return lambda at: np.asarray(spline(at))
+
+
+def _averaged(series: Series) -> Series:
+    """Return the known readings (n, 1), the means of those that follow faster than `OFTEN`."""
+    known = np.isfinite(series.values[:, 0]) & (series.values[:, 0] > 0)
+    time, values = series.time[known], series.values[known, 0]
+    bins = np.floor((time - time[0]) * OFTEN + 1e-6).astype(int)
+    _, which, count = np.unique(bins, return_inverse=True, return_counts=True)
+    time, values = (np.bincount(which, weights=samples) / count for samples in (time, values))
+    return Series(time, values[:, None])
