@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from tuner.flights.damage import Cause, Damage
-from tuner.flights.flight import Array, Flight, InitialState, Series
-from tuner.flights.notes import Note
+from tuner.flights.flight import Array, Flight, InitialState, Note, Series
 
 logger = logging.getLogger(__name__)
 
@@ -113,7 +112,7 @@ def _flight(
         yaw_rate_setpoint=about["yaw_rate_setpoint"],
         level_held=about["level_held"],
         trajectory=about["trajectory"],
-        notes=tuple(Note.read(note) for note in about["notes"]),
+        notes=tuple(Note(**note) for note in about["notes"]),
         damage=tuple(
             Damage(**{**damage, "cause": Cause(damage["cause"])}) for damage in about["damage"]
         ),

@@ -1,20 +1,22 @@
-"""The last stages of a search once more, from where it ended, with something changed."""
+"""A search once more with something changed: its last stages from where it ended, or all of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
+from tuner.objective.normal import Objective
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.search.progress import Progress, criterion_of, point_of
-from tuner.search.stages import plan
+from tuner.search.progress import Progress, beginning, criterion_of, point_of
+from tuner.search.stages import Stage, plan
 
 
 def polished(
@@ -25,7 +27,7 @@ def polished(
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
-    """Return a fit polished again.
+    """Return a fit polished again, by the last two stages from its point.
 
     Parameters
     ----------
@@ -40,16 +42,7 @@ def polished(
     on_progress
         Called after every iteration.
     """
-    objective, settings = fitted.objective, job.settings.job.search
-    *_, first, last = plan(
-        "gradient",
-        objective.samples,
-        float(objective.schedule.log_rate),
-        windows=objective.segments.freedom is not None,
-        robust=settings.robust == "huber",
-        steps=settings.max_iterations,
-    )
-    stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in (first, last))
+    *_, first, last = _stages(fitted.objective, job)
     names = [flight.name for flight in job.fitted]
     progress = Progress(
         stage=0,
@@ -58,14 +51,69 @@ def polished(
         ),
         scales={
             channel: np.array([fitted.scales[name][channel] for name in names])
-            for channel in objective.segments.measured
+            for channel in fitted.objective.segments.measured
         },
         states=None if fitted.criterion.states is None else np.asarray(fitted.criterion.states),
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        feedback=float(objective.model.controller.rate.saturation_feedback),
+        feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
     )
+    return _grown(
+        job, fitted, progress, (first, last), free=free, title=title, on_progress=on_progress
+    )
+
+
+def searched_again(
+    job: Job,
+    fitted: Fitted,
+    vector: NDArray[np.float64],
+    *,
+    free: Free,
+    title: str,
+    on_progress: Callable[[Progress], None],
+) -> Fitted:
+    """Return a fit searched for again by all stages from a start vector (K,).
+
+    The other arguments are those of `polished`. What terms that were missing did to a fit, a
+    coefficient at its bound say, is forgotten that way.
+    """
+    progress = replace(
+        beginning(fitted.objective, vector[None]),
+        iterations=fitted.iterations,
+        evaluations=fitted.evaluations,
+        feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
+    )
+    stages = _stages(fitted.objective, job)
+    return _grown(job, fitted, progress, stages, free=free, title=title, on_progress=on_progress)
+
+
+def _stages(objective: Objective, job: Job) -> tuple[Stage, ...]:
+    """Return the stages of least squares."""
+    settings = job.settings.job.search
+    return plan(
+        "gradient",
+        objective.samples,
+        float(objective.schedule.log_rate),
+        windows=objective.segments.freedom is not None,
+        robust=settings.robust == "huber",
+        steps=settings.max_iterations,
+    )
+
+
+def _grown(
+    job: Job,
+    fitted: Fitted,
+    progress: Progress,
+    stages: Sequence[Stage],
+    *,
+    free: Free,
+    title: str,
+    on_progress: Callable[[Progress], None],
+) -> Fitted:
+    """Return where some stages lead."""
+    stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
+    objective, last = fitted.objective, stages[-1]
     progress = grow(objective, stages, progress, free=free, clipped=False, on_progress=on_progress)
     point = point_of(progress.points, 0)
     return replace(
@@ -73,8 +121,8 @@ def polished(
         point=point,
         criterion=criterion_of(last, progress.scales, np.asarray(point.offsets), progress.states),
         scales={
-            name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
-            for i, name in enumerate(names)
+            flight.name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
+            for i, flight in enumerate(job.fitted)
         },
         iterations=progress.iterations,
         evaluations=progress.evaluations,

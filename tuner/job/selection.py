@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.job.extension import extended
-from tuner.job.polish import polished
+from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
 from tuner.model import with_coefficients
@@ -27,6 +27,7 @@ from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
+from tuner.search.progress import Progress
 from tuner.selection.candidates import (
     Groups,
     candidate_groups,
@@ -138,6 +139,8 @@ class _Selection:
         """Add groups until none earns its place."""
         state = self._seen(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
+        if self._wanted(state, dropped):
+            state = self._with_all(state) or state
         for _ in range(MAX_ROUNDS):
             wanted = self._wanted(state, dropped)
             if not wanted:
@@ -171,6 +174,22 @@ class _Selection:
         }
         return scores if any(found.earns_place for found in scores.values()) else {}
 
+    def _with_all(self, base: _State) -> _State | None:
+        """Return what backward elimination leaves of all groups, if it predicts better.
+
+        Where something is missing the base fit lies anywhere, and what little it shows of the
+        missing terms picks those that stand in for them. So the search begins again where it
+        began, with every candidate in the model.
+        """
+        self.on_message(
+            f"The flights call for more than the base model: searching again with all "
+            f"{len(self.candidates)} groups of terms, to see which can go."
+        )
+        trial = self._pruned(self._refitted(base, self.candidates, anew=True))
+        if trial.added and self._predicts_better(trial, base, by_flight=True):
+            return trial
+        return None
+
     def _grown(
         self, state: _State, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
     ) -> _State | None:
@@ -200,8 +219,8 @@ class _Selection:
         self.on_message(f"Fitting again without {listed(tuple(taken))}.")
         return self._pruned(self._refitted(state, {name: self.candidates[name] for name in kept}))
 
-    def _refitted(self, state: _State, groups: Groups) -> _State:
-        """Return the fit with exactly these groups, from where the last one ended."""
+    def _refitted(self, state: _State, groups: Groups, *, anew: bool = False) -> _State:
+        """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted = _names(groups)
         spare = [name for name in _names(self.candidates) if name not in wanted]
         free = [*self.job.space.names, *wanted]
@@ -209,25 +228,32 @@ class _Selection:
         objective, point = with_terms(
             self._objective, self.fitted.point, filled, self.job.settings.job
         )
-        start, names = np.asarray(point.coefficients), objective.space.names
+        start, names = np.array(point.coefficients), objective.space.names
         vector = [
             state.vector.get(name, start[i]) if name in free else start[i]
             for i, name in enumerate(names)
         ]
         new = [group for group in groups if group not in state.added]
-        fitted = polished(
-            self.job,
-            replace(
-                state.fitted,
-                objective=objective,
-                point=Point(jnp.asarray(vector), state.fitted.point.offsets),
-            ),
-            free=Free(np.array([name in free for name in names]), free_offsets(self.job)),
-            title=f"with {len(new)} terms more" if new else f"with {len(groups)} terms",
-            on_progress=lambda progress: self.on_progress(
-                replace(self.job, space=objective.space), progress
-            ),
+        from_here = replace(
+            state.fitted,
+            objective=objective,
+            point=Point(jnp.asarray(vector), state.fitted.point.offsets),
         )
+        free_ones = Free(np.array([name in free for name in names]), free_offsets(self.job))
+        title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
+
+        def on_progress(progress: Progress) -> None:
+            self.on_progress(replace(self.job, space=objective.space), progress)
+
+        if anew:
+            start[: len(self.job.space)] = self.job.space.initial
+            fitted = searched_again(
+                self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
+            )
+        else:
+            fitted = polished(
+                self.job, from_here, free=free_ones, title=title, on_progress=on_progress
+            )
         return self._seen(fitted, groups)
 
     def _seen(self, fitted: Fitted, added: Groups) -> _State:
