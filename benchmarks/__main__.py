@@ -18,7 +18,16 @@ from benchmarks.table import Section, table
 from benchmarks.timing import machine
 from tuner import runtime
 
-PARTS = ("throughput", "derivatives", "one_vehicle", "compilation", "scaling", "job", "reading")
+PARTS = (
+    "throughput",
+    "derivatives",
+    "one_vehicle",
+    "compilation",
+    "scaling",
+    "job",
+    "reading",
+    "service",
+)
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
 

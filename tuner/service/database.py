@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from threading import Lock
 from typing import Any
 
 from alembic import command
@@ -37,6 +38,8 @@ class Database:
     def __init__(self, url: str) -> None:
         self._reader = _engine(url)
         self._writer = self._reader.execution_options(writes=True)
+        one_writer = self._reader.dialect.name == "sqlite"
+        self._turn: AbstractContextManager[object] = Lock() if one_writer else nullcontext()
 
     def migrate(self) -> None:
         """Bring the tables to this version of the program.
@@ -68,13 +71,16 @@ class Database:
     def writing(self) -> Iterator[Session]:
         """Yield a session that is committed at the end, or leaves nothing.
 
+        SQLite has one writer at a time, and those who wait for another process's take no turns:
+        our own threads do.
+
         Raises
         ------
         UnavailableError
             The database cannot be reached, or is locked.
         """
         session = Session(self._writer, expire_on_commit=False)
-        with _outages(), session, session.begin():
+        with _outages(), self._turn, session, session.begin():
             yield session
 
     def ping(self) -> None:
