@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from threading import Lock
 from typing import Any
 
@@ -18,7 +18,9 @@ from tuner.errors import InputError
 from tuner.service.errors import UnavailableError
 
 LOCKED_FOR = 5.0
-"""s for which a writer waits for another one."""
+"""s for which a writer waits for another process."""
+IN_TURN_FOR = 30.0
+"""s for which a writer waits for other threads of this one."""
 
 
 class Database:
@@ -39,7 +41,7 @@ class Database:
         self._reader = _engine(url)
         self._writer = self._reader.execution_options(writes=True)
         one_writer = self._reader.dialect.name == "sqlite"
-        self._turn: AbstractContextManager[object] = Lock() if one_writer else nullcontext()
+        self._turn = Lock() if one_writer else None
 
     def migrate(self) -> None:
         """Bring the tables to this version of the program.
@@ -80,8 +82,21 @@ class Database:
             The database cannot be reached, or is locked.
         """
         session = Session(self._writer, expire_on_commit=False)
-        with _outages(), self._turn, session, session.begin():
+        with _outages(), self._in_turn(), session, session.begin():
             yield session
+
+    @contextmanager
+    def _in_turn(self) -> Iterator[None]:
+        """Wait until no other thread of ours writes, where there may be only one."""
+        if self._turn is None:
+            yield
+            return
+        if not self._turn.acquire(timeout=IN_TURN_FOR):
+            raise UnavailableError("the database", "is busy", "try again in a minute")
+        try:
+            yield
+        finally:
+            self._turn.release()
 
     def ping(self) -> None:
         """Ask for an answer.

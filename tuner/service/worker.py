@@ -24,6 +24,7 @@ from tuner.errors import InputError
 from tuner.service.limiting import limit_process
 from tuner.service.request import Asked
 from tuner.service.settings import Limits, size_in_words
+from tuner.yaml_files.shipped import configs_folder
 
 RESULT = Path("result")
 LOCK = ".lock"
@@ -125,7 +126,8 @@ def _listener(channel: IO[str]) -> Any:
 
     def on_settings(settings: Any) -> None:
         for name, origin in settings.origin.items():
-            say("message", text=f"{name}: {origin}")
+            # where this program lies here is nothing to a visitor
+            say("message", text=f"{name}: {origin}".replace(f"{configs_folder()}/", ""))
 
     def on_iteration(iteration: Any, left: float) -> None:
         rest = None if math.isnan(left) else left
