@@ -89,7 +89,6 @@ def killed_again_and_again(data: Path, table: Path, kills: int, database: str = 
 def check_all_done_once(found: list[dict]) -> None:
     """Nothing is lost, nothing failed, and nothing came to another result by being interrupted."""
     assert [job["state"] for job in found] == ["done"] * len(found)
-    assert all(job["iteration"] == 40 for job in found)
     assert any("has gone; it goes on" in line for job in found for line in job["log"])
 
 
