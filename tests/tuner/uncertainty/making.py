@@ -1,4 +1,8 @@
-"""Small fits whose truth is known: short simulated flights, sampled with white noise."""
+"""Small fits whose truth is known: short simulated flights, sampled with white noise.
+
+A program belongs to the number of free coefficients, not to their names, and takes longer to
+compile than to run: tests that free three, five or ten share theirs.
+"""
 
 from __future__ import annotations
 

@@ -129,7 +129,14 @@ def test_intervals_are_in_units_and_inside_the_bounds(
 
 def test_tied_coefficients_share_their_estimate() -> None:
     exact = making.problem(
-        ("inertia_xx", "inertia_yy", "input_scaling"),
+        (
+            "inertia_xx",
+            "inertia_yy",
+            "inertia_zz",
+            "input_scaling",
+            "motor_constant",
+            "moment_constant",
+        ),
         job={"ties": (("inertia_xx", "inertia_yy"),)},
     )
     noisy = making.with_data(exact, making.truth(exact), noise=np.random.default_rng(1))

@@ -17,7 +17,13 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import Profile, Profiles
 
-FREE = ("motor_constant", "moment_constant", "rolling_moment_coefficient")
+FREE = (
+    "inertia_xx",
+    "input_scaling",
+    "motor_constant",
+    "moment_constant",
+    "rolling_moment_coefficient",
+)
 
 
 @pytest.fixture(scope="module")
