@@ -27,6 +27,7 @@ PARTS = (
     "job",
     "reading",
     "service",
+    "workers",
 )
 RESULTS = Path(__file__).with_name("RESULTS.md")
 

@@ -6,11 +6,13 @@
     python examples/search_trials.py clock       # one recording's poses stamped 20 ms late
     python examples/search_trials.py noise       # one recording replaced by noise
 
-Each prints one row of the README's table.
+Each prints one row of the README's table. With ``--workers N`` or ``--cluster FILE`` they are
+computed side by side.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
@@ -31,6 +33,7 @@ from tuner.config import (  # noqa: E402 (jax is configured first)
     settle,
     with_values,
 )
+from tuner.engine import Report, engine_for  # noqa: E402
 from tuner.findings import Code  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
 from tuner.job.best_fit import validate, vehicle_fitted  # noqa: E402
@@ -175,10 +178,21 @@ def noise() -> str:
 TRIALS = {trial.__name__: trial for trial in (reference, starts, mass, clock, noise)}
 
 
-def main(names: list[str]) -> None:
+def trial(name: str, _report: Report) -> str:
+    """Return a trial's row."""
+    return f"| `python examples/search_trials.py {name}` | {TRIALS[name]()} |"
+
+
+def main(words: list[str]) -> None:
     """Run the named trials, or all."""
-    for name in names or list(TRIALS):
-        print(f"| `python examples/search_trials.py {name}` | {TRIALS[name]()} |", flush=True)
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--cluster")
+    parser.add_argument("names", nargs="*", choices=[[], *TRIALS])
+    asked = parser.parse_args(words)
+    with engine_for(asked.workers, asked.cluster) as engine:
+        for row in engine.stream(trial, asked.names or list(TRIALS)):
+            print(row, flush=True)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from tuner.config import ControllerFile, Options, VehicleFile
 from tuner.config.job import Method
+from tuner.engine import engine_for
 from tuner.flights.flight import Array
 from tuner.flights.load import load_flight
 from tuner.result import Run, read_run
@@ -58,6 +59,8 @@ def fit(
     resume: bool = False,
     force: bool = False,
     cross_validate: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> Run:
     """Fit the coefficients of a vehicle to recordings, as ``tune --flights`` does.
 
@@ -91,6 +94,9 @@ def fit(
         Whether to search even where the check before the search reports a failure.
     cross_validate
         Whether to fit without each flight in turn as well, into ``cross_validation.csv``.
+    workers, cluster
+        Local processes, or the cluster file or scheduler, that compute what is independent; the
+        numbers are the same. A script that names them needs ``if __name__ == "__main__":``.
 
     Returns
     -------
@@ -120,14 +126,15 @@ def fit(
         namespace=namespace,
         bench=None if bench is None else str(bench),
     )
-    folder, _ = run(
-        options,
-        out=None if out is None else Path(out),
-        resume=resume,
-        force=force,
-        cross_validated=cross_validate,
-        command=f"tuner.fit from Python: {options.flights}",
-    )
+    with engine_for(workers, cluster):
+        folder, _ = run(
+            options,
+            out=None if out is None else Path(out),
+            resume=resume,
+            force=force,
+            cross_validated=cross_validate,
+            command=f"tuner.fit from Python: {options.flights}",
+        )
     return read_run(folder)
 
 
@@ -197,6 +204,8 @@ def sensitivity(
     span: float = 30.0,
     profile: Sequence[str] | None = None,
     out: Named | None = None,
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> SensitivityResult:
     """Report what recordings say about each coefficient of a vehicle, as ``tune sensitivity`` does.
 
@@ -221,6 +230,8 @@ def sensitivity(
         Coefficients whose likelihood is profiled: the others are fitted again along a grid.
     out
         Folder that tables and report are written into; None makes one under ``runs/``.
+    workers, cluster
+        As of `fit`.
 
     Returns
     -------
@@ -249,18 +260,19 @@ def sensitivity(
         topics=topics,
         namespace=namespace,
     )
-    return examine_vehicle(
-        options,
-        SensitivityRequest(
-            arena=arena,
-            global_method=global_method,
-            samples=samples,
-            span=span / 100.0,
-            profiles=tuple(profile or ()),
-        ),
-        out=folder_for(None if out is None else Path(out)),
-        command=f"tuner.sensitivity from Python: {options.flights}",
-    )
+    with engine_for(workers, cluster):
+        return examine_vehicle(
+            options,
+            SensitivityRequest(
+                arena=arena,
+                global_method=global_method,
+                samples=samples,
+                span=span / 100.0,
+                profiles=tuple(profile or ()),
+            ),
+            out=folder_for(None if out is None else Path(out)),
+            command=f"tuner.sensitivity from Python: {options.flights}",
+        )
 
 
 def simulate(
@@ -278,6 +290,8 @@ def simulate(
     grid: Mapping[str, Array] | None = None,
     precision: Precision = "float64",
     forces: bool = False,
+    workers: int | None = None,
+    cluster: str | None = None,
 ) -> tuple[Simulation, ...]:
     """Simulate a trajectory, as ``tune simulate`` does.
 
@@ -306,6 +320,8 @@ def simulate(
         What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
     forces
         Whether each simulation has ``forces``: what acted along the flight, term by term.
+    workers, cluster
+        As of `fit`.
 
     Returns
     -------
@@ -327,19 +343,20 @@ def simulate(
         "speed_scale": speed_scale,
         "yaw_rate": yaw_rate,
     }
-    return tuple(
-        fly(
-            _text(vehicle),
-            _text(controller),
-            shape,
-            speed=speed,
-            duration=duration,
-            rate=rate,
-            grid=grid,
-            precision=precision,
-            forces=forces,
+    with engine_for(workers, cluster):
+        return tuple(
+            fly(
+                _text(vehicle),
+                _text(controller),
+                shape,
+                speed=speed,
+                duration=duration,
+                rate=rate,
+                grid=grid,
+                precision=precision,
+                forces=forces,
+            )
         )
-    )
 
 
 def export(

@@ -51,6 +51,10 @@ class ExportError(InputError):
     """An export was refused or could not be written."""
 
 
+class EngineError(InputError):
+    """What computes elsewhere is gone, or cannot go on."""
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """Return ``did you mean 'x'?`` for the nearest known word, or the list of known words."""
     names = sorted(known)

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from tuner.cli.options import (
     TYPED,
+    Cluster,
     ControllerChoice,
     Flights,
     JobChoice,
@@ -18,6 +19,7 @@ from tuner.cli.options import (
     Quiet,
     Topics,
     VehicleChoice,
+    Workers,
 )
 
 
@@ -40,6 +42,8 @@ def sensitivity(
     span: float = 30.0,
     profile: Annotated[list[str] | None, Many] = None,
     out: Path | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     quiet: Quiet = False,
 ) -> None:
     """Report the effect of each coefficient, how well it is known and from which flights.
@@ -71,6 +75,7 @@ def sensitivity(
 
     configure()
     from tuner.config import Options
+    from tuner.engine import engine_for
     from tuner.job.folder import folder_for
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
 
@@ -92,7 +97,7 @@ def sensitivity(
         span=span / 100.0,
         profiles=profile or (),
     )
-    with listening(quiet=quiet) as listener:
+    with engine_for(workers, cluster), listening(quiet=quiet) as listener:
         result = examine_vehicle(
             options,
             request,

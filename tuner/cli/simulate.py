@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tuner.cli.options import ControllerName, Many, Quiet, VehicleName
+from tuner.cli.options import Cluster, ControllerName, Many, Quiet, VehicleName, Workers
 
 
 def simulate(
@@ -24,6 +24,8 @@ def simulate(
     sweep: Annotated[list[str] | None, Many] = None,
     precision: Literal["float32", "float64"] = "float64",
     forces: Path | None = None,
+    workers: Workers = None,
+    cluster: Cluster = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a vehicle and its controller on a trajectory, and write the flight.
@@ -59,6 +61,7 @@ def simulate(
     from tuner.runtime import configure
 
     configure()
+    from tuner.engine import engine_for
     from tuner.simulation.plan import fly
     from tuner.simulation.sweep import grid_of
     from tuner.simulation.write import write_flights
@@ -80,6 +83,7 @@ def simulate(
         precision=precision,
         forces=forces is not None,
     )
-    summaries = write_flights(flights, out, forces=forces)
+    with engine_for(workers, cluster):
+        summaries = write_flights(flights, out, forces=forces)
     if not quiet:
         print_flights(summaries, out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -77,10 +78,9 @@ def job_script_for(cluster: str | None) -> str:
 
 
 def _quiet_dask() -> None:
-    """Have Dask log errors alone, unless the user has set that otherwise."""
+    """Have Dask log nothing, unless the user has set that otherwise: what fails is raised."""
     import dask.config  # noqa: PLC0415 (an extra)
 
-    with_users_on_top = dask.config.merge(
-        {"logging": {"distributed": "critical"}}, dask.config.collect()
-    )
+    nothing = {"logging": {"distributed": logging.CRITICAL + 1}}
+    with_users_on_top = dask.config.merge(nothing, dask.config.collect())
     dask.config.update_defaults(with_users_on_top)

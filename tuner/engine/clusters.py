@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -45,7 +46,7 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         memory_limit=file.memory or "auto",
         host="127.0.0.1",
         dashboard_address=None,
-        silence_logs=50,
+        silence_logs=logging.CRITICAL + 1,
     )
     return cluster
 

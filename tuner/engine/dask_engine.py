@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future
 from typing import Any, TypeVar
 
+import cloudpickle
 from distributed import Client, Event, KilledWorker
 from distributed.comm import CommClosedError
 
@@ -24,15 +25,11 @@ from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import Engine, Report, Task
 from tuner.engine.store import Store
 from tuner.engine.worker import SetUp, Shared, run_task, stop_name
-from tuner.errors import InputError
+from tuner.errors import EngineError
 from tuner.runtime import cache_folder, configure
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-
-class EngineError(InputError):
-    """What computes elsewhere is gone or cannot go on."""
 
 
 class OnDask(Engine):
@@ -51,7 +48,7 @@ class OnDask(Engine):
     """
 
     def __init__(self, client: Client, at_once: int, store: Store, devices: int) -> None:
-        self.at_once = at_once
+        self.at_once = self.ahead = at_once
         self.executor: Executor = client.get_executor(pure=False)
         self._client, self._store, self._devices = client, store, devices
         self._topic = f"tune-{uuid.uuid4().hex}"
@@ -66,9 +63,9 @@ class OnDask(Engine):
         self._listeners[identity] = on_report
         outcome: Future[R] = Future()
         with self._translated():
-            inner = self.executor.submit(
-                run_task, function, task, identity, self._topic, self._devices
-            )
+            # bytes, lest the scheduler, which looks at arguments, import and hold all of it
+            content = cloudpickle.dumps((function, task))
+            inner = self.executor.submit(run_task, content, identity, self._topic, self._devices)
 
         def ended(inner: Future[R]) -> None:
             self._listeners.pop(identity, None)
@@ -117,6 +114,12 @@ class OnDask(Engine):
                 "give each more memory, as memory: 4GiB in the cluster file, or use fewer",
             ) from None
         except (CancelledError, CommClosedError, TimeoutError, OSError, RuntimeError) as error:
+            if "deserialization" in str(error):
+                raise EngineError(
+                    "scheduler",
+                    "does not know this program",
+                    "install multirotor-tune[cluster] there, the same version as here",
+                ) from None
             if isinstance(error, RuntimeError) and self._client.status == "running":
                 raise
             raise EngineError(

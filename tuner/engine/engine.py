@@ -8,7 +8,8 @@ worker. While it works it may report, see `Report`.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -33,9 +34,12 @@ class Engine(ABC):
     ----------
     at_once
         How many tasks are computed side by side.
+    ahead
+        How many results `stream` has computed before they are asked for.
     """
 
     at_once: int
+    ahead: int
 
     @abstractmethod
     def submit(self, function: Task[T, R], task: T, on_report: Report = _ignore) -> Future[R]:
@@ -89,11 +93,32 @@ class Engine(ABC):
                 future.cancel()
             raise
 
+    def stream(self, function: Task[T, R], tasks: Iterable[T]) -> Iterator[R]:
+        """Yield the results of tasks in their order, no more of them at a time than needed.
+
+        Parameters
+        ----------
+        function, tasks
+            As of `submit`.
+        """
+        waiting: deque[Future[R]] = deque()
+        try:
+            for task in tasks:
+                waiting.append(self.submit(function, task))
+                if len(waiting) > self.ahead:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
+
 
 class Here(Engine):
     """Computes each task when it is submitted, in this process, on all its devices."""
 
     at_once = 1
+    ahead = 0
 
     def submit(self, function: Task[T, R], task: T, on_report: Report = _ignore) -> Future[R]:
         """Compute a task; its error is raised at once."""

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from tuner.errors import InputError
 
-PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "fsspec")
+PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
 
 
 @contextmanager

@@ -6,21 +6,20 @@ import contextlib
 import logging
 import os
 import pickle
+import signal
+import threading
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from distributed import Event, Worker, WorkerPlugin, get_worker
 
-from tuner.engine.engine import HERE, Task, using
+from tuner.engine.engine import HERE, using
 from tuner.engine.store import Store
-from tuner.errors import InputError
+from tuner.errors import EngineError
 from tuner.runtime import configure
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Of linear algebra beside XLA: one, for every worker has its cores for itself."""
@@ -55,6 +54,8 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Worker) -> None:
         """Set a worker up."""
         if self.pool:
+            if threading.current_thread() is threading.main_thread():
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's to handle
             first = self.cores * int(worker.name)
             pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
         if self.gpus:
@@ -80,16 +81,35 @@ def pin(cores: Collection[int]) -> None:
             os.sched_setaffinity(int(thread.name), cores)
 
 
-def run_task(function: Task[T, R], task: T, identity: str, topic: str, devices: int) -> R:
+def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
     """Compute a task in a worker, its reports and log lines sent where it was asked for.
+
+    Parameters
+    ----------
+    content
+        Function and argument, pickled.
+    identity, topic
+        Of the task and its reports.
+    devices
+        See `SetUp`.
 
     Raises
     ------
     Stopped
         It was cancelled: noticed when it reports.
+    EngineError
+        This worker cannot compute it.
     """
     worker, stop = get_worker(), Event(stop_name(identity))
     _check_devices(devices)
+    try:
+        function, task = pickle.loads(content)
+    except (ImportError, AttributeError) as error:
+        raise EngineError(
+            "workers",
+            f"do not know this program's task ({error})",
+            "install multirotor-tune[cluster] there, the same version as here",
+        ) from None
 
     def report(message: Any) -> None:
         if stop.is_set():
@@ -113,7 +133,7 @@ def _check_devices(wanted: int) -> None:
 
     there = len(jax.devices("cpu"))
     if there != wanted:
-        raise InputError(
+        raise EngineError(
             "--cluster",
             f"its workers divide batches among {there} devices, this process among {wanted}, so "
             "that the last digits would differ",

@@ -9,12 +9,13 @@ import datetime
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 
 from tuner.comparison.tabulate import table_of
 from tuner.config import Options, settle, with_values, write_vehicle
 from tuner.disk import make_folder
-from tuner.errors import ConfigError, InputError, OutputError
+from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
@@ -96,7 +97,7 @@ def run(
     try:
         fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
         selected = with_terms_selected(job, fitted, on_progress, listener.on_message)
-    except (KeyboardInterrupt, OutputError):
+    except (KeyboardInterrupt, OutputError, EngineError):
         listener.on_message(
             f"The best coefficients so far are in {folder}. "
             f"Continue the search with --out {folder} --resume."
@@ -133,7 +134,9 @@ def run(
     table_of(simulations).write(folder)
     write_search(folder, fitted)
     if cross_validated:
-        listener.on_folds(cross_validate(job, fitted, folder, _reporting(listener)))
+        listener.on_folds(
+            cross_validate(job, fitted, folder, lambda now: listener.on_iteration(now, nan))
+        )
 
     listener.on_message("Simulating which flight would be the most informative next.")
     write_knowledge(folder, job, examination, fitted)

@@ -13,6 +13,7 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
+from tuner.engine import Report, current
 from tuner.objective.criterion import Criterion, Point, SegmentData
 from tuner.objective.loss import robust_loss
 from tuner.objective.normal import Objective
@@ -47,6 +48,8 @@ def evaluate(
 ) -> Batch:
     """Fly all segments with every vector, in chunks of one compiled shape.
 
+    The engine in force computes them.
+
     Parameters
     ----------
     objective, criterion
@@ -56,21 +59,29 @@ def evaluate(
     point
         Its clock offsets hold for all.
     """
-    evaluate_chunk = _shared(objective.simulator)
-    parts = []
-    for first in range(0, len(vectors), CHUNK):
-        chunk = vectors[first : first + CHUNK]
-        padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
-        result = evaluate_chunk(
-            objective.data(point.offsets, criterion),
-            objective.tunable,
-            padded,
-            np.asarray(criterion.horizon),
-            np.asarray(criterion.huber),
-        )
-        parts.append(_first(result, len(chunk)))
+    engine = current()
+    problem = engine.share((objective, point, criterion))
+    chunks = [vectors[first : first + CHUNK] for first in range(0, len(vectors), CHUNK)]
+    parts = engine.map(_evaluated, [(problem, chunk) for chunk in chunks])
     joined: Batch = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
     return joined
+
+
+def _evaluated(
+    task: tuple[Callable[[], tuple[Objective, Point, Criterion]], NDArray[np.float64]],
+    _report: Report,
+) -> Batch:
+    """Return what some vectors give, filled up to a whole chunk on the way."""
+    (objective, point, criterion), chunk = task[0](), task[1]
+    padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
+    batch = _shared(objective.simulator)(
+        objective.data(point.offsets, criterion),
+        objective.tunable,
+        padded,
+        np.asarray(criterion.horizon),
+        np.asarray(criterion.huber),
+    )
+    return _first(batch, len(chunk))
 
 
 def _first(batch: Batch, count: int) -> Batch:

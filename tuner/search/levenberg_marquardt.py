@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float
 
 from tuner.coefficients.space import Coordinates
 from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
 from tuner.search.normal_equations import (
     LinearResiduals,
@@ -168,7 +169,8 @@ def begin(points: Point) -> Step:
 def advance(objective: Objective, before: Step, criterion: Criterion, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
 
-    The points are flown on all devices; the step itself, a small affair, is taken on one.
+    The points are flown on all devices, or wherever the engine in force computes; the step itself,
+    a small affair, is taken on one.
 
     Parameters
     ----------
@@ -185,7 +187,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     after = _step(
         objective.space.coordinates,
         np.asarray(objective.segments.flight),
-        replace(before, sums=objective.sums_of(on_host(tried), criterion)),
+        replace(before, sums=sums_at(objective, on_host(tried), criterion)),
         criterion,
         np.asarray(free),
     )

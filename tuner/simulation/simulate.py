@@ -18,6 +18,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
 from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, check_mixer
+from tuner.engine import Here, Report, current
 from tuner.flights.flight import Array, Series
 from tuner.flights.resample import resample
 from tuner.model import Model, model_of, schedule_of, with_coefficients
@@ -68,6 +69,8 @@ def simulate(
 ) -> Iterator[Simulation]:
     """Fly a trajectory, starting at rest at its first point.
 
+    The engine in force flies the pieces of a grid.
+
     Parameters
     ----------
     vehicle, controller
@@ -90,35 +93,67 @@ def simulate(
     Simulation
         One, or B of them in the order of the grid.
     """
-    clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
+    check_mixer(vehicle)
+    asked = _Asked(vehicle, controller, trajectory, duration, rate, precision, forces)
+    pieces = ((asked, columns, wanted) for columns, wanted in _chunks(grid or {}))
+    engine = current()
+    here = isinstance(engine, Here)  # flights then need not be in memory all at once
+    for flights in map(_flights, pieces) if here else engine.stream(_flown, pieces):
+        yield from flights
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What every vehicle of a grid flies; as of `simulate`."""
+
+    vehicle: VehicleFile
+    controller: ControllerFile
+    trajectory: TrajectorySettings
+    duration: float
+    rate: float
+    precision: Precision
+    forces: bool
+
+
+_Piece = tuple[_Asked, dict[str, Array], int]
+
+
+def _flown(piece: _Piece, _report: Report) -> list[Simulation]:
+    """Return what `_flights` yields: it leaves the process all at once."""
+    return list(_flights(piece))
+
+
+def _flights(piece: _Piece) -> Iterator[Simulation]:
+    """Fly a piece of a grid, and yield as many of its flights as are wanted."""
+    asked, columns, wanted = piece
+    controller, rate = asked.controller, asked.rate
+    clock = np.arange(math.floor(asked.duration * rate + 1e-9) + 1) / rate
     fits = round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
     control_rate = schedule.position_control_rate
-    reference = published(trajectory, duration=duration, control_rate=control_rate)
+    reference = published(asked.trajectory, duration=asked.duration, control_rate=control_rate)
     sent = _sent(reference, clock, control_rate)
-    samples = math.ceil(duration * schedule.log_rate) + 1
+    samples = math.ceil(asked.duration * schedule.log_rate) + 1
     log_time = np.arange(samples) / schedule.log_rate
-    check_mixer(vehicle)
-    model = model_of(vehicle, controller)
-    fly = _flier(schedule, samples, precision)
-    for columns, wanted in _chunks(grid or {}):
-        flown = fly(columns, model, reference.inlet, reference.start)
-        logged = _logged(flown)
-        crashes = np.asarray(flown.crash_time).reshape(-1)
-        for segment in range(wanted):
-            signals = {
-                name: resample(name, Series(log_time, values[..., segment]), clock)
-                for name, values in logged.items()
-            }
-            signals["acceleration"] = _specific_force(clock, signals)
-            coefficients = {name: float(column[segment]) for name, column in columns.items()}
-            flight = Simulation(
-                time=clock,
-                signals=signals | sent,
-                crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
-                coefficients=coefficients,
-            )
-            yield _with_forces(flight, model) if forces else flight
+    model = model_of(asked.vehicle, controller)
+    fly = _flier(schedule, samples, asked.precision)
+    flown = fly(columns, model, reference.inlet, reference.start)
+    logged = _logged(flown)
+    crashes = np.asarray(flown.crash_time).reshape(-1)
+    for segment in range(wanted):
+        signals = {
+            name: resample(name, Series(log_time, values[..., segment]), clock)
+            for name, values in logged.items()
+        }
+        signals["acceleration"] = _specific_force(clock, signals)
+        coefficients = {name: float(column[segment]) for name, column in columns.items()}
+        flight = Simulation(
+            time=clock,
+            signals=signals | sent,
+            crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
+            coefficients=coefficients,
+        )
+        yield _with_forces(flight, model) if asked.forces else flight
 
 
 def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:

@@ -1,0 +1,132 @@
+"""The same numbers to the last bit, wherever they are computed and whichever worker is lost."""
+
+import os
+import shutil
+import signal
+import threading
+
+import jax
+import numpy as np
+import pytest
+
+from tests.tuner.engine import tasks
+from tests.tuner.uncertainty import making
+from tuner.config import Options, TrajectorySettings, settle
+from tuner.engine import using
+from tuner.job.cross_validation import CROSS_VALIDATION_FILE, cross_validate
+from tuner.job.prepare import job_of
+from tuner.job.unfitted import unfitted
+from tuner.objective.batch import evaluate
+from tuner.objective.criterion import Point
+from tuner.objective.many_points import sums_at
+from tuner.recordings import read_recordings
+from tuner.simulation import simulate as simulation
+from tuner.simulation.simulate import simulate
+
+FREE = ("inertia_xx", "motor_constant", "estimate_latency")
+
+
+def same(here, there):
+    jax.tree.map(np.testing.assert_array_equal, here, there)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    objective = making.problem(FREE)
+    return objective, making.fitted_of(objective, making.truth(objective))
+
+
+def vectors_around(point, count):
+    drawn = np.random.default_rng(0).uniform(0.0, 0.001, (count, len(FREE)))
+    return np.asarray(point.coefficients) + drawn
+
+
+def test_points_are_computed_alike_alone_and_in_a_row_here_and_elsewhere(problem, two_workers):
+    objective, fitted = problem
+    vectors = vectors_around(fitted.point, 3)
+    points = Point(vectors, np.stack([np.asarray(fitted.point.offsets)] * 3))
+    here = sums_at(objective, points, fitted.criterion)
+    alone = objective.sums(Point(vectors[1], points.offsets[1]), fitted.criterion)
+    same(jax.tree.map(lambda leaf: leaf[1], here), alone)
+    with using(two_workers):
+        same(sums_at(objective, points, fitted.criterion), here)
+    assert np.ptp(np.asarray(here.loss), axis=0).max() > 0.0
+
+
+def test_populations_are_evaluated_alike(problem, two_workers):
+    objective, fitted = problem
+    vectors = vectors_around(fitted.point, 20)  # more than a chunk
+    here = evaluate(objective, vectors, fitted.point, fitted.criterion)
+    with using(two_workers):
+        same(evaluate(objective, vectors, fitted.point, fitted.criterion), here)
+    assert len(here.loss) == 20
+
+
+def test_a_sweep_is_flown_alike(updated, two_workers, monkeypatch):
+    monkeypatch.setattr(simulation, "CHUNK", 4)
+
+    def flown():
+        grid = {"motor_constant": np.linspace(1.3e-5, 1.6e-5, 10)}
+        shape = TrajectorySettings(name="circle")
+        return list(simulate(updated, making.controller_file(), shape, duration=1.0, grid=grid))
+
+    here = flown()
+    with using(two_workers):
+        there = flown()
+    assert [f.coefficients for f in there] == [f.coefficients for f in here]
+    for one, other in zip(there, here, strict=True):
+        same(one.signals, other.signals)
+
+
+@pytest.fixture(scope="module")
+def two_flights(bag, tmp_path_factory):
+    """A job of two short flights, nothing fitted yet."""
+    folder = tmp_path_factory.mktemp("flights")
+    names = [str(shutil.copyfile(bag, folder / f"{name}.bag")) for name in ("one", "two")]
+    job = folder / "job.yaml"
+    job.write_text(
+        f"free: [{', '.join(FREE)}]\nterms: none\nsearch: {{max_iterations: 3}}\n"
+        "flights: {two: {weight: 0.5}}\n"
+    )
+    settings = settle(Options(names, vehicle="hovergames", config=str(job)))
+    prepared = job_of(settings, read_recordings(settings))
+    return prepared, unfitted(prepared)
+
+
+def table_of(job, folder, on_iteration=lambda _: None):
+    folder.mkdir()
+    cross_validate(*job, folder, on_iteration)
+    return (folder / CROSS_VALIDATION_FILE).read_text()
+
+
+@pytest.fixture(scope="module")
+def folds_here(two_flights, tmp_path_factory):
+    stages = []
+    folder = tmp_path_factory.mktemp("folds") / "here"
+    table = table_of(two_flights, folder, lambda now: stages.append(now.stage))
+    assert {stage.partition(",")[0] for stage in stages} == {"without one", "without two"}
+    return table, set(stages)
+
+
+def test_folds_are_the_same_elsewhere(two_flights, two_workers, folds_here, tmp_path):
+    heard = []
+    with using(two_workers):
+        there = table_of(two_flights, tmp_path / "there", lambda now: heard.append(now.stage))
+    assert there == folds_here[0]
+    assert set(heard) == folds_here[1]
+
+
+@pytest.mark.parametrize(
+    "moment", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 20))]
+)
+def test_folds_are_the_same_though_a_worker_is_lost(
+    two_flights, two_workers, folds_here, tmp_path, moment
+):
+    workers = {one["pid"] for one in two_workers.map(tasks.about_the_process, range(8))}
+    seconds = np.random.default_rng(moment).uniform(0.0, 3.0)
+    killing = threading.Timer(seconds, os.kill, (max(workers), signal.SIGKILL))
+    with using(two_workers):
+        killing.start()
+        there = table_of(two_flights, tmp_path / "there")
+    killing.join()
+    assert there == folds_here[0]
