@@ -45,7 +45,7 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         threads_per_worker=1,
         memory_limit=file.memory or "auto",
         host="127.0.0.1",
-        dashboard_address=None,
+        dashboard_address="127.0.0.1:0",
         silence_logs=logging.CRITICAL + 1,
     )
     return cluster

@@ -142,8 +142,10 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
     import jax  # noqa: PLC0415 (slow, and configured first)
 
     devices = len(jax.devices("cpu"))
-    store = Store(file.store or str(cache_folder() / "shared"))
+    base = file.store or str(cache_folder() / "shared")
+    store = Store(f"{base.rstrip('/')}/{uuid.uuid4().hex}")  # what this engine shares, and no other
     with contextlib.ExitStack() as stack:
+        stack.callback(store.clear)
         cluster = stack.enter_context(cluster_of(file))
         client = stack.enter_context(connected(cluster, file))
         local = file.address is None and file.jobs is None and file.kubernetes is None

@@ -115,6 +115,11 @@ class Store:
                 raise self._changed(sha256)
         return path
 
+    def clear(self) -> None:
+        """Delete everything in the store, and the store."""
+        if self._files.exists(self._root):
+            self._files.rm(self._root, recursive=True)
+
     def _missing(self, sha256: str) -> InputError:
         return InputError(
             f"store {self.url}",

@@ -41,6 +41,16 @@ def test_a_shared_value_arrives(engine):
     assert engine.map(tasks.value_of, [shared, shared]) == [{"many": list(range(1000))}] * 2
 
 
+@pytest.mark.slow
+def test_what_was_shared_is_gone_with_the_engine(tmp_path):
+    file = tmp_path / "cluster.yaml"
+    file.write_text(f"store: {tmp_path / 'store'}")
+    with engine_for(cluster=str(file)) as engine:
+        engine.share("anything")
+        assert list((tmp_path / "store").iterdir())
+    assert not list((tmp_path / "store").iterdir())
+
+
 def test_workers_keep_to_cores_of_their_own(two_workers):
     processes = two_workers.map(tasks.about_the_process, range(8))
     own = {one["pid"]: {tuple(cores) for cores in one["cores"]} for one in processes}

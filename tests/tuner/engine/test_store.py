@@ -60,3 +60,11 @@ def test_what_somebody_changed_is_refused(tmp_path):
 def test_an_unknown_kind_of_store_is_one_line():
     with pytest.raises(InputError, match="store nowhere://x: cannot be reached"):
         Store("nowhere://x")
+
+
+def test_a_store_is_emptied(store):
+    sha256 = store.put(b"a flight")
+    store.clear()
+    store.clear()
+    assert not store.holds(sha256)
+    assert store.put(b"a flight") == sha256
