@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,6 +25,7 @@ from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
 from tuner.model import with_coefficients
 from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
+from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -374,13 +376,18 @@ class _Selection:
         space, flight = objective.space, np.asarray(objective.segments.flight)
         model = self._columns([*self.job.space.names, *_names(state.added)])
         own = self._columns(space.names)
-        movable, losses = _offsets_fitted(fitted), []
+        movable, vectors, losses = _offsets_fitted(fitted), [], []
         for number in range(objective.flights):
             change = linear.step(model, inside=linear.flight != number)[own]
             far = LONGEST_STEP * space.prior_sd
             scaled = linear.scaled[own] + np.clip(change, -far, far)
-            vector = space.at_share((scaled - space.lower) / space.width)
-            sums = objective.sums(Point(jnp.asarray(vector), fitted.point.offsets), criterion)
+            vectors.append(space.at_share((scaled - space.lower) / space.width))
+        offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
+        of_each = sums_at(
+            objective, Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets)), criterion
+        )
+        for number in range(objective.flights):
+            sums = jax.tree.map(lambda leaf, at=number: leaf[at], of_each)
             inside = flight == number
             losses.append(
                 float(np.asarray(sums.loss)[inside].sum())
