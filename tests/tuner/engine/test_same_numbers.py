@@ -53,6 +53,23 @@ def test_points_are_computed_alike_alone_and_in_a_row_here_and_elsewhere(problem
     assert np.ptp(np.asarray(here.loss), axis=0).max() > 0.0
 
 
+def test_points_are_the_same_though_a_worker_is_lost(problem, two_workers):
+    objective, fitted = problem
+    vectors = vectors_around(fitted.point, 8)
+    points = Point(vectors, np.stack([np.asarray(fitted.point.offsets)] * 8))
+    here = sums_at(objective, points, fitted.criterion)
+    workers = {one["pid"] for one in two_workers.map(tasks.about_the_process, range(8))}
+    killing = threading.Timer(0.2, os.kill, (max(workers), signal.SIGKILL))
+    with using(two_workers):
+        killing.start()
+        same(sums_at(objective, points, fitted.criterion), here)
+    killing.join()
+    assert max(workers) not in {
+        one["pid"] for one in two_workers.map(tasks.about_the_process, range(8))
+    }
+
+
+@pytest.mark.slow
 def test_populations_are_evaluated_alike(problem, two_workers):
     objective, fitted = problem
     vectors = vectors_around(fitted.point, 20)  # more than a chunk
@@ -62,6 +79,7 @@ def test_populations_are_evaluated_alike(problem, two_workers):
     assert len(here.loss) == 20
 
 
+@pytest.mark.slow
 def test_a_sweep_is_flown_alike(updated, two_workers, monkeypatch):
     monkeypatch.setattr(simulation, "CHUNK", 4)
 
@@ -108,6 +126,7 @@ def folds_here(two_flights, tmp_path_factory):
     return table, set(stages)
 
 
+@pytest.mark.slow
 def test_folds_are_the_same_elsewhere(two_flights, two_workers, folds_here, tmp_path):
     heard = []
     with using(two_workers):
@@ -116,9 +135,8 @@ def test_folds_are_the_same_elsewhere(two_flights, two_workers, folds_here, tmp_
     assert set(heard) == folds_here[1]
 
 
-@pytest.mark.parametrize(
-    "moment", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in range(1, 20))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", range(20))
 def test_folds_are_the_same_though_a_worker_is_lost(
     two_flights, two_workers, folds_here, tmp_path, moment
 ):
