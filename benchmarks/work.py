@@ -19,7 +19,7 @@ def wait(seconds: float, _report: Report) -> None:
 
 
 def process(_: int, _report: Report) -> dict[str, float]:
-    """Return this process, its threads and the most memory that it has had, in bytes."""
+    """Return this process, its threads, s of processor and the most memory it had, in bytes."""
     time.sleep(0.2)  # so that no worker takes them all
     status = dict(
         line.split(":", 1)
@@ -30,4 +30,5 @@ def process(_: int, _report: Report) -> dict[str, float]:
         "pid": os.getpid(),
         "threads": float(status["Threads"]),
         "memory": 1024.0 * float(status["VmHWM"].split()[0]),
+        "processor": time.process_time(),
     }
