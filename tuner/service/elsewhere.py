@@ -16,6 +16,7 @@ from typing import Any
 
 from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
+from tuner.errors import EngineError
 from tuner.service.attempt import (
     BEAT,
     CHECKPOINTS,
@@ -90,8 +91,6 @@ def sent(
     DiedError
         The process of the job died, or the machine did.
     """
-    from tuner.engine.dask_engine import EngineError  # noqa: PLC0415 (an extra)
-
     heard: SimpleQueue[dict[str, Any]] = SimpleQueue()
     future = engine.submit(fit_elsewhere, errand, heard.put)
     try:
