@@ -1,22 +1,30 @@
 """The whole job on the shipped recordings, held against the truth that they were flown with."""
 
+import io
 import json
 import re
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from markupsafe import escape
 
+from tuner.cli import main
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, Options, read_controller, read_vehicle, values_of
 from tuner.errors import InputError
 from tuner.findings import Code
+from tuner.flights.damage import Cause
 from tuner.flights.load import load_flight
 from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.recordings import Recording
 from tuner.report import render
+from tuner.report.record import SearchRecord
+from tuner.result import read_run
+from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 MECHANICAL = (
@@ -136,9 +144,48 @@ def test_each_flight_is_predicted_from_the_others_and_the_fit_stays(tmp_path):
     assert written["moment_constant"] == result.coefficients["moment_constant"].best
 
 
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory):
+    """A recording whose file lacks its end and its index."""
+    path = tmp_path_factory.mktemp("broken") / "cut.bag"
+    whole = (FLIGHTS / "yaw_spin_3rps.bag").read_bytes()
+    path.write_bytes(whole[: 2 * len(whole) // 3])
+    return path
+
+
+@pytest.fixture(scope="module")
+def salvaged(broken, tmp_path_factory):
+    """A run that the command made of it, and what it printed meanwhile."""
+    out = tmp_path_factory.mktemp("salvaged") / "run"
+    words = ["--flights", str(broken), "--fit", *SHORT["fit"], "--vehicle", SHORT["vehicle"]]
+    printed = io.StringIO()
+    with redirect_stdout(printed), redirect_stderr(printed):
+        status = main([*words, "--out", str(out), "--quiet"])
+    return status, printed.getvalue(), read_run(out)
+
+
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
-    _, whole = run(short_job(), out=tmp_path / "whole")
+def test_what_was_salvaged_is_said_by_result_and_page_even_of_a_quiet_run(salvaged):
+    status, printed, whole = salvaged
+    assert (status, printed) == (0, "")
+    found = [finding for finding in whole.result.findings if finding.code is Code.SALVAGED]
+    assert {finding.subject for finding in found} == {"cut"}
+    assert {finding.names[0] for finding in found} <= set(Cause)
+    assert sum(finding.numbers.get("salvaged", 0) for finding in found) > 5_000
+    page = (whole.folder / "report.html").read_text()
+    for finding in found:
+        assert str(escape(sentence(finding))) in page
+
+
+@pytest.mark.slow
+def test_a_spin_alone_has_no_position_error(salvaged):
+    iterations = SearchRecord.read(salvaged[2].folder).iterations
+    assert {iteration.position_rmse for iteration in iterations} == {None}
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_goes_on_to_the_same_numbers(broken, salvaged, tmp_path):
+    whole = salvaged[2].result
     iterations = []
 
     def interrupt(*what):
@@ -146,15 +193,12 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(tmp_path):
         if len(iterations) == 7:
             raise KeyboardInterrupt
 
+    job = Options([str(broken)], **SHORT)
     with pytest.raises(KeyboardInterrupt):
-        run(
-            short_job(),
-            out=tmp_path / "cut",
-            listener=Listener(on_iteration=interrupt),
-        )
+        run(job, out=tmp_path / "cut", listener=Listener(on_iteration=interrupt))
     assert (tmp_path / "cut" / "best_fit.yaml").exists()
     assert not (tmp_path / "cut" / "result.json").exists()
-    _, resumed = run(short_job(), out=tmp_path / "cut", resume=True)
+    _, resumed = run(job, out=tmp_path / "cut", resume=True)
     for name, coefficient in whole.coefficients.items():
         assert resumed.coefficients[name].best == coefficient.best
     assert resumed.search.evaluations == whole.search.evaluations
