@@ -28,6 +28,7 @@ PARTS = (
     "reading",
     "service",
     "workers",
+    "prediction",
 )
 RESULTS = Path(__file__).with_name("RESULTS.md")
 

@@ -40,6 +40,8 @@ class Code(StrEnum):
     SINGULAR_DIRECTION = "singular_direction"  # names: the coefficients
     SATURATION_FEEDBACK = "saturation_feedback"  # feedback: 1 if the integrator stops, else 0
     CLOCK_OFFSET = "clock_offset"  # seconds; names: the clock
+    TURNING_UNEXPLAINED = "turning_unexplained"  # explained (share)
+    INPUT_LATE = "input_late"  # seconds
     GYRO_OFFSET = "gyro_offset"  # rate (rad/s); names: the axis
     FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise
     MODEL_UNMATCHED = "model_unmatched"  # unmatched, flights, noise_multiple

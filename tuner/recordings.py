@@ -17,7 +17,7 @@ from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.objective.allocation import with_commands
 from tuner.objective.choice import choose_inlet
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.windows import require_windows
 from tuner.simulation.trajectory import with_named_reference
 from tuner.yaml_files.section import build
@@ -41,6 +41,8 @@ class Recording:
         What surrounded it, of `tuner.coefficients.conditions`, as far as that is known.
     because
         Why it does not enter at the most upstream place whose signals were recorded.
+    input_late
+        s by which what is fed in is stamped later than the recorded state.
     """
 
     flight: Flight
@@ -49,6 +51,7 @@ class Recording:
     holdout: bool = False
     conditions: Mapping[str, float] = field(default_factory=dict)
     because: Finding | None = None
+    input_late: float = 0.0
 
 
 def read_recordings(
@@ -168,6 +171,13 @@ def with_conditions(
     return tuple(replace(r, conditions=conditions[r.flight.name]) for r in recordings)
 
 
+def with_inputs_late(
+    recordings: Sequence[Recording], late: Mapping[str, float]
+) -> tuple[Recording, ...]:
+    """Return recordings whose inputs are stamped late by known s: flight name -> s."""
+    return tuple(replace(r, input_late=late[r.flight.name]) for r in recordings)
+
+
 def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     job, flight_settings = settings.job, settings.job.flights.get(flight.name)
     inlet, offset = job.inlet, job.time_offset
@@ -178,7 +188,8 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     chosen = choice.inlet
     if not INLETS[chosen].closed_loop:
-        require_windows(flight, job.search.window, INLETS[chosen].fed(flight))
+        seconds = window_seconds([chosen], job.search.window)
+        require_windows(flight, seconds, INLETS[chosen].fed(flight))
     if INLETS[chosen].has_mixer:
         check_mixer(settings.vehicle)
     late = None if offset == "free" else float(offset)

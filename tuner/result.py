@@ -95,12 +95,52 @@ class AxesRmse(Part):
     yaw: FiniteOrNone
 
 
+class PredictedErrors(Part):
+    """How far open-loop predictions lie from the recording, ``seconds`` after they begin.
+
+    Means over all predictions of a flight of the Euclidean distance in position (m), velocity (m/s)
+    and body rate (rad/s), and of the angle between the attitudes (rad). Each begins at the recorded
+    state, filtered within hundredths of a second (`tuner.flights.states`); nothing is fitted to it.
+    """
+
+    seconds: float
+    position: FiniteOrNone
+    velocity: FiniteOrNone
+    attitude: FiniteOrNone
+    body_rate: FiniteOrNone
+
+
 class FlightResult(Part):
     """One recording: what it was used for and how closely it is met.
 
-    ``duration`` in s; ``time_offset`` in s by which its clock is late; ``conditions`` are what
-    surrounded it, of the registry's scope ``flight``, as it was simulated; RMSE with the initial
-    and the best coefficients.
+    Every simulation behind ``rmse_initial`` and ``rmse_best`` begins at a recorded state.
+
+    Attributes
+    ----------
+    duration
+        s.
+    time_offset
+        s by which its clock is late.
+    clock
+        Whether that was ``given``, ``fitted`` to this flight, or ``assumed`` to be zero: a held-out
+        flight's is never fitted.
+    conditions
+        What surrounded it, of the registry's scope ``flight``, as it was simulated; of a held-out
+        flight the mean of the fitted ones.
+    input_late
+        s by which what is fed in is stamped later than the recorded state; of a held-out flight the
+        mean of the fitted ones.
+    horizon
+        s that each simulation lasts before the next begins at the recorded state; None for a flight
+        that is simulated whole in its closed loop.
+    rmse_initial, rmse_best
+        With the initial and the best coefficients.
+    rmse_fitted_starts
+        With the best coefficients where each window's start and trim are fitted to the window: how
+        well it can be met, not how well it is predicted. None for a flight simulated whole.
+    predicted_initial, predicted_best
+        Open-loop predictions with the initial and the best coefficients, by how far they look
+        ahead; empty for a flight simulated whole.
     """
 
     name: str
@@ -112,6 +152,12 @@ class FlightResult(Part):
     conditions: dict[str, float] = Field(default_factory=dict)
     rmse_initial: AxesRmse
     rmse_best: AxesRmse
+    clock: Literal["given", "fitted", "assumed"] = "assumed"
+    input_late: float = 0.0
+    horizon: float | None = None
+    rmse_fitted_starts: AxesRmse | None = None
+    predicted_initial: tuple[PredictedErrors, ...] = ()
+    predicted_best: tuple[PredictedErrors, ...] = ()
 
 
 class SearchResult(Part):

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 def print_run(folder: Path, result: RunResult) -> None:
     """Print the coefficients, the RMSE before and after, and where everything lies."""
+    from tuner.wording.predictions import starts_in_words
     from tuner.wording.status import ending_sentence
 
     screen = console()
@@ -29,6 +30,10 @@ def print_run(folder: Path, result: RunResult) -> None:
     if result.selection:
         _print_selection(screen, result)
     screen.print(_errors(result))
+    for line in starts_in_words(result.flights):
+        screen.print(line, markup=False)
+    if any(flight.predicted_best for flight in result.flights):
+        screen.print(_predictions(result))
     search = result.search
     screen.print(
         f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "
@@ -156,6 +161,27 @@ def _errors(result: RunResult) -> Table:
             cells.append(f"{_number(before)} → {_number(after)}")
         held_out = " (held out)" if flight.split == "holdout" else ""
         table.add_row(flight.name + held_out, *cells)
+    return table
+
+
+def _predictions(result: RunResult) -> Table:
+    """Return the open-loop predictions' errors, before and after the fit."""
+    from tuner.wording.predictions import PREDICTED
+
+    title = "Open-loop predictions from recorded states: mean error, initial → best coefficients"
+    table = Table(box=None, title=title, title_justify="left")
+    table.add_column("flight")
+    table.add_column("after", justify="right")
+    for name, unit in PREDICTED.items():
+        table.add_column(f"{name.replace('_', ' ')} {unit}", justify="right")
+    for flight in result.flights:
+        held_out = " (held out)" if flight.split == "holdout" else ""
+        for before, after in zip(flight.predicted_initial, flight.predicted_best, strict=True):
+            cells = [
+                f"{_number(getattr(before, name))} → {_number(getattr(after, name))}"
+                for name in PREDICTED
+            ]
+            table.add_row(flight.name + held_out, f"{after.seconds:g} s", *cells)
     return table
 
 

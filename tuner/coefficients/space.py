@@ -206,6 +206,7 @@ def space_of(
     joint_prior: JointPrior | None = None,
     *,
     bypassed: Collection[str] = (),
+    freed: Collection[str] = (),
 ) -> Space:
     """Return what a job fits.
 
@@ -219,6 +220,8 @@ def space_of(
         What ground measurements say.
     bypassed
         Coefficients that do not act on the job's flights: they stay as they are.
+    freed
+        Coefficients that are free besides the usual ones.
 
     Raises
     ------
@@ -226,7 +229,7 @@ def space_of(
         Nothing is free, bounds exclude or pin the start, a tie names a fixed coefficient, or a free
         coefficient belongs to something that does not fly.
     """
-    free = _free_names(job, bypassed)
+    free = _free_names(job, bypassed, freed)
     values = initial_values(vehicle, controller, free)
     for name in free:
         if name not in values:
@@ -254,8 +257,8 @@ def space_of(
     return Space(parameters, {n: v for n, v in values.items() if n not in free}, joint_prior)
 
 
-def _free_names(job: JobFile, bypassed: Collection[str]) -> tuple[str, ...]:
-    wanted = {n for n, row in COEFFICIENTS.items() if row.free} - set(job.fixed)
+def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:
+    wanted = {n for n, row in COEFFICIENTS.items() if row.free or n in freed} - set(job.fixed)
     wanted = wanted if job.free is None else set(job.free)
     free = tuple(name for name in COEFFICIENTS if name in wanted and name not in bypassed)
     if not free:

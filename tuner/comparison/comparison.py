@@ -3,9 +3,9 @@
 Simulation and reading at the stamps are those of the fit (`tuner.objective.residuals`), and so are
 the stretches: whole flights where the reference enters, windows from recorded starts where a signal
 further down does. A simulation that is fed motor commands, rotor speeds or rate set-points drifts
-away within seconds, whatever its coefficients; over a window its error says how good they are. What
-no recording holds exactly, a window's start and the trim of its rotors, is the likeliest one for
-the vehicle that flies.
+away within seconds, whatever its coefficients; over a window its error says how good they are. A
+window starts from the recorded state, so that its end is predicted; how closely it is met from the
+likeliest start for the vehicle that flies, and with the likeliest trim, is another number.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Criterion, Point, units_of
-from tuner.objective.inlets import INLETS
+from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import (
@@ -52,6 +52,7 @@ from tuner.objective.segments import (
     segments_of,
     window_segments,
 )
+from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
 from tuner.padding import padded_size
 from tuner.recordings import Recording
@@ -83,7 +84,8 @@ class Comparison:
     controller
         What flew.
     window
-        s, length of the windows of flights that are not simulated in a closed loop.
+        s, length of the windows of flights that are not simulated in a closed loop; None takes
+        that of their inlet.
 
     Raises
     ------
@@ -92,15 +94,31 @@ class Comparison:
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], controller: ControllerFile, *, window: float = 1.0
+        self,
+        recordings: Sequence[Recording],
+        controller: ControllerFile,
+        *,
+        window: float | None = None,
     ) -> None:
         self._names = [recording.flight.name for recording in recordings]
         by_inlet: dict[InletName, list[Recording]] = {}
         for recording in recordings:
             by_inlet.setdefault(recording.inlet, []).append(recording)
         self._groups = [
-            _Group(members, controller, inlet, window) for inlet, members in by_inlet.items()
+            _Group(members, controller, inlet, window_seconds([inlet], window))
+            for inlet, members in by_inlet.items()
         ]
+
+    def fly_from_fitted_starts(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+        """Return what `fly` does of flights in windows, but from the likeliest starts and trims.
+
+        These are fitted to each window: how well the vehicle can meet it, not how well it predicts.
+        """
+        errors: dict[str, FlightErrors] = {}
+        for group in self._groups:
+            if group.windowed:
+                errors |= group.fly(vehicle, fitted_starts=True)
+        return {name: errors[name] for name in self._names if name in errors}
 
     def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
@@ -129,22 +147,15 @@ class _Group:
         self._recordings, self._controller = tuple(recordings), controller
         self._schedule = schedule_of(controller)
         self._has_mixer = INLETS[inlet].has_mixer
-        self._windowed = not INLETS[inlet].closed_loop
-        self._seconds = seconds
+        self._inlet, self._seconds = inlet, seconds
+        self.windowed = not INLETS[inlet].closed_loop
         self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
-        if self._windowed:
+        if self.windowed:
             self._windows = [
                 windows_of(flight, seconds, fed=INLETS[inlet].fed(flight)) for flight in flights
             ]
-            self._segments = window_segments(
-                flights,
-                inlets=[inlet] * len(flights),
-                seconds=seconds,
-                schedule=self._schedule,
-                lag=LAG,
-                noise=noise_of(flights),
-            )
+            self._segments = self._laid(free_starts=False)
             self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
         else:
             self._windows = [(Window(flight, 0.0),) for flight in flights]
@@ -161,22 +172,43 @@ class _Group:
             for name in names
         }
 
-    def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+    def _laid(self, *, free_starts: bool) -> Segments:
+        """Return the windows, which start as recorded or near there."""
+        flights = [recording.flight for recording in self._recordings]
+        return window_segments(
+            flights,
+            inlets=[self._inlet] * len(flights),
+            seconds=self._seconds,
+            schedule=self._schedule,
+            lag=LAG,
+            noise=noise_of(flights),
+            free_starts=free_starts,
+            input_late={r.flight.name: r.input_late for r in self._recordings},
+        )
+
+    def fly(self, vehicle: VehicleFile, *, fitted_starts: bool = False) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
         if self._has_mixer:
             check_mixer(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         owner = np.asarray(self._segments.flight)
+        segments, states = self._segments, None
+        if fitted_starts:
+            segments = self._laid(free_starts=True)
+            states = jnp.asarray(self._likeliest_starts(model, segments))
+        elif self.windowed:
+            segments = self._spinning(vehicle)
         simulated, acted, crash_times = _flown(
             model,
-            self._segments,
+            segments,
             jnp.asarray(self._late),
             {name: jnp.asarray(values[owner]) for name, values in self._conditions.items()},
             schedule=self._schedule,
             samples=self._samples,
             limits=self._limits,
-            states=jnp.asarray(self._likeliest_starts(model)) if self._windowed else None,
+            windowed=self.windowed,
+            states=states,
             stride=self._stride,
         )
         errors, first = {}, 0
@@ -191,7 +223,7 @@ class _Group:
                 )
                 for signal in POSE
             )
-            crashed = not self._windowed and crash <= flight.duration
+            crashed = not self.windowed and crash <= flight.duration
             errors[flight.name] = FlightErrors(
                 flight.name,
                 position,
@@ -208,7 +240,7 @@ class _Group:
         measured = self._segments.measured[signal]
         time = np.asarray(measured.time)[:, segment]
         used = (np.asarray(measured.weight)[..., segment] > 0).all(axis=1)
-        if self._windowed:  # the next one begins where this one ends
+        if self.windowed:  # the next one begins where this one ends
             used &= time < window.flight.duration
         recorded = np.asarray(measured.values)[used, :, segment]
         flown = simulated[used, :, segment]
@@ -227,7 +259,7 @@ class _Group:
         of_term = {name: np.asarray(values) for name, values in in_order(acted).items()}
         count = len(next(iter(of_term.values())))
         time = np.arange(count) * self._stride / self._schedule.log_rate
-        shown = time < (self._seconds if self._windowed else end)
+        shown = time < (self._seconds if self.windowed else end)
         segments = range(first, first + len(windows))
         whole = Forces(
             np.concatenate([time[shown] + window.begin for window in windows]),
@@ -236,15 +268,24 @@ class _Group:
                 for name, values in of_term.items()
             },
         )
-        return whole.before(windows[0].flight.duration) if self._windowed else whole
+        return whole.before(windows[0].flight.duration) if self.windowed else whole
 
-    def _likeliest_starts(self, model: Model) -> Array:
+    def _spinning(self, vehicle: VehicleFile) -> Segments:
+        """Return the windows whose rotors without tachometer have followed their commands."""
+        motor = vehicle.motor
+        lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
+        pieces = [window.flight for windows in self._windows for window in windows]
+        turning = jnp.asarray(np.stack([recent_command(piece, lag) for piece in pieces], axis=-1))
+        segments: Segments = eqx.tree_at(lambda s: s.turning, self._segments, turning)
+        return segments
+
+    def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
         """Return the likeliest starts (L, F), in the segments' standard deviations."""
-        assert self._segments.freedom is not None
+        assert segments.freedom is not None
         names, flights = tuple(self._conditions), len(self._recordings)
         objective = Objective(
             model,
-            self._segments,
+            segments,
             Space([], {}),
             self._schedule,
             self._samples,
@@ -257,11 +298,11 @@ class _Group:
         ]
         none = np.zeros((len(OFFSETS), flights))
         point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
-        states = np.zeros(self._segments.freedom.shape)
+        states = np.zeros(segments.freedom.shape)
         for _ in range(ROUNDS):
             criterion = Criterion(
                 horizon=jnp.asarray(self._samples),
-                scale={name: jnp.full(flights, LOOSE) for name in self._segments.measured},
+                scale={name: jnp.full(flights, LOOSE) for name in segments.measured},
                 reference_offset=jnp.zeros((len(CLOCKS), flights)),
                 huber=jnp.asarray(jnp.inf),
                 prior=jnp.asarray(1.0),
@@ -282,6 +323,7 @@ def _flown(
     schedule: Schedule,
     samples: int,
     limits: Limits,
+    windowed: bool,
     states: Float[JaxArray, "L F"] | None,
     stride: int,
 ) -> tuple[
@@ -296,7 +338,6 @@ def _flown(
     A stamp that is so late that it was taken before the simulation begins, or so early that it was
     taken behind its end, is compared with the simulation's first or last sample.
     """
-    windowed = states is not None
     rollout = simulate_segments(
         model,
         segments,

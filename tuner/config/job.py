@@ -117,7 +117,7 @@ class Search(Section):
     robust
         ``huber`` bounds the pull of outliers, ``none`` is plain least squares.
     window
-        s, length of the windows of inlets below ``reference``.
+        s, length of the windows of inlets below ``reference``; None leaves the inlet's own.
     max_iterations
         Of each stage.
     """
@@ -127,7 +127,7 @@ class Search(Section):
     starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
     spread: Annotated[Number, Interval(gt=1, le=10)] = 2.0
     robust: Literal["huber", "none"] = "huber"
-    window: Annotated[Number, Interval(ge=0.1, le=60)] = 1.0
+    window: Annotated[Number, Interval(ge=0.1, le=60)] | None = None
     max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100
 
 

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
-from tuner.recordings import read_recordings, with_conditions, with_offsets
+from tuner.recordings import read_recordings, with_conditions, with_inputs_late, with_offsets
 from tuner.result import AxesRmse, Run, RunResult
 
 
@@ -39,6 +39,7 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")
     on_time = with_offsets(recordings, {name: f.time_offset for name, f in wanted.items()})
     on_time = with_conditions(on_time, {name: f.conditions for name, f in wanted.items()})
+    on_time = with_inputs_late(on_time, {name: f.input_late for name, f in wanted.items()})
     window = settings.job.search.window
     flown = Comparison(on_time, settings.controller, window=window).fly(vehicle)
     return {name: errors.rmse for name, errors in flown.items()}

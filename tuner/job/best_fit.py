@@ -6,7 +6,6 @@ import numpy as np
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.comparison import Comparison
-from tuner.comparison.errors import FlightErrors
 from tuner.config import ControllerFile, VehicleFile, initial_values, with_values
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT, units_of
@@ -86,11 +85,3 @@ def comparison_of(job: Job, fitted: Fitted) -> Comparison:
     recordings = with_conditions(recordings, conditions_of(job, fitted))
     window = job.settings.job.search.window
     return Comparison(recordings, controller_flown(job, fitted), window=window)
-
-
-def validate(
-    job: Job, fitted: Fitted, vehicle: VehicleFile
-) -> tuple[dict[str, FlightErrors], dict[str, FlightErrors]]:
-    """Fly every flight whole with the initial and with the fitted vehicle."""
-    comparison = comparison_of(job, fitted)
-    return comparison.fly(job.settings.vehicle), comparison.fly(vehicle)

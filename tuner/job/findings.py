@@ -19,6 +19,10 @@ UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""
 STEPS_MATTER = 1e-4
 """s of a lag: the shipped recordings, flown at 4 kHz, are met best by one 0.14 ms too short."""
+EXPLAINED = 0.9
+"""Share of the turning below which moments of inertia are said to be effective ones."""
+LATE = 1e-3
+"""s of an input's lateness from which it is said."""
 WORSE = 0.01
 """Share by which a flight may be met worse than before the fit without a word."""
 MET_BY: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
@@ -116,6 +120,33 @@ def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
         and source.flights is not None
         and abs(source.deviation) > CONFLICT
     )
+
+
+def inputs_late(job: Job) -> tuple[Finding, ...]:
+    """Return which fitted flights' inputs are stamped late against their states."""
+    return tuple(
+        Finding(Code.INPUT_LATE, "info", r.flight.name, {"seconds": r.input_late})
+        for r in job.recordings
+        if not r.holdout and abs(r.input_late) > LATE
+    )
+
+
+def turning_unexplained(explained: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Warn where recorded inputs explain too little of how fitted flights turn.
+
+    Noise of the inputs, and the loop's own answer to what disturbs the vehicle, shrink the torque
+    that a fit finds behind an input, by up to the share that it explains (errors in variables).
+
+    Parameters
+    ----------
+    explained
+        Flight -> share of the squared change of body rate that is predicted.
+    """
+    share = float(np.median(list(explained.values()))) if explained else 1.0
+    if share >= EXPLAINED:
+        return ()
+    numbers = {"explained": share}
+    return (Finding(Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", numbers),)
 
 
 def flights_worse(

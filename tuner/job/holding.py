@@ -37,8 +37,15 @@ def with_undetermined_held(
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
 ) -> tuple[Fitted, Examination]:
-    """Return the fit once all that it does not identify is held, and its examination."""
+    """Return the fit once all that it does not identify is held, and its examination.
+
+    A fit that predicts from recorded states keeps all its values: together they predict, even where
+    the flights do not tell them apart, and each one's verdict says so.
+    """
     examination = examine(fitted)
+    segments = fitted.objective.segments
+    if segments.windowed and segments.freedom is None:
+        return fitted, examination
     for _ in range(MAX_ROUNDS):
         stand_ins = stand_ins_of(examination.uncertainty) | dict(fitted.held)
         names = sorted(set(stand_ins.values()))

@@ -95,7 +95,7 @@ def _stages(objective: Objective, job: Job) -> tuple[Stage, ...]:
         "gradient",
         objective.samples,
         float(objective.schedule.log_rate),
-        windows=objective.segments.freedom is not None,
+        windows=objective.segments.windowed,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )

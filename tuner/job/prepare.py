@@ -17,7 +17,7 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.model import model_of, schedule_of
 from tuner.objective.battery import require_voltage, with_reference_voltage
-from tuner.objective.inlets import INLETS, bypassed_by
+from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, segments_of, window_segments
@@ -29,6 +29,8 @@ from tuner.recordings import Recording
 #: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
 SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
 
+OVERLAP = 0.5
+"""Share of a window after which the next one begins, where windows start as recorded."""
 CLIPPED = 0.005
 """A recorded command below this is a rotor clipped low."""
 
@@ -131,6 +133,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         job,
         settings.bench,
         bypassed=bypassed_by(inlets, fitted),
+        freed=freed_by(inlets, terms=job.terms == "auto"),
     )
     if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
         require_voltage(fitted)
@@ -154,20 +157,23 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
             conditions=_conditions(job, segments.measured),
         )
 
-    windows = None
+    seconds = window_seconds(inlets, job.search.window)
+    windows, free_starts = None, not all(INLETS[inlet].starts_recorded for inlet in inlets)
+    stride = None if free_starts else OVERLAP * seconds
     if not closed or not all(begins_gently(flight) for flight in fitted):
         segments = window_segments(
             on_time,
             inlets=inlets,
-            seconds=job.search.window,
+            seconds=seconds,
             schedule=schedule,
             lag=settings.vehicle.motor.time_constant_up,
             noise=noise,
             weights=_weights(settings, fitted, whole=False),
+            stride=stride,
+            free_starts=free_starts,
+            input_late={recording.flight.name: recording.input_late for recording in to_fit},
         )
-        windows = problem(
-            segments, min(longest, job.search.window + 1.0 / fitted[0].rate), AIRBORNE
-        )
+        windows = problem(segments, min(longest, seconds + 1.0 / fitted[0].rate), AIRBORNE)
     if closed:
         whole = segments_of(
             on_time,

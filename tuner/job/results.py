@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from pydantic import JsonValue
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.comparison.errors import FlightErrors
 from tuner.config import VehicleFile, write_vehicle
 from tuner.disk import write_text
 from tuner.files import csv_text
-from tuner.flights.flight import Flight
 from tuner.job.best_fit import (
     best_values,
     conditions_of,
@@ -22,14 +21,16 @@ from tuner.job.best_fit import (
     initial_of,
     offsets_of,
 )
+from tuner.job.held_out import Validation
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
+from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.segments import OFFSETS
+from tuner.recordings import Recording
 from tuner.result import (
     BEST_FIT_FILE,
     RMSE_UNITS,
-    AxesRmse,
     CoefficientResult,
     Ending,
     FlightResult,
@@ -60,14 +61,13 @@ def result_of(
     job: Job,
     fitted: Fitted,
     uncertainty: Uncertainty,
-    errors: tuple[Mapping[str, FlightErrors], Mapping[str, FlightErrors]],
+    validation: Validation,
     *,
     sources: Mapping[str, Sources] | None = None,
     command: str = "",
     selection: tuple[SelectionRow, ...] = (),
 ) -> RunResult:
     """Assemble ``result.json``."""
-    initial, best = errors
     settings = job.settings
     return RunResult(
         status=Status.CONVERGED if fitted.converged else Status.STOPPED,
@@ -89,10 +89,7 @@ def result_of(
         },
         coefficients=_coefficients(job, fitted, uncertainty),
         sources=dict(sources or {}),
-        flights=tuple(
-            _flight(job, fitted, flight, initial[flight.name].rmse, best[flight.name].rmse)
-            for flight in job.flights
-        ),
+        flights=tuple(_flight(job, fitted, recording, validation) for recording in job.recordings),
         findings=fitted.findings,
         search=SearchResult(
             method=fitted.method,
@@ -201,20 +198,37 @@ def _interval(pair: tuple[float, float]) -> tuple[float, float] | None:
     return (low, high) if np.isfinite(low) and np.isfinite(high) else None
 
 
-def _flight(
-    job: Job, fitted: Fitted, flight: Flight, initial: AxesRmse, best: AxesRmse
-) -> FlightResult:
+def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validation) -> FlightResult:
+    flight, name = recording.flight, recording.flight.name
+    met = validation.fitted_starts.get(name)
+    horizon = None
+    if not INLETS[recording.inlet].closed_loop:
+        horizon = window_seconds([recording.inlet], job.settings.job.search.window)
     return FlightResult(
         name=flight.name,
         path=flight.path,
         sha256=flight.sha256,
-        split="holdout" if flight in job.held_out else "fit",
+        split="holdout" if recording.holdout else "fit",
         duration=flight.duration,
         time_offset=offsets_of(job, fitted).get(flight.name, 0.0),
         conditions=conditions_of(job, fitted)[flight.name],
-        rmse_initial=initial,
-        rmse_best=best,
+        rmse_initial=validation.initial[name].rmse,
+        rmse_best=validation.best[name].rmse,
+        clock=_clock(job, fitted, recording),
+        input_late=recording.input_late,
+        horizon=horizon,
+        rmse_fitted_starts=None if met is None else met.rmse,
+        predicted_initial=validation.predicted_initial.get(name, ()),
+        predicted_best=validation.predicted_best.get(name, ()),
     )
+
+
+def _clock(job: Job, fitted: Fitted, recording: Recording) -> Literal["given", "fitted", "assumed"]:
+    """Return where a flight's clock offset comes from."""
+    if recording.time_offset is not None:
+        return "given"
+    moved = offsets_of(job, fitted).get(recording.flight.name, 0.0) != 0.0
+    return "fitted" if moved and not recording.holdout else "assumed"
 
 
 def write_folder(folder: Path, result: RunResult, vehicle: VehicleFile, job: Job) -> None:

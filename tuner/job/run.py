@@ -19,19 +19,27 @@ from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
-from tuner.job.best_fit import validate, vehicle_fitted
+from tuner.job.best_fit import vehicle_fitted
 from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate
 from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.findings import finer_than_steps, flights_worse, ground_conflicts
+from tuner.job.findings import (
+    finer_than_steps,
+    flights_worse,
+    ground_conflicts,
+    inputs_late,
+    turning_unexplained,
+)
 from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
+from tuner.job.held_out import validate
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
 from tuner.job.selection import with_terms_selected
+from tuner.prediction.input_lag import with_inputs_on_time
 from tuner.recordings import read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
@@ -88,8 +96,9 @@ def run(
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
     recordings, left_out = read_usable(settings)
+    recordings = with_inputs_on_time(recordings, settings.vehicle)
     job = with_first_terms(job_of(settings, recordings))
-    findings = (*left_out, *check(job))
+    findings = (*left_out, *inputs_late(job), *check(job))
     _report(findings, listener, force=force)
 
     make_folder(folder)
@@ -114,8 +123,11 @@ def run(
     _report(conflicts, listener, force=True)
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
-    initial, best = validate(job, fitted, vehicle)
-    worse = flights_worse(initial, best)
+    validation = validate(job, fitted, vehicle)
+    worse = (
+        *flights_worse(validation.initial, validation.best),
+        *turning_unexplained(validation.turning_explained),
+    )
     _report(worse, listener, force=True)
     findings = (*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts)
     fitted = replace(fitted, findings=findings)
@@ -123,13 +135,13 @@ def run(
         job,
         fitted,
         uncertainty,
-        (initial, best),
+        validation,
         sources=sources,
         command=command,
         selection=selected.rows,
     )
     write_folder(folder, result, vehicle, job)
-    simulations = {"initial": initial, "best": best}
+    simulations = {"initial": validation.initial, "best": validation.best}
     write_traces(folder, simulations)
     table_of(simulations).write(folder)
     write_search(folder, fitted)

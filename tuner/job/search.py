@@ -202,7 +202,7 @@ def _plan(job: Job, objective: Objective, method: str) -> tuple[Stage, ...]:
         method,
         objective.samples,
         float(objective.schedule.log_rate),
-        windows=objective.segments.freedom is not None,
+        windows=objective.segments.windowed,
         robust=settings.robust == "huber",
         steps=settings.max_iterations,
     )
@@ -232,6 +232,8 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
     free[: len(CLOCKS), list(job.offset_is_fixed)] = False
     fed = [not INLETS[inlet].closed_loop for inlet in job.inlets]
     free[CLOCKS.index("flight_controller"), fed] = False
+    if job.objective.segments.windowed and job.objective.segments.freedom is None:
+        free[: len(OFFSETS)] = False  # a recorded start has the recording's clock and bias
     return free
 
 

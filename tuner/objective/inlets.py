@@ -30,6 +30,7 @@ from sim_jax.inlet import (
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
+from tuner.coefficients import term_groups
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
@@ -64,6 +65,16 @@ MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""
 
 
+STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
+"""Rotors differ and the mass is never quite in the middle: recorded inputs hold a steady torque
+that turns nothing, and that a simulation which is fed with them has to know of."""
+
+
+AIR = ("linear_drag", "angular_drag", "flapping_moment", "thrust_inflow")
+"""Groups of terms by which air damps any multirotor that moves and turns: no loop hides them here,
+and without them the torque of the recorded inputs is what has to stand in for the damping."""
+
+
 class RecordedInlet(ABC):
     """How recordings feed an inlet of the simulator."""
 
@@ -76,11 +87,19 @@ class RecordedInlet(ABC):
     """Channels that are fed in or left out, so that the simulation says nothing about them."""
     ignores: ClassVar[tuple[str, ...]]
     """Parts of a segment's start (`tuner.objective.initial_conditions.STATES`) that do not act."""
+    starts_recorded: ClassVar[bool] = True
+    """Whether a recording holds all of the state that a window starts from: no integrator."""
+    window: ClassVar[float] = 0.5
+    """s, length of a window: open loop, attitude strays within a second whatever it is fed."""
     closed_loop: ClassVar[bool] = False
     """Whether the position controller is simulated: it keeps a whole flight to its path, and the
     recording's clock is the reference's rather than the flight controller's."""
     bypasses: ClassVar[tuple[str, ...]] = ()
     """Coefficients of the stages upstream, of which the simulation then says nothing."""
+    frees: ClassVar[tuple[str, ...]] = ()
+    """Coefficients that are free besides the usual ones: what no loop takes out by itself."""
+    terms: ClassVar[tuple[str, ...]] = ()
+    """Groups of terms that are free from the beginning where the job leaves the choice."""
     has_mixer: ClassVar[bool] = False
     """Whether the mixer, which is that of a quad X, is simulated."""
     remedy: ClassVar[str] = "use inlet: auto"
@@ -155,6 +174,8 @@ class RecordedReference(RecordedInlet):
     feeds = ReferenceInlet
     needs = ("reference_position",)
     ignores = ("trim",)
+    starts_recorded = False
+    window = 1.0
     closed_loop = True
     has_mixer = True
     remedy = "name its trajectory in the job file"
@@ -195,6 +216,8 @@ class RecordedBodyRate(RecordedInlet):
     needs = ("rate_setpoint", "thrust_setpoint")
     bypasses = ("estimate_latency",)
     ignores = ("trim",)
+    starts_recorded = False
+    window = 1.0
     has_mixer = True
 
     def update_rate(self, schedule: Schedule) -> float:
@@ -215,6 +238,8 @@ class RecordedCommand(RecordedInlet):
     needs = ("command",)
     silences = ("command", "acceleration")
     bypasses = ("estimate_latency", "gyro_cutoff")
+    frees = STEADY_TORQUE
+    terms = AIR
     ignores = ("rate_integral",)
 
     def update_rate(self, schedule: Schedule) -> float:
@@ -240,6 +265,8 @@ class RecordedRotorSpeed(RecordedInlet):
     needs = ("rotor_speed",)
     silences = ("command", "rotor_speed", "acceleration")
     bypasses = ("estimate_latency", "gyro_cutoff", *OF_MOTORS)
+    frees = STEADY_TORQUE
+    terms = AIR
     ignores = ("rotor_speed", "rate_integral")
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> RotorSpeedInlet:
@@ -284,6 +311,8 @@ class RecordedAttitude(RecordedInlet):
     silences = ("attitude", "body_rate", "command", "rotor_speed")
     bypasses = ("estimate_latency", "gyro_cutoff", *TURNING)
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
+    starts_recorded = False
+    window = 1.0
     remedy = "record motor commands, rotor speeds or thrust set-points beside the pose"
 
     #: What turns the rotors, the most direct first.
@@ -364,6 +393,32 @@ def bypassed_by(names: Sequence[InletName], flights: Sequence[Flight]) -> frozen
     """Return the coefficients that act on no flight, each entering through its own inlet."""
     pairs = zip(names, flights, strict=True)
     return frozenset.intersection(*(INLETS[name].bypassed(flight) for name, flight in pairs))
+
+
+def freed_by(names: Collection[InletName], *, terms: bool) -> frozenset[str]:
+    """Return the coefficients that flights through some inlets ask for besides the usual ones.
+
+    Parameters
+    ----------
+    names
+        Of the inlets.
+    terms
+        Whether those of terms beyond the motor model are among them.
+    """
+    groups = term_groups()
+    of_inlet = [
+        {
+            *INLETS[name].frees,
+            *(member for g in INLETS[name].terms if terms for member in groups[g]),
+        }
+        for name in names
+    ]
+    return frozenset(set.intersection(*of_inlet))
+
+
+def window_seconds(names: Collection[InletName], given: float | None) -> float:
+    """Return the s of the windows of some inlets: those given, or the longest of their own."""
+    return max(INLETS[name].window for name in names) if given is None else given
 
 
 def inlet_of(names: Sequence[InletName], flights: Sequence[Flight], schedule: Schedule) -> Inlet:

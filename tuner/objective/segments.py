@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from sim_jax.state import Start
 from tuner.coefficients import recording_offsets
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
-from tuner.flights.flight import Flight
+from tuner.flights.flight import Flight, Series
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import freedom_of
 from tuner.objective.inlets import INLETS, inlet_of
@@ -85,6 +87,11 @@ class Segments(eqx.Module):
     """Standard deviations of the start (`tuner.objective.initial_conditions`); None if known."""
 
     @property
+    def windowed(self) -> bool:
+        """Whether they are windows of flights rather than whole ones."""
+        return self.begin is not None
+
+    @property
     def begins(self) -> NDArray[np.float64]:
         """The s (F,) since the missions' starts at which the segments begin."""
         return np.zeros(self.count) if self.begin is None else np.asarray(self.begin)
@@ -149,8 +156,11 @@ def window_segments(
     lag: float,
     noise: Mapping[str, float],
     weights: Mapping[str, Mapping[str, float]] | None = None,
+    stride: float | None = None,
+    free_starts: bool = True,
+    input_late: Mapping[str, float] = MappingProxyType({}),
 ) -> Segments:
-    """Lay the windows of all flights side by side, their starts free.
+    """Lay the windows of all flights side by side.
 
     Parameters
     ----------
@@ -165,16 +175,40 @@ def window_segments(
         at a start.
     noise, weights
         As of `segments_of`.
+    stride
+        s from the beginning of a window to that of the next; by default its length.
+    free_starts
+        Whether starts are free, about the widely smoothed state; else they are the recorded states
+        (`tuner.flights.states`).
+    input_late
+        Flight name -> s by which what is fed in is stamped later than what it is compared with.
     """
     cut = [
         (number, window)
         for number, (flight, name) in enumerate(zip(flights, inlets, strict=True))
-        for window in windows_of(flight, seconds, fed=INLETS[name].fed(flight))
+        for window in windows_of(
+            flight,
+            seconds,
+            fed=INLETS[name].fed(flight),
+            stride=stride,
+            smoothed_widely=free_starts,
+        )
     ]
-    pieces = [window.flight for _, window in cut]
+    pieces = [
+        on_time(
+            window.flight,
+            INLETS[inlets[number]].fed(window.flight),
+            input_late.get(window.flight.name, 0.0),
+        )
+        for number, window in cut
+    ]
     start = start_of([piece.initial for piece in pieces], resting=False)
     names = [inlets[number] for number, _ in cut]
-    freedom = np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
+    freedom = None
+    if free_starts:
+        freedom = jnp.asarray(
+            np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
+        )
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
@@ -195,8 +229,19 @@ def window_segments(
         log_voltage=log_voltage_of(
             [flights[number] for number, _ in cut], [window for _, window in cut], schedule
         ),
-        freedom=jnp.asarray(freedom),
+        freedom=freedom,
     )
+
+
+def on_time(flight: Flight, signals: Sequence[str], late: float) -> Flight:
+    """Return a flight some of whose signals are stamped earlier by so many s."""
+    if late == 0.0:
+        return flight
+    moved = {
+        name: Series(flight.series[name].time - late, flight.series[name].values)
+        for name in signals
+    }
+    return replace(flight, series={**flight.series, **moved})
 
 
 def _all_measured(

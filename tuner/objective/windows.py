@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, Series
+from tuner.flights.flight import Flight, InitialState, Series
 from tuner.flights.initial import initial_state
+from tuner.flights.states import states_at
 
 BEFORE = 1.2
 """s of a recording before a window that may help to estimate its start."""
@@ -43,7 +44,14 @@ class Window:
     begin: float
 
 
-def windows_of(flight: Flight, seconds: float, *, fed: Collection[str] = ()) -> tuple[Window, ...]:
+def windows_of(
+    flight: Flight,
+    seconds: float,
+    *,
+    fed: Collection[str] = (),
+    stride: float | None = None,
+    smoothed_widely: bool = True,
+) -> tuple[Window, ...]:
     """Cut a flight into windows of so many s, one behind the other.
 
     A stretch with hardly a pose in it is left out, and so are one in which a signal that is fed in
@@ -57,18 +65,26 @@ def windows_of(flight: Flight, seconds: float, *, fed: Collection[str] = ()) -> 
         s, length of a window.
     fed
         Signals that are fed into the simulation.
+    stride
+        s from the beginning of a window to that of the next; by default its length.
+    smoothed_widely
+        Whether a window's initial state is smoothed over a tenth of a second on either side, for
+        a start that stays free; else it is the recorded state of `tuner.flights.states`.
 
     Raises
     ------
     RecordingError
         No stretch of the flight holds enough poses and enough of what is fed in.
     """
-    stretches = _stretches(flight, seconds)
+    stretches = _stretches(flight, seconds, stride)
+    usable = [(first, last) for first, last in stretches if _is_fed(flight, first, last, fed)]
+    begins = flight.time[[first for first, _ in usable]]
+    states = None if smoothed_widely or not usable else states_at(flight.series, begins)
     windows = [
         window
-        for first, last in stretches
-        if _is_fed(flight, first, last, fed)
-        and (window := _window(flight, first, last)) is not None
+        for number, (first, last) in enumerate(usable)
+        if (window := _window(flight, first, last, None if states is None else states.at(number)))
+        is not None
     ]
     if not windows:
         if any(_is_fed(flight, first, last, ()) for first, last in stretches):
@@ -93,7 +109,7 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
     RecordingError
         Names what is missing, and in how much of the flight.
     """
-    stretches = _stretches(flight, seconds)
+    stretches = _stretches(flight, seconds, None)
     for what, names in ((" and ".join(fed), fed), ("pose", ())):
         usable = sum(_is_fed(flight, first, last, names) for first, last in stretches)
         if usable < MOSTLY * len(stretches):
@@ -105,12 +121,13 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
             )
 
 
-def _stretches(flight: Flight, seconds: float) -> list[tuple[int, int]]:
+def _stretches(flight: Flight, seconds: float, stride: float | None) -> list[tuple[int, int]]:
     """Return the first and last tick of every stretch that may become a window."""
     count = max(1, round(seconds * flight.rate))
+    every = count if stride is None else max(1, round(stride * flight.rate))
     return [
         (first, min(first + count, len(flight.time) - 1))
-        for first in range(0, len(flight.time) - count // 2, count)
+        for first in range(0, len(flight.time) - count // 2, every)
     ]
 
 
@@ -138,7 +155,7 @@ def _is_fed(flight: Flight, first: int, last: int, fed: Collection[str]) -> bool
     return True
 
 
-def _window(flight: Flight, first: int, last: int) -> Window | None:
+def _window(flight: Flight, first: int, last: int, initial: InitialState | None) -> Window | None:
     begin, end = float(flight.time[first]), float(flight.time[last])
     series = _around(flight.series, begin, end)
     stretch = replace(
@@ -146,7 +163,7 @@ def _window(flight: Flight, first: int, last: int) -> Window | None:
         time=flight.time[first : last + 1] - begin,
         signals={name: rows[first : last + 1] for name, rows in flight.signals.items()},
         series=series,
-        initial=initial_state(series),
+        initial=initial_state(series) if initial is None else initial,
     )
     known = (stretch.initial.position, stretch.initial.velocity, stretch.initial.attitude)
     return Window(stretch, begin) if all(np.isfinite(part).all() for part in known) else None

@@ -8,7 +8,7 @@ from typing import Any
 from tuner.findings import Code, Finding
 from tuner.flights.damage import Cause, Damage
 from tuner.wording.damage import damage_sentence
-from tuner.wording.phrases import as_sentence, listed
+from tuner.wording.phrases import as_sentence, listed, percent
 
 #: Code -> what was noticed and what to do about it: text with the finding's numbers in braces,
 #: ``names`` for its names, ``first`` and ``second`` for one of them, ``subject`` for its subject.
@@ -79,6 +79,22 @@ TEXTS: Mapping[Code, tuple[str, str]] = {
     ),
     Code.CLOCK_OFFSET: (
         "The {first} clock is {milliseconds:+.2f} ms late, which the fit takes into account.",
+        "",
+    ),
+    Code.TURNING_UNEXPLAINED: (
+        (
+            "The recorded inputs explain {explained_percent} of the change of body rate over half "
+            "a second. Noise in them, and the loop's answer to disturbances, make their torque "
+            "look weaker than it is: inertia and lags are those that predict best, and inertia "
+            "may be several times too large, whatever its interval says."
+        ),
+        "Log inputs at the rate loop's rate, or measure the inertia on the ground (tune bench).",
+    ),
+    Code.INPUT_LATE: (
+        (
+            "What is fed into the simulation is stamped {milliseconds:+.2f} ms late against the "
+            "recorded state, which the fit takes into account."
+        ),
         "",
     ),
     Code.GYRO_OFFSET: (
@@ -212,6 +228,7 @@ def _values(finding: Finding) -> dict[str, object]:
         values["coefficients"] = listed(finding.names)
     seconds = finding.numbers.get("seconds", 0.0)
     values["unit"] = finding.names[-1] if finding.names else ""
+    values["explained_percent"] = percent(max(finding.numbers.get("explained", 0.0), 0.0))
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
     changed = finding.numbers.get("changed")
     lower = "ended lower, and its result was kept" if changed else "ended no lower"

@@ -29,7 +29,11 @@ def test_held_out_flights_are_met_twice_as_well_as_by_the_unfitted_vehicle(tmp_p
     for flight in held:
         for axis, before in flight.rmse_initial:
             assert getattr(flight.rmse_best, axis) < 0.5 * before, (flight.name, axis)
-    assert result.coefficients["motor_constant"].identifiable is False
-    assert "fitted with input_scaling held" in result.coefficients["motor_constant"].note
-    assert 0 < result.settings["window_starts"]["trim"] < 0.1
+        assert flight.horizon == 0.5
+        assert flight.input_late == pytest.approx(0.0, abs=2e-3)
+        (_, before), (_, after) = flight.predicted_initial, flight.predicted_best
+        for name in ("position", "velocity", "attitude", "body_rate"):
+            assert getattr(after, name) < 0.5 * getattr(before, name), (flight.name, name)
+    assert result.settings["window_starts"] == {}
+    assert result.coefficients["torque_trim_x"].best != 0.0
     assert (folder / "report.html").exists()

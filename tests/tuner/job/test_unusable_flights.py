@@ -16,8 +16,8 @@ from tuner.findings import Code, Finding
 from tuner.flights.flight import Series
 from tuner.flights.outliers import HONEST, sticking_out
 from tuner.job.check import said_once
-from tuner.job.findings import flights_worse
-from tuner.objective.inlets import INLETS, bypassed_by
+from tuner.job.findings import flights_worse, turning_unexplained
+from tuner.objective.inlets import INLETS, bypassed_by, freed_by
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings import read_usable, recordings_of
@@ -124,3 +124,23 @@ def test_a_flight_that_a_fit_left_worse_is_named():
         "attitude",
     }
     assert flights_worse(crashed, crashed) == ()
+
+
+def test_what_no_loop_takes_out_is_free_where_inputs_are_fed_in(updated):
+    def names(*inlets, terms):
+        freed = freed_by(inlets, terms=terms)
+        return set(space_of(updated, ControllerFile(), JobFile(), freed=freed).names)
+
+    usual = names("reference", "rotor_speed", terms=True)
+    trims = {"torque_trim_x", "torque_trim_y", "torque_trim_z"}
+    assert not usual & trims
+    assert names("rotor_speed", terms=False) == usual | trims
+    more = names("rotor_speed", "actuator", terms=True)
+    assert {"angular_drag_x", "linear_drag_y", "thrust_inflow_coefficient"} <= more - usual - trims
+
+
+def test_inputs_that_hardly_explain_how_a_flight_turns_are_named():
+    (weak,) = turning_unexplained({"a": 0.4, "b": 0.5, "c": 0.99})
+    assert (weak.code, weak.numbers["explained"]) == (Code.TURNING_UNEXPLAINED, 0.5)
+    assert turning_unexplained({"a": 0.97}) == ()
+    assert turning_unexplained({}) == ()

@@ -78,6 +78,10 @@ MADE = {
     Code.CLOCK_OFFSET: Finding(
         Code.CLOCK_OFFSET, "info", "a", {"seconds": -0.012}, ("flight_controller",)
     ),
+    Code.TURNING_UNEXPLAINED: Finding(
+        Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", {"explained": 0.41}
+    ),
+    Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
     Code.FLIGHT_UNMATCHED: Finding(
         Code.FLIGHT_UNMATCHED, "warning", "a", {"position": 90.0, "body_rate": 12.0}

@@ -1,0 +1,166 @@
+"""Open-loop prediction of real flights that were not fitted, against simpler predictors.
+
+Every set of recordings in the folder of real flights is fitted by ``tune`` itself, two of its
+flights held out; these are then predicted from every recorded state. No recording is stored here.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.regression import Regression
+from benchmarks.table import Section, figure
+from benchmarks.timing import ROOT
+from tuner.config import ControllerFile, Options, read_vehicle, settle
+from tuner.errors import InputError
+from tuner.flights.flight import Flight
+from tuner.job.run import run
+from tuner.objective.inlets import INLETS
+from tuner.prediction.predict import UNITS, Predictions, hold, predict, summary
+from tuner.recordings import Recording, read_usable
+from tuner.result import BEST_FIT_FILE, RunResult
+
+FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
+STEPS = (10, 50)
+"""Samples of 10 ms after which predictions are compared."""
+STRIDE = 0.02
+"""s from one prediction to the next."""
+JOBS: Mapping[str, str] = {"nanobench": "crazyflie"}
+"""Set -> shipped job file, where it holds no ``tune.yaml`` of its own."""
+HELD_OUT: Mapping[str, tuple[str, ...]] = {
+    "nanobench": ("B2_circle_slow_rep1", "B3_figure8_medium_rep1")
+}
+"""Set -> flights that are held out; of another set the last two of four or more."""
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A set of recordings, and each predictor's predictions of its held-out flights."""
+
+    held_out: tuple[str, ...]
+    fitted: int
+    seconds: float
+    predictions: Mapping[str, Sequence[Predictions]]
+
+
+def measure() -> Section:
+    """Fit and predict every set that is there."""
+    head = ["set", "predictor", "steps", *(f"{name} [{unit}]" for name, unit in UNITS.items())]
+    rows: list[list[str]] = []
+    notes = []
+    for folder in sorted(path for path in FLIGHTS.glob("*") if path.is_dir()):
+        try:
+            contest = contest_of(folder)
+        except InputError as error:
+            notes.append(f"{folder.name} takes no part: {error.what}.")
+            continue
+        held_out = " and ".join(contest.held_out)
+        notes.append(
+            f"{folder.name}: {contest.fitted} flights fitted in {contest.seconds:.0f} s, compiling "
+            f"included; {held_out} held out."
+        )
+        rows += list(_rows(folder.name, contest))
+    text = (
+        "Mean error of open-loop predictions of held-out flights, so many samples of 10 ms ahead, "
+        f"begun every {1e3 * STRIDE:.0f} ms at the recorded state (filtered within 30 ms on either "
+        "side): Euclidean distances, and for the attitude the angle between both. Nothing is "
+        "fitted to these flights. *hold* lets the state be; *linear regression* fits "
+        "accelerations to state and inputs of the fitted flights; *unfitted* is the vehicle file "
+        "that the fit starts from. "
+    )
+    return Section("Prediction of real flights", text + " ".join(notes), head, rows)
+
+
+def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
+    for predictor, predictions in contest.predictions.items():
+        for steps in STEPS:
+            means = summary(predictions, steps / 100.0)
+            yield [name, predictor, str(steps), *(figure(means[key]) for key in UNITS)]
+
+
+def contest_of(folder: Path) -> Contest:
+    """Fit a set and predict its held-out flights by all predictors.
+
+    Raises
+    ------
+    InputError
+        Its recordings cannot be fitted.
+    """
+    options = options_of(folder)
+    recordings, _ = read_usable(settle(options))
+    fitted = [recording.flight for recording in recordings if not recording.holdout]
+    held_out = [recording for recording in recordings if recording.holdout]
+    if not held_out or any(INLETS[recording.inlet].closed_loop for recording in recordings):
+        raise InputError(folder, "no flight of it can be held out and predicted open loop", "")
+    with tempfile.TemporaryDirectory() as name:
+        clock = time.perf_counter()
+        out, result = run(options, out=Path(name) / "run")
+        seconds = time.perf_counter() - clock
+        best = read_vehicle(out / BEST_FIT_FILE)
+    settings = settle(options)
+    vehicles = {"unfitted": settings.vehicle, "fitted": best}
+    late = {flight.name: flight.input_late for flight in result.flights}
+    predictions: dict[str, list[Predictions]] = {
+        vehicle: [
+            predict(
+                file,
+                controller_of(result),
+                recording.flight,
+                recording.inlet,
+                stride=STRIDE,
+                input_late=late[recording.flight.name],
+            )
+            for recording in held_out
+        ]
+        for vehicle, file in vehicles.items()
+    }
+    return Contest(
+        tuple(recording.flight.name for recording in held_out),
+        len(fitted),
+        seconds,
+        {**_simple(fitted, held_out, predictions["fitted"]), **predictions},
+    )
+
+
+def _simple(
+    fitted: Sequence[Flight], held_out: Sequence[Recording], like: Sequence[Predictions]
+) -> dict[str, list[Predictions]]:
+    """Return what predictors without physics make of the same starts."""
+    signal = INLETS[held_out[0].inlet].needs[0]
+    regression = Regression.of(fitted, signal)
+    pairs = list(zip(held_out, like, strict=True))
+    return {
+        "hold": [hold(recording.flight, same.begins, same.ahead) for recording, same in pairs],
+        "linear regression": [
+            regression.predict(recording.flight, same.begins, same.ahead)
+            for recording, same in pairs
+        ],
+    }
+
+
+def controller_of(result: RunResult) -> ControllerFile:
+    """Return the controller file of a run."""
+    return ControllerFile.model_validate(result.settings["controller"])
+
+
+def options_of(folder: Path) -> Options:
+    """Return what ``tune`` is given for a set."""
+    files = sorted(
+        path
+        for path in folder.iterdir()
+        if path.is_file() and path.suffix not in (".md", ".yaml") and path.name != "LICENSE"
+    )
+    if not files:
+        raise InputError(folder, "it holds no recording", "")
+    own, job = folder / "tune.yaml", JOBS.get(folder.name)
+    config = str(own) if own.exists() else None
+    if config is None and job is not None:
+        config = str(ROOT / "configs" / "jobs" / f"{job}.yaml")
+    held_out = HELD_OUT.get(folder.name, tuple(path.stem for path in files[-2:]))
+    given = {} if own.exists() or len(files) < 4 else {"holdout": list(held_out)}
+    return Options([str(path) for path in files], config=config, **given)

@@ -1,0 +1,78 @@
+"""Open-loop predictions: the truth predicts, nothing of the flight ahead is looked at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuner.comparison.comparison import Comparison
+from tuner.config import ControllerFile, with_values
+from tuner.flights.flight import Series
+from tuner.prediction.predict import UNITS, hold, predict, summary
+from tuner.recordings import Recording
+
+
+@pytest.fixture(scope="module")
+def truth(full_flight, updated):
+    return predict(updated, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+
+
+def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
+    naive = hold(full_flight, truth.begins, truth.ahead)
+    for name in UNITS:
+        assert truth.mean(0.5)[name] < 0.05 * naive.mean(0.5)[name], name
+    assert truth.errors["position"].shape == (50, len(truth.begins))
+    assert truth.begins[-1] + 0.5 <= full_flight.duration
+    assert naive.mean(0.5)["position"] > naive.mean(0.1)["position"] > 0.0
+
+
+def test_the_distances_are_euclidean_and_the_angle_is_geodesic(truth, full_flight):
+    naive = hold(full_flight, truth.begins[:1], truth.ahead)
+    time, place = full_flight.time, full_flight.signals["position"]
+    begin = int(np.searchsorted(time, truth.begins[0]))
+    moved = np.linalg.norm(place[begin + 50] - place[begin])
+    assert naive.errors["position"][-1, 0] == pytest.approx(moved, abs=1e-3)
+    first, last = full_flight.signals["attitude"][[begin, begin + 50]]
+    angle = 2 * np.arccos(abs(first @ last))
+    assert naive.errors["attitude"][-1, 0] == pytest.approx(angle, abs=2e-3)
+    both = summary([truth, truth], 0.5)
+    assert both == pytest.approx(truth.mean(0.5))
+
+
+def test_a_wrong_vehicle_predicts_worse_and_a_late_input_is_put_right(truth, full_flight, updated):
+    heavy = with_values(updated, {"motor_constant": 0.9 * updated.aerodynamics.motor_constant})
+    worse = predict(heavy, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+    assert worse.mean(0.5)["velocity"] > 5 * truth.mean(0.5)["velocity"]
+    speed = full_flight.series["rotor_speed"]
+    late = replace(
+        full_flight,
+        series=dict(full_flight.series) | {"rotor_speed": Series(speed.time + 0.02, speed.values)},
+    )
+    off = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2)
+    right = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2, input_late=0.02)
+    assert off.mean(0.5)["body_rate"] > 2 * right.mean(0.5)["body_rate"]
+    assert right.mean(0.5) == pytest.approx(truth.mean(0.5), rel=0.02)
+
+
+def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
+    position = full_flight.series["position"]
+    moved = position.values + np.where(position.time > truth.begins[5] + 0.1, 1.0, 0.0)[:, None]
+    changed = replace(
+        full_flight,
+        series=dict(full_flight.series) | {"position": Series(position.time, moved)},
+    )
+    elsewhere = predict(updated, ControllerFile(), changed, "rotor_speed", stride=0.2)
+    for name in ("velocity", "attitude", "body_rate"):
+        np.testing.assert_allclose(
+            elsewhere.errors[name][:, 5], truth.errors[name][:, 5], rtol=1e-9, err_msg=name
+        )
+    assert elsewhere.errors["position"][-1, 5] == pytest.approx(np.sqrt(3.0), rel=0.02)
+
+
+def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(full_flight, updated):
+    wrong = with_values(updated, {"torque_trim_x": 0.02})
+    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    predicted = comparison.fly(wrong)[full_flight.name].rmse
+    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name].rmse
+    assert predicted.roll > 3 * met.roll  # a trim in each window hides what is wrong
+    assert comparison.fly(updated)[full_flight.name].rmse.roll < 0.1 * predicted.roll
