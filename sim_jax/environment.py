@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from sim_jax.disturbance import Disturbance
 from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
 from sim_jax.trees import row_of
@@ -24,13 +27,26 @@ class Environment(eqx.Module):
     """1/s by which rotor speeds fall, where no voltage was recorded."""
     begin: Float[Array, "*batch"] | None = None
     """s since the battery began to decline at which the simulation begins; None for zero."""
+    disturbance: Disturbance | None = None
+    """Gusts, and whatever else pushes."""
 
     @property
-    def at_first(self) -> tuple[Vec3 | Scalar | None, ...]:
+    def at_first(self) -> tuple[Vec3 | Scalar | Disturbance | None, ...]:
         """The values at the first control tick, every leaf (\\*batch)."""
         series = self.log_voltage
         voltage = None if series is None else series[0]
-        return self.wind, self.battery_decline, self.begin, voltage
+        disturbance = None if self.disturbance is None else self.disturbance.at_first
+        return self.wind, self.battery_decline, self.begin, voltage, disturbance
+
+    def during(self, step: Int[Array, ""], schedule: Schedule) -> Environment:
+        """Return what surrounds the flight in a physics step: its gust is part of the wind."""
+        if self.disturbance is None:
+            return self
+        now = self.disturbance.during(step, schedule)
+        wind = self.wind
+        if now.gust is not None:
+            wind = now.gust if wind is None else wind + now.gust
+        return replace(self, wind=wind, disturbance=now)
 
     def speed_factor(
         self, battery_exponent: Scalar | None, step: Int[Array, ""], schedule: Schedule

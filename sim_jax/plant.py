@@ -191,10 +191,14 @@ class Plant(eqx.Module):
             changes = zip(speeds, state.rotor_speed, strict=True)
             accelerations = tuple((end - begin) / self.schedule.step for end, begin in changes)
 
+        around = self.environment.during(step, self.schedule)
+
         def wrench_at(predicted: Motion) -> Wrench:
             motion = self.inlet.felt(predicted, step)
-            air = Air.around(self.vehicle, motion, self.environment, accelerations)
-            return total_wrench(self.vehicle, motion, acting, air)
+            air = Air.around(self.vehicle, motion, around, accelerations)
+            wrench = total_wrench(self.vehicle, motion, acting, air)
+            pushing = around.disturbance
+            return wrench if pushing is None else pushing.added_to(wrench, motion)
 
         integrator = self.schedule.integrator
         advance = _INTEGRATORS[integrator] if isinstance(integrator, str) else integrator

@@ -1,0 +1,59 @@
+"""What pushes a vehicle and is no law of its motion: gusts, turbulence, thrust that wanders."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from sim_jax.rigid_body import Motion, Wrench
+from sim_jax.schedule import Schedule
+from sim_jax.trees import row_of
+from sim_jax.vector import Vec3
+
+
+class Disturbance(eqx.Module):
+    """Series with a value for every control tick, linear in between; what is None is not there.
+
+    After its end the last value stays.
+    """
+
+    gust: Vec3 | None = None
+    """m/s, world ENU, leaves (ticks, \\*batch): the air's velocity beside the steady wind."""
+    force: Vec3 | None = None
+    """N, world ENU, leaves (ticks, \\*batch): acts at the centre of mass."""
+    thrust: Float[Array, "ticks *batch"] | None = None
+    """N along body z."""
+    moment: Vec3 | None = None
+    """N m about the centre of mass, body axes, leaves (ticks, \\*batch)."""
+
+    @property
+    def at_first(self) -> Disturbance:
+        """The values at the first control tick, every leaf (\\*batch)."""
+        first: Disturbance = jax.tree.map(lambda series: series[0], self)
+        return first
+
+    def during(self, step: Int[Array, ""], schedule: Schedule) -> Disturbance:
+        """Return the values in the middle of a physics step, every leaf (\\*batch)."""
+        ticks = (step + 0.5) * (schedule.position_control_rate / schedule.physics_rate)
+        tick = jnp.floor(ticks)
+        before, share = tick.astype(step.dtype), ticks - tick
+
+        def between(old: Array, new: Array) -> Array:
+            return old + share.astype(old.dtype) * (new - old)
+
+        now: Disturbance = jax.tree.map(between, row_of(self, before), row_of(self, before + 1))
+        return now
+
+    def added_to(self, wrench: Wrench, motion: Motion) -> Wrench:
+        """Return what acts about the centre of mass where values (\\*batch) act besides."""
+        force, moment = wrench.force, wrench.moment
+        if self.force is not None:
+            force = force + motion.attitude.to_body(self.force)
+        if self.thrust is not None:
+            force = Vec3(force.x, force.y, force.z + self.thrust)
+        if self.moment is not None:
+            moment = moment + self.moment
+        return Wrench(force, moment)
