@@ -17,9 +17,6 @@ pytestmark = pytest.mark.slow
 #: Commands that are not run, and why; `tests.docs.test_pages` holds that they are understood.
 NOT_RUN = {
     "tune --flights lab/*.bag --bench runs/bench": "a lab's own flights",
-    "tune --flights reference_flights/*.bag --cross-validate": "four fits; the engine's tests make "
-    "shorter ones",
-    "tune --flights fleet/": "a fleet",
     "tune sensitivity --flights reference_flights/circle_3mps.bag": "a minute of simulated "
     "candidates; the tests of the examination make shorter ones",
     "tune --flights nanobench/*.csv": "public flights that do not ship with the project",
