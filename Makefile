@@ -15,10 +15,10 @@ demo: $(READY)  ## fit the five recordings that ship with the project
 	$(BIN)/tune --flights reference_flights/*.bag --out runs/demo
 
 test: $(READY)  ## every test, the slow ones too
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-fast: $(READY)  ## what a change is checked against while it is being made
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 lint: $(READY)  ## style, types, and who may import whom
 	$(BIN)/ruff check .

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import tuner
+from tuner.wording.notes import note_in_words
 
 LAB = Path(__file__).resolve().parents[1] / "reference_flights"
 OUT = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/example")
@@ -20,7 +21,7 @@ flight = tuner.load_flight(LAB / "circle_3mps.bag")
 speed = np.linalg.norm(flight.signals["velocity"], axis=1)
 print(f"{flight.name}: {flight.duration:.0f} s, up to {np.nanmax(speed):.1f} m/s")
 for note in flight.notes:
-    print(f"  {note.topic or 'recording'}: {note.text}")
+    print(f"  {note.topic or 'recording'}: {note_in_words(note)}")
 
 # %% How far off are the coefficients that the vehicle's model shipped with?
 flights = [LAB / "circle_3mps.bag", LAB / "yaw_spin_3rps.bag", LAB / "circle_4mps.bag"]

@@ -220,7 +220,13 @@ def publish(
     """
     scaler = jnp.asarray(velocity_scaler, dtype=float)
     batch = jnp.broadcast_shapes(*(jnp.shape(leaf) for leaf in jax.tree.leaves((shape, scaler))))
-    pace = jnp.broadcast_to(scaler / TICK_RATE, batch)
+    return _published(shape, jnp.broadcast_to(scaler / TICK_RATE, batch), ticks, start_tick)
+
+
+@eqx.filter_jit
+def _published(shape: Shape, pace: Scalar, ticks: int, start_tick: int) -> Publication:
+    """Run the publisher at a pace in seconds of the shape per tick, compiled once per shape."""
+    batch = pace.shape
     lap_angle = 2.0 * PUBLISHER_PI
 
     def tick(

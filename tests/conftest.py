@@ -1,9 +1,10 @@
 """Double precision, the program's own set-up, and bounded memory, for every test that uses jax.
 
 A test process keeps every program that it has compiled: gibibytes by the end of the suite, for most
-modules compile their own and use them once. When a process has grown beyond `MOST_MEMORY`, all of
-them are dropped. A program that is asked for again comes from the compilation cache on disk, which
-the processes of a run share, those that tests start included; it is traced again, not compiled.
+modules compile their own and use them once. When a process has grown beyond `MOST_MEMORY`, and
+still is when what is free was given back, all of them are dropped. A program that is asked for
+again comes from the compilation cache on disk, however small it is, which the processes of a run
+share, those that tests start included; it is traced again, not compiled.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import ctypes
 import gc
 import os
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -28,7 +30,7 @@ __all__ = ["demo"]
 
 set_environment()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 settings.register_profile("project", deadline=None, derandomize=True)
@@ -36,6 +38,20 @@ settings.load_profile("project")
 
 MOST_MEMORY = 800 * 2**20
 """bytes of a test process at the end of a test beyond which its compiled programs are dropped."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files with slow tests first, and in turns those of the folders with most of them left.
+
+    Processes that take file by file then end together, and what one has compiled the other finds
+    later, rather than compiling it at the same time.
+    """
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    folders: dict[tuple[bool, Path], list[Path]] = defaultdict(list)
+    for path in dict.fromkeys(item.path for item in items):
+        folders[path in slow, path.parent].append(path)
+    behind = {path: len(paths) - i for paths in folders.values() for i, path in enumerate(paths)}
+    items.sort(key=lambda item: (item.path not in slow, -behind[item.path]))
 
 
 def resident_memory() -> int:
@@ -49,9 +65,17 @@ def resident_memory() -> int:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown() -> None:
-    """Drop what jax has compiled once the process has grown too large."""
-    if "jax" in sys.modules and resident_memory() > MOST_MEMORY:
+    """Give back what is free once the process has grown too large, then what jax has compiled."""
+    if "jax" not in sys.modules or resident_memory() <= MOST_MEMORY:
+        return
+    _give_back()
+    if resident_memory() > MOST_MEMORY:
         sys.modules["jax"].clear_caches()
-        gc.collect()
-        if sys.platform == "linux":
-            ctypes.CDLL(None).malloc_trim(0)  # what was freed goes back to the system
+        _give_back()
+
+
+def _give_back() -> None:
+    """Return to the system what compiling has left behind and nobody holds any more."""
+    gc.collect()
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)

@@ -68,8 +68,8 @@ def test_it_is_installed_and_works_in_a_clean_environment(
 ) -> None:
     (package,) = built.glob(f"*.{suffix}")
     assert VERSION in package.name
-    venv.create(tmp_path / "venv", with_pip=True)
-    binaries = tmp_path / "venv" / "bin"
+    venv.create(tmp_path / "venv")
+    python, tune = (str(tmp_path / "venv" / "bin" / name) for name in ("python", "tune"))
     # what it depends on is this environment's, behind its own; of ours it has the package alone
     (site,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
@@ -77,7 +77,7 @@ def test_it_is_installed_and_works_in_a_clean_environment(
 
     def run(*words: str) -> str:
         outcome = subprocess.run(
-            [str(binaries / words[0]), *words[1:]],
+            [*words],
             cwd=tmp_path,
             env=clean,
             check=False,
@@ -87,16 +87,16 @@ def test_it_is_installed_and_works_in_a_clean_environment(
         assert outcome.returncode == 0, outcome.stderr
         return outcome.stdout
 
-    offline = ("--no-deps", "--no-index", "--no-build-isolation", "--disable-pip-version-check")
-    run("python", "-m", "pip", "install", "--quiet", "--ignore-installed", *offline, str(package))
-    where = run("python", "-c", "import tuner, sim_jax; print(tuner.__file__, sim_jax.__file__)")
+    offline = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
+    pip = (sys.executable, "-m", "pip", "--python", str(python), "install", "--ignore-installed")
+    run(*pip, *offline, str(package))
+    where = run(str(python), "-c", "import tuner, sim_jax; print(tuner.__file__, sim_jax.__file__)")
     assert where.count(str(site)) == 2
-    assert run("tune", "--version").strip() == VERSION
+    assert run(tune, "--version").strip() == VERSION
     flown = ("--trajectory", "circle", "--duration", "2", "--out", "c.csv", "--forces", "f.csv")
-    assert "written to" in run("tune", "simulate", *flown)
+    assert "written to" in run(tune, "simulate", *flown)
     assert (tmp_path / "f.csv").read_text().startswith("time,thrust_fx")
-    run("tune", "new-vehicle", "--like", "hovergames", "--out", "quad.yaml")
-    run("tune", "report", "--help")
+    run(tune, "new-vehicle", "--like", "hovergames", "--out", "quad.yaml")
 
 
 @pytest.mark.slow
@@ -106,4 +106,4 @@ def test_the_sdist_holds_what_building_needs_and_nothing_private(built: Path) ->
         names = {name.partition("/")[2] for name in archive.getnames()}
     needed = {"pyproject.toml", "setup.py", "README.md", "LICENSE", "configs/tune.yaml"}
     assert needed | {"tuner/cli/app.py", "sim_jax/rollout.py"} <= names
-    assert not [name for name in names if name.startswith((".ci", "runs/", ".git"))]
+    assert not [name for name in names if name.startswith((".ci", "runs/", ".git", "tests/"))]

@@ -16,7 +16,7 @@ Level = Literal["failure", "warning", "info"]
 class Code(StrEnum):
     """What was noticed; the comment after each names its numbers and its names."""
 
-    RECORDING = "recording"  # names: topic, what reading the recording doubted
+    RECORDING = "recording"  # count and numbers, names: code, topic and names of the `Note`
     SALVAGED = "salvaged"  # those of `tuner.flights.damage.Damage`; names: its cause and subject
     LEFT_OUT = "left_out"  # names: what the flight lacks, what to do
     FLIGHT_WORSE = "flight_worse"  # before, after; names: position or attitude, its unit

@@ -19,6 +19,9 @@ NOT_RUN = {
     "tune --flights lab/*.bag --bench runs/bench": "a lab's own flights",
     "tune sensitivity --flights reference_flights/circle_3mps.bag": "a minute of simulated "
     "candidates; the tests of the examination make shorter ones",
+    "tune --flights reference_flights/*.bag --cross-validate": "four fits; the engine's tests make "
+    "shorter ones",
+    "tune --flights fleet/": "a fleet",
     "tune --flights nanobench/*.csv": "public flights that do not ship with the project",
     "tune --flights reference_flights/*.bag --config runs/quad.job.yaml": "another fit as long as "
     "the shared one; what its files hold is read instead",

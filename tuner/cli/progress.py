@@ -74,7 +74,7 @@ class _StageLines:
 
     def message(self, text: str) -> None:
         self.close()
-        self._screen.print(text, markup=False)
+        self._screen.print(text, markup=False, soft_wrap=True)
 
     def close(self) -> None:
         if self._last is not None:

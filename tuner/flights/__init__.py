@@ -10,9 +10,10 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tuner.flights.flight import SIGNALS, Flight, InitialState, Note, Series
+    from tuner.flights.flight import SIGNALS, Flight, InitialState, Series
     from tuner.flights.inspection import Inspection, inspect_recordings
     from tuner.flights.load import load_flight, load_flights
+    from tuner.flights.notes import Note
 
 __all__ = [
     "SIGNALS",
@@ -31,6 +32,7 @@ _HOMES = {
     "inspect_recordings": "inspection",
     "load_flight": "load",
     "load_flights": "load",
+    "Note": "notes",
 }
 
 

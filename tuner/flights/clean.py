@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.flights.flight import Array, Note
+from tuner.flights.flight import Array
+from tuner.flights.notes import Kind, Note, NoteCode
 from tuner.flights.outliers import HONEST, excursions, frozen, sticking_out
 
 #: Signals that cannot leave a range; a value beyond it is a corrupt sample.
@@ -59,13 +59,13 @@ def clean(
     """
     notes = []
 
-    def note(count: int, text: str, kind: Literal["info", "warning"] = "info") -> None:
+    def note(count: int, code: NoteCode, kind: Kind = "info", **numbers: float) -> None:
         if count:
-            notes.append(Note(kind, topic, f"{count} {signal} samples {text}", int(count)))
+            notes.append(Note(code, kind, topic, int(count), numbers, (signal,)))
 
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
-    note(int(beyond.any(axis=1).sum()), f"outside {low:g} to {high:g} dropped")
+    note(int(beyond.any(axis=1).sum()), NoteCode.OUT_OF_RANGE, lower=low, upper=high)
     values = np.where(beyond, np.nan, values)
     if signal in {"command", "thrust_setpoint"}:
         values = np.clip(values, 0.0, 1.0)
@@ -74,24 +74,24 @@ def clean(
     empty = np.isnan(values).all(axis=1) if one_per_row else np.isnan(values).any(axis=1)
     empty |= ~np.isfinite(time)
     counted = np.asarray(beyond.any(axis=1))
-    note(int((empty & ~counted).sum()), "without a number dropped")
+    note(int((empty & ~counted).sum()), NoteCode.NOT_A_NUMBER)
     usable = np.logical_not(empty)
     time, values = time[usable], values[usable]
 
     late = int((np.diff(time) < 0).sum())
-    note(late, "out of order, put in order")
+    note(late, NoteCode.OUT_OF_ORDER)
     order = np.argsort(time, kind="stable")
     time, values = time[order], values[order]
     apart = np.abs(time - np.median(time)) > LONGEST if len(time) else np.zeros(0, dtype=np.bool_)
-    note(int(apart.sum()), "stamped hours away from the others dropped")
+    note(int(apart.sum()), NoteCode.FAR_IN_TIME)
     time, values = time[~apart], values[~apart]
     time, values, doubles = _merge_equal_times(time, values)
-    note(doubles, "with a stamp seen before dropped")
-    note(0 if signal == "lap" else _missing(time), "seem to be missing between those recorded")
+    note(doubles, NoteCode.STAMPED_TWICE)
+    note(0 if signal == "lap" else _missing(time), NoteCode.SAMPLES_MISSING)
 
     if signal == "attitude":
         time, values, odd = _unit_quaternions(time, values)
-        note(odd, "that are no unit quaternion dropped or normalised")
+        note(odd, NoteCode.NO_UNIT_QUATERNION)
 
     if signal in HONEST:
         time, values = _without_outliers(signal, time, values, note)
@@ -105,16 +105,16 @@ def _without_outliers(
     honest = HONEST[signal]
     if signal in ("position", "attitude"):
         stuck = frozen(time, values, honest)
-        note(int(stuck.sum()), "repeat the one before while the vehicle moves: dropped")
+        note(int(stuck.sum()), NoteCode.REPEATED)
         away, lasting = excursions(time[~stuck], values[~stuck], honest)
-        note(int(away.sum()), "jump away and back within a second: dropped")
-        note(lasting, "leap and do not come back: check the recording", kind="warning")
+        note(int(away.sum()), NoteCode.AWAY_AND_BACK)
+        note(lasting, NoteCode.AWAY_FOR_GOOD, "warning")
         time, values = time[~stuck][~away], values[~stuck][~away]
     outlier = np.zeros(values.shape, dtype=np.bool_)
     for column in range(values.shape[1]):
         measured = np.flatnonzero(np.isfinite(values[:, column]))
         outlier[measured, column] = sticking_out(time[measured], values[measured, column], honest)
-    note(int(outlier.any(axis=1).sum()), "far from their neighbours dropped as outliers")
+    note(int(outlier.any(axis=1).sum()), NoteCode.OUTLIERS)
     if signal == "rotor_speed":
         values = np.where(outlier, np.nan, values)
         keep = np.isfinite(values).any(axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,16 +12,16 @@ from tuner.errors import RecordingError
 from tuner.flights.clean import clean
 from tuner.flights.damage import Damage
 from tuner.flights.extract import Raw, extract
-from tuner.flights.flight import Note, Series
+from tuner.flights.flight import Series
 from tuner.flights.formats import open_recording
 from tuner.flights.frames import correct_frames
 from tuner.flights.locate import Place, choose_map, locate, require_pose
 from tuner.flights.mission import Mission, find_missions
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Contents, Recording, Samples
 from tuner.flights.sidecar import Sidecar, sidecar_path
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
-from tuner.wording.phrases import listed
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def read_signals(
         require_pose(recording, chosen, places)
     raw, contents, noticed = extract(recording, places, chosen.time)
     notes = [
-        Note("info", "", f"topic map '{chosen.name}' finds {len(places)} signals", len(places)),
+        Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *passed_over,
         *contents.notes,
         *noticed,
@@ -232,28 +232,21 @@ def _clean(
     first = [raw["position"]] if "position" in raw else list(raw.values())
     epoch = min((int(data.time.min()) for data in first), default=0)
     series = {}
-    notes: dict[tuple[str, str, str], list[tuple[str, Note]]] = {}
+    notes: dict[tuple[object, ...], Note] = {}
     for signal, data in raw.items():
         seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
         time, values, dropped = clean(signal, data.topic, seconds, data.values)
         for note in dropped:  # signals of one message lack the same samples
-            alike = (note.topic, note.kind, note.text.replace(f" {signal} ", " {} "))
-            notes.setdefault(alike, []).append((signal, note))
+            alike = (note.code, note.topic, note.count, tuple(note.numbers.items()))
+            before = notes[alike].names if alike in notes else ()
+            notes[alike] = replace(note, names=(*before, *note.names))
         if len(time):
             series[signal] = Series(time, values)
     for needed in ("position", "attitude") if with_pose else ():
         if needed not in series:
             where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
             raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
-    return series, epoch, [_of_all(alike[2], found) for alike, found in notes.items()]
-
-
-def _of_all(text: str, found: Sequence[tuple[str, Note]]) -> Note:
-    """Return one note of all signals that it concerns."""
-    _, first = found[0]
-    if len(found) == 1:
-        return first
-    return replace(first, text=text.replace("{}", listed([signal for signal, _ in found]), 1))
+    return series, epoch, list(notes.values())
 
 
 def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:
@@ -263,8 +256,9 @@ def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list
     missing = np.flatnonzero(np.isnan(series["rotor_speed"].values).all(axis=0))
     if len(missing) == 0:
         return []
-    text = f"rotors {', '.join(str(rotor) for rotor in missing)} have no tachometer"
-    return [Note("info", topics["rotor_speed"], text, len(missing))]
+    rotors = tuple(str(rotor) for rotor in missing)
+    topic = topics["rotor_speed"]
+    return [Note(NoteCode.NO_TACHOMETER, "info", topic, count=len(rotors), names=rotors)]
 
 
 def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:

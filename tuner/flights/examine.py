@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +20,7 @@ from tuner.flights.content import (
     read_content,
     read_signals,
 )
-from tuner.flights.flight import SIGNALS, Array, Note, Series
+from tuner.flights.flight import SIGNALS, Array, Series
 from tuner.flights.formats import open_recording
 from tuner.flights.inertial import flying, is_inertial
 from tuner.flights.informs import informed, inlets
@@ -34,6 +33,7 @@ from tuner.flights.inspection import (
 from tuner.flights.locate import Place
 from tuner.flights.mission import yaw_spin
 from tuner.flights.motion import RATE, derivative, rotate, smooth
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Recording, Samples, Topic
 from tuner.flights.resample import resample
 from tuner.flights.sidecar import Sidecar, read_sidecar
@@ -80,10 +80,7 @@ def _without_pose(signals: Signals) -> Inspection:
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
     measured = {name: _measured(series) for name, series in signals.series.items()}
     flown = sum(end - begin for begin, end in flying(signals))
-    text = (
-        f"no pose was recorded: the {flown:.1f} s with turning motors are fitted without motion "
-        "capture, by body rate and specific force"
-    )
+    note = Note(NoteCode.WITHOUT_POSE, "info", numbers={"seconds": float(flown)})
     return Inspection(
         path=str(signals.recording.path),
         format=signals.recording.format,
@@ -99,7 +96,7 @@ def _without_pose(signals: Signals) -> Inspection:
         coefficients=(),
         clock={},
         battery=_battery(signals.series),
-        notes=tuple(dataclasses.asdict(note) for note in (Note("info", "", text), *signals.notes)),
+        notes=(note, *signals.notes),
         damage=signals.damage,
     )
 
@@ -149,7 +146,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
         coefficients=informed(content.series, measured, missions),
         clock=_clock(content),
         battery=_battery(content.series),
-        notes=tuple(dataclasses.asdict(note) for note in content.notes),
+        notes=content.notes,
         damage=content.damage,
     )
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.flights.flight import SIGNALS, Array, Note
+from tuner.flights.flight import SIGNALS, Array
 from tuner.flights.formats import is_tabular
 from tuner.flights.locate import Place
+from tuner.flights.notes import Note
 from tuner.flights.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
 from tuner.flights.stamps import believe
 from tuner.flights.units import ATTITUDES, quaternion_of, to_enu_flu, to_si

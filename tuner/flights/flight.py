@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.flights.damage import Damage
+from tuner.flights.notes import Note
 
 Array = NDArray[np.float64]
 
@@ -83,28 +84,6 @@ class InitialState:
     body_rate: Array
     rotor_speed: Array
     command: Array
-
-
-@dataclass(frozen=True)
-class Note:
-    """Something that reading found or changed, for the report.
-
-    Attributes
-    ----------
-    kind
-        ``info`` for what was done, ``warning`` for what a user should look at.
-    topic
-        The topic or signal concerned.
-    text
-        One sentence, with its number in it.
-    count
-        How many samples it concerns.
-    """
-
-    kind: Literal["info", "warning"]
-    topic: str
-    text: str
-    count: int = 0
 
 
 @dataclass(frozen=True)

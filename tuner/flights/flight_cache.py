@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from tuner.flights.damage import Cause, Damage
-from tuner.flights.flight import Array, Flight, InitialState, Note, Series
+from tuner.flights.flight import Array, Flight, InitialState, Series
+from tuner.flights.notes import Note
 
 logger = logging.getLogger(__name__)
 
@@ -112,7 +113,7 @@ def _flight(
         yaw_rate_setpoint=about["yaw_rate_setpoint"],
         level_held=about["level_held"],
         trajectory=about["trajectory"],
-        notes=tuple(Note(**note) for note in about["notes"]),
+        notes=tuple(Note.read(note) for note in about["notes"]),
         damage=tuple(
             Damage(**{**damage, "cause": Cause(damage["cause"])}) for damage in about["damage"]
         ),

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tuner.flights.flight import Array, Note, Series
+from tuner.flights.flight import Array, Series
 from tuner.flights.motion import (
     alike,
     body_rate_of,
@@ -18,6 +18,7 @@ from tuner.flights.motion import (
     smooth,
     stretch,
 )
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.units import to_enu_flu
 
 GRAVITY = 9.81
@@ -38,6 +39,10 @@ class _Reading:
 
     name: str
     read: Callable[[Array], Array]
+
+
+_Judgement = tuple[_Reading | None, Note | None]
+"""How else to read what was recorded, or else what is doubted."""
 
 
 def _scalar_last(q: Array) -> Array:
@@ -80,17 +85,17 @@ def correct_frames(
     if len(clock) < 200:
         return fixed, ()
 
-    def apply(signal: str, reading: _Reading | None, doubt: str) -> None:
+    def apply(signal: str, reading: _Reading | None, doubt: Note | None) -> None:
         topic = topics.get(signal, signal)
         if reading is not None:
             measured = fixed[signal]
             values = reading.read(measured.values)
             known = np.isfinite(values).all(axis=1)
             fixed[signal] = Series(measured.time[known], values[known])
-            text = f"{signal} is {reading.name}, which the topic map does not say: turned"
-            notes.append(Note("warning", topic, text, len(measured.time)))
-        elif doubt:
-            notes.append(Note("warning", topic, doubt))
+            count, names = len(measured.time), (signal, reading.name)
+            notes.append(Note(NoteCode.FRAME_TURNED, topic=topic, count=count, names=names))
+        elif doubt is not None:
+            notes.append(replace(doubt, topic=topic))
 
     apply("attitude", *_judge_attitude(fixed, clock))
     if "body_rate" in fixed:
@@ -100,7 +105,7 @@ def correct_frames(
     return fixed, tuple(notes)
 
 
-def _judge_attitude(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     q = on_clock(series, "attitude", clock)
     position = smooth(on_clock(series, "position", clock), 0.2)
     push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
@@ -126,31 +131,29 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> tuple[_Readin
 
     fit, upright = agreement(lambda values: values)
     if fit > GOOD and upright > 0.5:
-        return None, ""
+        return None, None
     # The likelier misreading comes first in the list.
     worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(_ATTITUDES)]
     best = _ATTITUDES[int(np.argmax(worth))]
     best_fit, best_upright = agreement(best.read)
     better = _worth(best_fit, best_upright) > _worth(fit, upright) + BETTER
     if better and best_fit > GOOD and best_upright > 0.5:
-        return best, ""
+        return best, None
     if fit < 0.2 or upright < 0.5:
-        return None, (
-            f"the attitude does not tilt as the vehicle accelerates (agreement {fit:.2f}, "
-            f"upright {upright:.2f}): check its frame and order"
-        )
-    return None, ""
+        numbers = {"agreement": fit, "upright": upright}
+        return None, Note(NoteCode.ATTITUDE_DOUBTED, numbers=numbers)
+    return None, None
 
 
 def _worth(fit: float, upright: float) -> float:
     return fit + min(upright, 1.0)
 
 
-def _judge_rate(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     turning = smooth(body_rate_of(on_clock(series, "attitude", clock)))
     gyro = smooth(on_clock(series, "body_rate", clock))
     if min(rms(turning), rms(gyro)) < ENOUGH_TURNING:
-        return None, ""
+        return None, None
 
     def mismatch(rates: Array) -> float:
         """Return the part of the turning that is left when a reading of the gyro is taken off."""
@@ -161,19 +164,19 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | 
     best = min(_RATES, key=lambda r: mismatch(r.read(gyro)))
     there = mismatch(best.read(gyro))
     if there < 0.7 and there < here / 2:
-        return best, ""
-    doubt = f"the body rate is not the attitude's change ({here:.1f} of it is left)"
-    return None, doubt if here > 0.9 else ""
+        return best, None
+    doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
+    return None, doubt if here > 0.9 else None
 
 
-def _judge_velocity(series: Mapping[str, Series], clock: Array) -> tuple[_Reading | None, str]:
+def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     moving = smooth(derivative(on_clock(series, "position", clock)), 0.1)
     velocity = smooth(on_clock(series, "velocity", clock), 0.1)
     if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
-        return None, ""
+        return None, None
     fit = alike(moving, velocity)
     if fit > 0.8:
-        return None, ""
+        return None, None
     measured = series["velocity"]
     at_samples = on_clock(series, "attitude", measured.time)
 
@@ -185,5 +188,5 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> tuple[_Readin
     }
     best = max(fits, key=lambda r: fits[r])
     if fits[best] > max(0.8, fit + 0.15):
-        return best, ""
-    return None, f"the velocity is not the position's change (agreement {fit:.2f})"
+        return best, None
+    return None, Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": fit})

@@ -15,8 +15,9 @@ import numpy as np
 from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.content import Settings, Signals, given_map, read_signals
-from tuner.flights.flight import Note, Series
+from tuner.flights.flight import Series
 from tuner.flights.mission import IDLE, SHORTEST, stretches
+from tuner.flights.notes import Note
 from tuner.flights.sidecar import read_sidecar
 
 #: What a recording must hold.

@@ -16,6 +16,7 @@ from tuner.disk import exists
 from tuner.errors import InputError, RecordingError
 from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.damage import Cause, Damage
+from tuner.flights.notes import Note
 
 if TYPE_CHECKING:
     from tuner.flights.topics import TopicMap
@@ -171,7 +172,7 @@ class Inspection:
     battery
         V at the start and at the end, None where it was not recorded.
     notes
-        What was dropped, repaired or doubted: kind, topic, text and count.
+        What was dropped, repaired or doubted.
     damage
         What the file has lost, with times in s since the first pose.
     """
@@ -190,7 +191,7 @@ class Inspection:
     coefficients: tuple[Informed, ...]
     clock: Mapping[str, float]
     battery: tuple[float, float] | None
-    notes: tuple[Mapping[str, Any], ...]
+    notes: tuple[Note, ...]
     damage: tuple[Damage, ...]
 
 
@@ -285,7 +286,7 @@ def from_json(content: bytes) -> Inspection | None:
                 "inlets": tuple(Inlet(i["name"], tuple(i["missing"])) for i in raw["inlets"]),
                 "coefficients": tuple(Informed(**c) for c in raw["coefficients"]),
                 "battery": tuple(raw["battery"]) if raw["battery"] else None,
-                "notes": tuple(raw["notes"]),
+                "notes": tuple(Note.read(note) for note in raw["notes"]),
                 "damage": tuple(Damage(**{**d, "cause": Cause(d["cause"])}) for d in raw["damage"]),
             }
         )

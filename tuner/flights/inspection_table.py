@@ -10,6 +10,7 @@ from rich.text import Text
 
 from tuner.flights.inspection import Inspection, MissionReport
 from tuner.wording.damage import damage_sentence
+from tuner.wording.notes import note_in_words
 
 _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 
@@ -37,9 +38,9 @@ def _tables(inspection: Inspection) -> list[RenderableType]:
     if inspection.coefficients:
         parts.append(_coefficients(inspection))
     for note in inspection.notes:
-        colour = "yellow" if note["kind"] == "warning" else "dim"
-        topic = f"{note['topic']}: " if note["topic"] else ""
-        parts.append(Text(f"{note['kind']}: {topic}{note['text']}", colour))
+        colour = "yellow" if note.kind == "warning" else "dim"
+        topic = f"{note.topic}: " if note.topic else ""
+        parts.append(Text(f"{note.kind}: {topic}{note_in_words(note)}", colour))
     return parts
 
 

@@ -14,10 +14,11 @@ from tuner.errors import RecordingError
 from tuner.flights.cache import cached, digest, load, store
 from tuner.flights.clock import Grid, fit_grid
 from tuner.flights.content import Content, Settings, given_map, read_content
-from tuner.flights.flight import SIGNALS, Array, Flight, Note, Series
+from tuner.flights.flight import SIGNALS, Array, Flight, Series
 from tuner.flights.flight_cache import from_parquet, to_parquet
 from tuner.flights.initial import initial_state
 from tuner.flights.mission import Mission, yaw_spin
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.resample import GAP, resample, without_gaps
 from tuner.flights.sidecar import Sidecar, read_sidecar
 from tuner.flights.topics import TopicMap
@@ -58,11 +59,10 @@ def make_flight(
     ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
     if grid is not None and grid.drift:
-        text = f"the publisher's clock drifts by {1e6 * grid.drift:+.0f} ppm against its stamps"
-        notes.append(Note("info", "", text))
+        notes.append(Note(NoteCode.CLOCK_DRIFTS, "info", numbers={"drift": grid.drift}))
     if len(content.missions) > 1:
-        text = f"mission {index + 1} of {len(content.missions)} in this recording"
-        notes.append(Note("info", "", text, len(content.missions)))
+        of, number = len(content.missions), {"number": index + 1}
+        notes.append(Note(NoteCode.ONE_OF_SEVERAL, "info", count=of, numbers=number))
     signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
     notes.extend(_gaps(signals, rate))
     spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
@@ -94,9 +94,8 @@ def _gaps(signals: Mapping[str, Array], rate: float) -> list[Note]:
         if unknown > GAP * rate:
             edges = np.diff(np.concatenate([[0], ~known, [0]]).astype(np.int8))
             runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
-            longest = runs.max() / rate
-            text = f"{name} is unknown for {unknown / rate:.2f} s, {longest:.2f} s at a time"
-            notes.append(Note("warning", "", text, unknown))
+            times = {"seconds": unknown / rate, "longest": float(runs.max() / rate)}
+            notes.append(Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,)))
     return notes
 
 

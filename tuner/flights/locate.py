@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from tuner.errors import RecordingError
-from tuner.flights.flight import Note
 from tuner.flights.formats import is_tabular
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Recording
 from tuner.flights.topics import Source, TopicMap
+from tuner.wording.notes import reason_in_words
 
 
 @dataclass(frozen=True)
@@ -67,16 +68,17 @@ def locate(
             good = [place for place in attempts if isinstance(place, Place)]
             if good:
                 if len(good) > 1:
-                    others = ", ".join(place.topic for place in good[1:4])
-                    text = f"{signal} from {good[0].topic}; {others} would also match"
-                    notes.append(Note("warning", good[0].topic, text, len(good) - 1))
+                    names = (signal, *(place.topic for place in good[1:4]))
+                    more, topic = len(good) - 1, good[0].topic
+                    notes.append(Note(NoteCode.OTHERS_MATCH, "warning", topic, more, names=names))
                 places[signal] = good[0]
                 break
-            refusal = next((text for text in attempts if isinstance(text, str) and text), None)
+            refusal = next((found for found in attempts if isinstance(found, Note)), None)
             if refusal and strict:
-                raise RecordingError(recording.path, refusal, "correct the topic map")
+                what = reason_in_words(refusal)
+                raise RecordingError(recording.path, what, "correct the topic map")
             if refusal:
-                notes.append(Note("warning", source.topic, f"passed over: {refusal}"))
+                notes.append(refusal)
     return places, tuple(notes)
 
 
@@ -90,23 +92,22 @@ def _matching(recording: Recording, source: Source) -> list[str]:
     return [topic.name for topic in sorted(known, key=lambda t: (-t.count, t.name))]
 
 
-def _place(recording: Recording, signal: str, source: Source, topic: str) -> Place | str:
-    """Return where a topic holds a signal, or why it does not: empty if nobody expects it to."""
+def _place(recording: Recording, signal: str, source: Source, topic: str) -> Place | Note | None:
+    """Return where a topic holds a signal, or why it does not: None if nobody expects it to."""
     usual = recording.usual(topic, signal)
     fields = source.fields or (usual.fields if usual else None)
     if fields is None:
         kind = next(known.type for known in recording.topics if known.name == topic)
         wild = "*" in source.topic
-        return "" if wild else f"it is not known where {topic} ({kind}) holds the {signal}"
+        return None if wild else Note(NoteCode.LAYOUT_UNKNOWN, topic=topic, names=(kind, signal))
     missing = recording.lacking(topic, fields)
     if missing:
         # nobody expects a table, or any topic whatsoever, to hold all that a map knows
         anywhere = is_tabular(recording.format) or source.topic == "*"
         absent = anywhere and len(missing) == len(fields)
         near = difflib.get_close_matches(missing[0], recording.fields(topic), n=1)
-        hint = f", did you mean '{near[0]}'?" if near else ""
-        what = f"{topic} has no field" if topic else "there is no column"
-        return "" if absent else f"{what} '{missing[0]}' for the {signal}{hint}"
+        names = (missing[0], signal, *near)
+        return None if absent else Note(NoteCode.FIELD_MISSING, topic=topic, names=names)
     unit = source.unit or (usual.unit if usual and not source.fields else "si")
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
 

@@ -14,7 +14,8 @@ from pydantic import model_validator
 
 from tuner.errors import RecordingError
 from tuner.flights.damage import Damage
-from tuner.flights.flight import Array, Note
+from tuner.flights.flight import Array
+from tuner.flights.notes import Note
 from tuner.yaml_files.section import Section
 
 Nanoseconds = NDArray[np.int64]

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
-from tuner.flights.flight import Note
+from tuner.flights.notes import Kind, Note, NoteCode
 from tuner.flights.recording import Nanoseconds, Samples
 
 SECOND = 1_000_000_000
@@ -57,19 +56,18 @@ def believe(
     for topic, offset in offsets.items():
         if abs(offset - common) > APART:
             times[topic] = times[topic] - (offset - common)
-            text = f"stamped by another clock, {(offset - common) / SECOND:.3f} s off: moved"
-            notes.append(Note("warning", topic, text, len(times[topic])))
+            off = {"seconds": (offset - common) / SECOND}
+            count = len(times[topic])
+            notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=off))
     for topic, of in samples.items():
         if topic not in times:
             # Where all stamps count from a start-up, arrivals are moved to count from there too.
             times[topic] = of.receive + (common if abs(common) > SECOND else 0)
             if topic in unset:
-                text = "its stamps are not set: its times are those of recording"
-                notes.append(Note("warning", topic, text, len(of.receive)))
+                notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(of.receive)))
             elif topic not in receive_only:
-                text = "has no header: its times are those of recording"
-                kind: Literal["info", "warning"] = "info" if topic in unhurried else "warning"
-                notes.append(Note(kind, topic, text, len(of.receive)))
+                kind: Kind = "info" if topic in unhurried else "warning"
+                notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(of.receive)))
     return times, tuple(notes)
 
 
@@ -114,8 +112,7 @@ def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanos
             steps.append(here)
             i += 1
     if wrong:
-        text = f"{wrong} stamps far from their neighbours replaced by the time of recording"
-        notes.append(Note("warning", topic, text, wrong))
+        notes.append(Note(NoteCode.STAMPS_REPLACED, topic=topic, count=wrong))
     if steps:
         bounds = [0, *(at + 1 for at in steps), len(stamp)]
         parts = list(pairwise(bounds))
@@ -124,6 +121,6 @@ def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanos
         for (a, b), offset in zip(parts, level, strict=True):
             fixed[a:b] -= offset - level[longest]
         largest = max(abs(offset - level[longest]) for offset in level) / SECOND
-        text = f"its clock jumped {len(steps)} times, by up to {largest:.3f} s: joined again"
-        notes.append(Note("warning", topic, text, len(steps)))
+        jump = {"seconds": largest}
+        notes.append(Note(NoteCode.CLOCK_JUMPED, topic=topic, count=len(steps), numbers=jump))
     return fixed, notes

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from tuner.flights.flight import Array, Note, Series
+from tuner.flights.flight import Array, Series
 from tuner.flights.motion import RATE, alike, body_rate_of, on_clock, rms, smooth, stretch
+from tuner.flights.notes import Note, NoteCode
 
 #: A smaller offset, in s, is left to the fit, which has a time offset and latencies to find.
 WORTH_MOVING = 0.02
@@ -76,10 +77,10 @@ def align_pose(
     if offset is None:
         return aligned, ()
     if abs(offset) < WORTH_MOVING:
-        text = f"stamps are {1e3 * offset:+.1f} ms late against the gyro, by correlation"
-        return aligned, (Note("info", topic, text),)
+        return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
     for signal, samples in series.items():
         if topics.get(signal) == topic:
             aligned[signal] = Series(samples.time - offset, samples.values)
-    text = f"its clock is {1e3 * offset:+.1f} ms late against the gyro, by correlation: moved"
-    return aligned, (Note("warning", topic, text, len(series["attitude"].time)),)
+    count = len(series["attitude"].time)
+    moved = Note(NoteCode.POSE_MOVED, topic=topic, count=count, numbers={"seconds": offset})
+    return aligned, (moved,)

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from tuner.errors import RecordingError
 from tuner.flights.damage import Cause, Damage
-from tuner.flights.flight import Array, Note
+from tuner.flights.flight import Array
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import (
     NANOSECONDS,
     ROWS,
@@ -69,7 +70,7 @@ class Table(TabularRecording):
         kept = time != _NEVER
         if not kept.all():
             lost = int((~kept).sum())
-            notes.append(Note("warning", ROWS, f"{lost} rows without a time left out", lost))
+            notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=ROWS, count=lost))
         fields = {name: values[kept] for name, values in fields.items()}
         samples = Samples(time[kept], time[kept], fields)
         return Contents({ROWS: samples}, tuple(notes), tuple(damage))

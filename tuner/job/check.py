@@ -78,8 +78,9 @@ def _recordings(job: Job) -> Iterator[Finding]:
     for flight in job.flights:
         for note in flight.notes:
             if note.kind == "warning":
-                names = (note.topic, note.text)
-                yield Finding(Code.RECORDING, "warning", flight.name, names=names)
+                numbers = {**note.numbers, "count": note.count}
+                names = (note.code.value, note.topic, *note.names)
+                yield Finding(Code.RECORDING, "warning", flight.name, numbers, names)
         for damage in flight.damage:
             numbers = {name: value for name, value in vars(damage).items() if _is_number(value)}
             names = (damage.cause.value, damage.subject)

@@ -11,14 +11,11 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.config import VehicleFile
-from tuner.flights.flight import Array, Flight, Note, Series
+from tuner.flights.flight import Array, Flight, Series
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.resample import resample
 from tuner.objective.explained import levers
 
-DERIVED = (
-    "its motor commands are those that, by the vehicle file's arms and curve, give the commanded "
-    "thrust and torque: what was found of thrust and inertia is relative to that"
-)
 WRENCH = ("commanded_thrust", "commanded_torque")
 
 
@@ -48,7 +45,7 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
         series={**flight.series, "command": series},
         signals={**flight.signals, "command": on_clock},
         initial=replace(flight.initial, command=nearest),
-        notes=(*flight.notes, Note("warning", "", DERIVED, len(command))),
+        notes=(*flight.notes, Note(NoteCode.COMMAND_DERIVED, count=len(command))),
     )
 
 

@@ -133,8 +133,8 @@ def _loss(
             joint_pull = (scaled @ space.joint_rows.T + space.joint_offset) * float(criterion.prior)
             total = total + 0.5 * (joint_pull**2).sum(axis=-1)
         squares = np.asarray(batch.squares.get("position", np.full((len(vectors), 1, 1), np.nan)))
-        placed = np.sum(counts.get("position", np.ones(1)))
-        rmse = sigma * np.sqrt(3.0 * squares.sum(axis=(1, 2)) / max(float(placed), 1.0))
+        placed = float(np.sum(counts.get("position", np.nan))) or np.nan
+        rmse = sigma * np.sqrt(3.0 * squares.sum(axis=(1, 2)) / placed)
         return np.nan_to_num(total / compared, nan=np.inf, posinf=np.inf), rmse
 
     return loss

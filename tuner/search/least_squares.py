@@ -81,11 +81,11 @@ def _gains_little(losses: Sequence[NDArray[np.float64]], tolerance: float) -> ND
 
 
 def _position_rmse(objective: Objective, step: Step, start: int) -> float:
-    """Return the position RMSE in m at the point that a start tried last."""
+    """Return the position RMSE in m at the point that a start tried last; NaN without positions."""
     if step.sums is None or "position" not in objective.segments.measured:
         return float("nan")
     weight = np.asarray(objective.segments.measured["position"].weight)
     sigma = 1.0 / weight.max(initial=1e-30)
     counts = float(jnp.sum(step.sums.counts["position"][start]))
     squares = float(jnp.sum(step.sums.squares["position"][start]))
-    return float(sigma * np.sqrt(3.0 * squares / max(counts, 1.0)))
+    return float(sigma * np.sqrt(3.0 * squares / (counts or np.nan)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import jax
 import jax.numpy as jnp
@@ -169,8 +170,12 @@ def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]
         )
 
 
+@lru_cache(maxsize=16)
 def _flier(schedule: Schedule, samples: int, precision: Precision) -> Callable[..., Rollout]:
-    """Return the function that flies a piece of a grid, on all devices where there is a grid."""
+    """Return the function that flies a piece of a grid, on all devices where there is a grid.
+
+    It is kept, so that a flight like the last is not compiled again.
+    """
 
     def fly(columns: dict[str, Scalar], model: Model, inlet: Inlet, start: Vec3) -> Rollout:
         flown = with_coefficients(model, columns)

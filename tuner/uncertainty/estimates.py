@@ -87,10 +87,7 @@ class Uncertainty:
 
 
 def uncertainty_of(
-    fitted: Fitted,
-    *,
-    flights: Sequence[str] | None = None,
-    offsets_fitted: NDArray[np.bool_] | None = None,
+    fitted: Fitted, *, offsets_fitted: NDArray[np.bool_] | None = None
 ) -> Uncertainty:
     """Return how well a fit's coefficients are known.
 
@@ -98,18 +95,14 @@ def uncertainty_of(
     ----------
     fitted
         A search's result.
-    flights
-        Names of the fitted flights in the order of the objective; those of ``fitted.scales`` by
-        default.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     """
     information = information_at(
         fitted.objective, fitted.point, fitted.criterion, offsets_fitted=offsets_fitted
     )
-    names = tuple(fitted.scales) if flights is None else tuple(flights)
     vector = np.asarray(fitted.point.coefficients)
-    return uncertainty_at(fitted.objective.space, vector, information, names)
+    return uncertainty_at(fitted.objective.space, vector, information, tuple(fitted.scales))
 
 
 def uncertainty_at(

@@ -7,7 +7,9 @@ from typing import Any
 
 from tuner.findings import Code, Finding
 from tuner.flights.damage import Cause, Damage
+from tuner.flights.notes import Note, NoteCode
 from tuner.wording.damage import damage_sentence
+from tuner.wording.notes import note_in_words
 from tuner.wording.phrases import as_sentence, listed, percent
 
 #: Code -> what was noticed and what to do about it: text with the finding's numbers in braces,
@@ -236,7 +238,10 @@ def _values(finding: Finding) -> dict[str, object]:
 
 
 def _recording(finding: Finding) -> str:
-    topic, text = finding.names
+    code, topic, *names = finding.names
+    numbers = dict(finding.numbers)
+    count = int(numbers.pop("count"))
+    text = note_in_words(Note(NoteCode(code), "warning", topic, count, numbers, tuple(names)))
     return f"{topic}: {text}." if topic else as_sentence(text)
 
 

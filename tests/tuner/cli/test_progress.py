@@ -5,6 +5,8 @@ from types import SimpleNamespace
 from tuner.cli.progress import listening
 from tuner.search.iteration import Iteration
 
+MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
+
 
 def iterations(stage, count, first=1):
     return [
@@ -26,13 +28,13 @@ def test_a_stage_is_one_line_with_its_last_iteration(capsys):
         listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
         for iteration in (*iterations("2 s", 30), *iterations("whole flights", 60, first=31)):
             listener.on_iteration(iteration, 12.0)
-        listener.on_message("Examining [how well] each coefficient is known.")
+        listener.on_message(MESSAGE)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 4
     assert lines[0] == "mass: --mass"
     assert lines[1].startswith("2 s: iteration 30, horizon 2 s, position RMSE 3.33 mm")
     assert lines[2].startswith("whole flights: iteration 90, ")
-    assert lines[3] == "Examining [how well] each coefficient is known."
+    assert lines[3] == MESSAGE
 
 
 def test_an_interrupted_stage_still_gets_its_line(capsys):

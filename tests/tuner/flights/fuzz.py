@@ -212,7 +212,7 @@ def attempt(path: Path) -> str:
         signal.setitimer(signal.ITIMER_REAL, 0)
 
 
-def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
+def fuzz(name: str, cases: range, seed: int) -> dict[str, Any]:
     """Try some broken recordings of a format; return what came of them."""
     outcomes: Counter[str] = Counter()
     failures = []
@@ -221,7 +221,7 @@ def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
         base = FORMATS[name](Path(scratch))
         whole = base.read_bytes()
         path = Path(scratch) / f"case{base.suffix}"
-        for case in range(cases):
+        for case in cases:
             random = np.random.default_rng([seed, case])
             raw = bytearray(whole)
             harm = HARMS[int(random.integers(len(HARMS)))]
@@ -241,7 +241,7 @@ def fuzz(name: str, cases: int, seed: int) -> dict[str, Any]:
     peak = _peak_megabytes()
     return {
         "format": name,
-        "cases": cases,
+        "cases": len(cases),
         **outcomes,
         "slowest_s": round(slowest, 2),
         "peak_mb": round(peak),
@@ -263,12 +263,13 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("format", choices=[*FORMATS, "all"])
     parser.add_argument("--cases", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
-    worst = 0
+    cases, worst = range(given.first, given.first + given.cases), 0
     for name in FORMATS if given.format == "all" else [given.format]:
-        result = fuzz(name, given.cases, given.seed)
+        result = fuzz(name, cases, given.seed)
         sys.stdout.write(json.dumps(result) + "\n")
         sys.stdout.flush()
         worst |= bool(result["failures"]) or result["peak_mb"] > MEMORY

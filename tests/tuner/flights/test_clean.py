@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.flights.clean import clean
+from tuner.flights.notes import NoteCode
 
 
 def _cleaned(signal: str, time: np.ndarray, values: np.ndarray):
@@ -137,7 +138,7 @@ def test_markers_swapped_for_a_while_are_dropped() -> None:
     kept, _, notes = _cleaned("position", time, position)
     assert not np.isin(time[300:330], kept).any()
     assert len(kept) == 570
-    assert "away and back" in notes[0].text
+    assert notes[0].code is NoteCode.AWAY_AND_BACK
 
 
 def test_a_jump_that_stays_is_only_noted() -> None:
@@ -146,6 +147,6 @@ def test_a_jump_that_stays_is_only_noted() -> None:
     position[300:] += [0.5, 0.0, 0.0]
     kept, _, notes = _cleaned("position", time, position)
     assert len(kept) == 600
-    assert "do not come back" in notes[0].text
+    assert notes[0].code is NoteCode.AWAY_FOR_GOOD
     assert notes[0].kind == "warning"
     assert notes[0].count == 1

@@ -14,6 +14,7 @@ from tests.tuner.flights import making
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights import Flight, load_flight, load_flights
 from tuner.flights.damage import Cause
+from tuner.flights.notes import Note, NoteCode
 from tuner.trajectory_settings import TrajectorySettings
 from tuner.wording.damage import damage_sentence
 from tuner.yaml_files.section import build
@@ -34,10 +35,14 @@ def dirty(short: Path, tmp_path: Path) -> Callable[[Change], Flight]:
     return lambda change: load_flight(making.rewrite(short, tmp_path / "dirty.bag", change))
 
 
-def noted_count(flight: Flight, text: str, topic: str = "") -> int:
-    """Return the count of the one note with a text."""
-    (note,) = [n for n in flight.notes if text in n.text and topic in n.topic]
-    return note.count
+def noted(flight: Flight, code: NoteCode, *names: str, topic: str = "") -> Note:
+    """Return the one note with a code, of the signals that are named."""
+    (note,) = (
+        note
+        for note in flight.notes
+        if note.code is code and topic in note.topic and note.names[: len(names)] == names
+    )
+    return note
 
 
 def near(
@@ -69,8 +74,8 @@ def test_dropped_duplicated_and_late_messages(clean: Flight, dirty: Any) -> None
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert noted_count(got, "position and attitude samples with a stamp seen before dropped") > 30
-    assert noted_count(got, "position and attitude samples out of order") > 30
+    assert noted(got, NoteCode.STAMPED_TWICE, "position", "attitude").count > 30
+    assert noted(got, NoteCode.OUT_OF_ORDER, "position", "attitude").count > 30
 
 
 def test_nan_and_quaternion_dirt(clean: Flight, dirty: Any) -> None:
@@ -91,8 +96,8 @@ def test_nan_and_quaternion_dirt(clean: Flight, dirty: Any) -> None:
     got = dirty(change)
     near(got, clean, position=5e-3)
     near(got, clean, signal="attitude")
-    assert noted_count(got, "position samples without a number dropped") > 10
-    assert noted_count(got, "no unit quaternion") > 100
+    assert noted(got, NoteCode.NOT_A_NUMBER, "position").count > 10
+    assert noted(got, NoteCode.NO_UNIT_QUATERNION, "attitude").count > 100
 
 
 def test_single_wrong_stamps_and_a_clock_that_was_set(clean: Flight, dirty: Any) -> None:
@@ -109,8 +114,9 @@ def test_single_wrong_stamps_and_a_clock_that_was_set(clean: Flight, dirty: Any)
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert noted_count(got, "stamps far from their neighbours", POSE) > 5
-    assert "3600.0" in next(n.text for n in got.notes if "its clock jumped" in n.text)
+    assert noted(got, NoteCode.STAMPS_REPLACED, topic=POSE).count > 5
+    jump = noted(got, NoteCode.CLOCK_JUMPED).numbers["seconds"]
+    assert jump == pytest.approx(3600.0, abs=0.1)
 
 
 def test_a_topic_on_another_clock_is_moved(clean: Flight, dirty: Any) -> None:
@@ -121,7 +127,7 @@ def test_a_topic_on_another_clock_is_moved(clean: Flight, dirty: Any) -> None:
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    assert noted_count(got, "stamped by another clock", POSE) > 1000
+    assert noted(got, NoteCode.OTHER_CLOCK, topic=POSE).count > 1000
 
 
 def test_motion_capture_behind_the_gyro_is_found_by_correlation(clean: Flight, dirty: Any) -> None:
@@ -132,8 +138,7 @@ def test_motion_capture_behind_the_gyro_is_found_by_correlation(clean: Flight, d
 
     got = dirty(change)
     near(got, clean, position=5e-3)
-    text = next(n.text for n in got.notes if "by correlation: moved" in n.text)
-    assert float(text.split("+")[1].split(" ")[0]) == pytest.approx(80, abs=1.5)
+    assert noted(got, NoteCode.POSE_MOVED).numbers["seconds"] == pytest.approx(0.08, abs=1.5e-3)
 
 
 def test_unset_header_stamps_give_way_to_receive_times(clean: Flight, dirty: Any) -> None:
@@ -160,8 +165,8 @@ def test_wrong_frame_and_order_are_turned(clean: Flight, dirty: Any) -> None:
     got = dirty(change)
     near(got, clean, position=1e-9, signal="attitude")
     near(got, clean, position=1e-9, signal="body_rate")
-    assert noted_count(got, "attitude is scalar-last") > 1000
-    assert noted_count(got, "body_rate is in FRD axes") > 1000
+    assert noted(got, NoteCode.FRAME_TURNED, "attitude", "scalar-last").count > 1000
+    assert noted(got, NoteCode.FRAME_TURNED, "body_rate", "in FRD axes").count > 1000
 
 
 def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:

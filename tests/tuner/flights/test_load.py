@@ -68,7 +68,7 @@ def test_initial_state_is_the_hover_before_the_mission() -> None:
 
 def test_tachometer_artefacts_are_dropped_and_counted() -> None:
     flight = load_flight(FLIGHTS / "circle_3mps.bag")
-    note = next(note for note in flight.notes if "rotor_speed" in note.text)
+    note = next(note for note in flight.notes if "rotor_speed" in note.names)
     assert note.topic == "/mavros/rpm"
     assert 5 <= note.count <= 40
     speed = flight.series["rotor_speed"].values[:, 0]

@@ -11,6 +11,7 @@ import pytest
 from tests.tuner.flights import making
 from tuner.errors import RecordingError
 from tuner.flights import load_flight
+from tuner.flights.notes import NoteCode
 
 LAB = "name: lab\nformat: ros\nsignals:\n  attitude: /optitrack/pose\n"
 
@@ -63,9 +64,9 @@ def test_a_pattern_takes_the_busiest_topic_and_says_so(short: Path, tmp_path: Pa
     path = making.rewrite(short, tmp_path / "vrpn.bag", rename=lambda name: names.get(name, name))
     got = load_flight(path)
     assert len(got.series["position"].time) > 1100
-    note = next(note for note in got.notes if "would also match" in note.text)
+    note = next(note for note in got.notes if note.code is NoteCode.OTHERS_MATCH)
     assert note.topic == "/vrpn_client_node/quad/pose"
-    assert "wand" in note.text
+    assert note.names == ("position", "/vrpn_client_node/wand/pose")
 
 
 def test_a_damaged_definition_costs_its_signals_only(short: Path, tmp_path: Path) -> None:
@@ -75,7 +76,8 @@ def test_a_damaged_definition_costs_its_signals_only(short: Path, tmp_path: Path
     got = load_flight(path)
     assert not got.has("battery_voltage")
     assert got.has("position")
-    assert any("passed over" in note.text and "/mavros/battery" in note.text for note in got.notes)
+    (note,) = (note for note in got.notes if note.code is NoteCode.FIELD_MISSING)
+    assert (note.topic, note.names[1]) == ("/mavros/battery", "battery_voltage")
 
 
 def test_definitions_come_from_msg_files_where_the_recording_has_none(
@@ -121,4 +123,4 @@ def test_single_tachometers_of_four_rotors_are_put_in_their_columns(
     level = [float(v) for v in got.signals["rotor_speed"][50:150].mean(axis=0)]
     steps = [(b - a) * 60 / 6.283185 for a, b in pairwise(level)]
     assert steps == pytest.approx([100, 100, 100], abs=30)
-    assert not any("no tachometer" in note.text for note in got.notes)
+    assert not any(note.code is NoteCode.NO_TACHOMETER for note in got.notes)

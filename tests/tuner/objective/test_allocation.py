@@ -7,7 +7,8 @@ import pytest
 
 from tuner.config import configs_folder, read_vehicle
 from tuner.flights.flight import Series
-from tuner.objective.allocation import DERIVED, commands_of, with_commands
+from tuner.flights.notes import NoteCode
+from tuner.objective.allocation import commands_of, with_commands
 from tuner.objective.explained import levers, squared_speed
 
 
@@ -38,6 +39,6 @@ def test_only_a_flight_without_commands_gets_them(flight, updated):
     bare = replace(flight, series=dict(flight.series) | series, signals=signals)
     made = with_commands(bare, updated)
     command = made.signals["command"]
-    assert made.notes[-1].text == DERIVED
+    assert made.notes[-1].code is NoteCode.COMMAND_DERIVED
     assert np.ptp(command[np.isfinite(command)]) < 1e-9
     assert command[10, 0] == pytest.approx((np.sqrt(9.81 * 2.243 / 4 / 1.45e-5) - 100) / 950)

@@ -26,7 +26,7 @@ ROLLING = Direction(
 )
 
 
-@pytest.fixture(scope="package")
+@pytest.fixture(scope="session")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("report")
     making.write_run(folder, FREE, ROLLING)

@@ -13,9 +13,11 @@ from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = (
     "inertia_xx",
+    "inertia_yy",
     "inertia_zz",
     "input_scaling",
     "time_constant_up",
+    "time_constant_down",
     "motor_constant",
     "moment_constant",
     "rotor_drag_coefficient",

@@ -7,7 +7,9 @@ from tuner.wording.findings import one_line, remedy, sentence
 
 #: What each code's maker gives beside it.
 MADE = {
-    Code.RECORDING: Finding(Code.RECORDING, "warning", "a", names=("", "poses lie far off")),
+    Code.RECORDING: Finding(
+        Code.RECORDING, "warning", "a", {"count": 0, "agreement": 0.3}, ("velocity_doubted", "")
+    ),
     Code.SALVAGED: Finding(
         Code.SALVAGED,
         "warning",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,8 @@ class Definitions:
 def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
     if len(text.data) > LONGEST:
         raise RecordingError(path, f"the definition of {kind} is absurdly long", "leave it out")
-    parse = get_types_from_idl if text.format is MessageDefinitionFormat.IDL else None
     try:
-        types = parse(text.data) if parse else get_types_from_msg(text.data, kind)
-        return {name: fields for name, (_, fields) in types.items()}
+        return _types(text.format, text.data, kind)
     except InputError:
         raise
     except Exception as err:  # the parser meets hostile text and has no common error class
@@ -86,6 +85,14 @@ def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
         raise RecordingError(
             path, f"the definition of {kind} makes no sense ({reason})", "record it again"
         ) from None
+
+
+@lru_cache(maxsize=64)
+def _types(form: MessageDefinitionFormat, text: str, kind: str) -> dict[str, Fields]:
+    """Return the fields of the types in a text; recordings of a day have the same ones."""
+    idl = form is MessageDefinitionFormat.IDL
+    types = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
+    return {name: fields for name, (_, fields) in types.items()}
 
 
 def _message_files(files: Iterable[Path]) -> Iterable[Path]:

@@ -41,6 +41,9 @@ FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_EN
 
 #: Bytes of a message record before its payload: op, length, channel, sequence, two times.
 BEFORE_PAYLOAD = 9 + 22
+#: Channel, sequence and time of a message. No true time is beyond 2^63: read with a sign, as in the
+#: indexes, a damaged one lies centuries before the others, and fits into an array.
+_HEAD = struct.Struct("<HIq")
 _FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros1msg": MessageDefinitionFormat.MSG,
@@ -177,7 +180,7 @@ class Mcap:
                 for number, count in in_chunk.items():
                     counts[number] = counts.get(number, 0) + count
             elif op == MESSAGE and length >= 22:
-                number, _, time = struct.unpack("<HIQ", stream.read(14))
+                number, _, time = _HEAD.unpack(stream.read(14))
                 self._loose.setdefault(number, []).append((at, end, time))
                 last = max(last or 0.0, time * 1e-9)
                 counts[number] = counts.get(number, 0) + 1
@@ -206,7 +209,7 @@ class Mcap:
         for op, at, end in _records(content):
             read = end
             if op == MESSAGE and end - at >= 22:
-                number, _, time = struct.unpack_from("<HIQ", content, at)
+                number, _, time = _HEAD.unpack_from(content, at)
                 counts[number] = counts.get(number, 0) + 1
                 last = max(last or 0, time)
             elif op in (SCHEMA, CHANNEL):
@@ -277,7 +280,7 @@ class Mcap:
         rows: dict[int, list[tuple[int, int]]] = {number: [] for number in wanted}
         for op, at, end in _records(raw):
             if op == MESSAGE and end - at >= 22:
-                number, _, time = struct.unpack_from("<HIQ", raw, at)
+                number, _, time = _HEAD.unpack_from(raw, at)
                 if number in rows:
                     rows[number].append((time, at - 9))
         content = np.frombuffer(raw, dtype=np.uint8)

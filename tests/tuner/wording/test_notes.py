@@ -1,0 +1,37 @@
+"""What was found in reading a recording, in words."""
+
+import re
+
+import pytest
+
+from tuner.flights.notes import Note, NoteCode
+from tuner.wording.notes import PASSED_OVER, TEXTS, note_in_words
+
+NUMBERS = dict.fromkeys(
+    ["seconds", "longest", "lower", "upper", "agreement", "upright", "left", "number", "drift"], 0.5
+)
+
+
+@pytest.mark.parametrize("code", NoteCode)
+def test_each_code_has_words_without_gaps(code):
+    names = ("position", "attitude", "yaw")
+    text = note_in_words(Note(code, topic="/pose", count=7, numbers=NUMBERS, names=names))
+    assert text
+    assert not re.search(r"[{}]|  | ,|None", text)
+    assert set(TEXTS) == set(NoteCode)
+
+
+def test_signals_of_one_topic_are_listed_and_a_clock_is_in_milliseconds():
+    twice = Note(NoteCode.STAMPED_TWICE, count=31, names=("position", "attitude"))
+    assert note_in_words(twice) == (
+        "31 position and attitude samples with a stamp seen before dropped"
+    )
+    late = Note(NoteCode.POSE_MOVED, numbers={"seconds": 0.08})
+    assert note_in_words(late).startswith("its clock is +80.0 ms late")
+
+
+@pytest.mark.parametrize("code", PASSED_OVER)
+def test_what_was_passed_over_says_so(code):
+    text = note_in_words(Note(code, topic="/battery", names=("voltage", "battery_voltage")))
+    assert text.startswith("passed over: ")
+    assert "/battery" in text

@@ -1,0 +1,82 @@
+"""What reading a recording found or changed, as codes and numbers.
+
+Sentences are made from them in `tuner.wording.notes`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Literal
+
+Kind = Literal["info", "warning"]
+
+
+class NoteCode(StrEnum):
+    """What was found or changed; the comment after each names its numbers and its names."""
+
+    TOPIC_MAP = "topic_map"  # names: the topic map
+    OTHERS_MATCH = "others_match"  # names: the signal, the topics that would match as well
+    LAYOUT_UNKNOWN = "layout_unknown"  # names: the message type, the signal
+    FIELD_MISSING = "field_missing"  # names: the field, the signal, a field that is called alike
+    WITHOUT_POSE = "without_pose"  # seconds with turning motors
+    OTHER_CLOCK = "other_clock"  # seconds
+    STAMPS_UNSET = "stamps_unset"
+    NO_HEADER = "no_header"
+    STAMPS_REPLACED = "stamps_replaced"
+    CLOCK_JUMPED = "clock_jumped"  # seconds, the largest jump
+    POSE_ON_TIME = "pose_on_time"  # seconds
+    POSE_MOVED = "pose_moved"  # seconds
+    CLOCK_DRIFTS = "clock_drifts"  # drift (share)
+    ROWS_WITHOUT_TIME = "rows_without_time"
+    OUT_OF_RANGE = "out_of_range"  # lower, upper; names: the signal, as of all below
+    NOT_A_NUMBER = "not_a_number"
+    OUT_OF_ORDER = "out_of_order"
+    FAR_IN_TIME = "far_in_time"
+    STAMPED_TWICE = "stamped_twice"
+    SAMPLES_MISSING = "samples_missing"
+    NO_UNIT_QUATERNION = "no_unit_quaternion"
+    REPEATED = "repeated"
+    AWAY_AND_BACK = "away_and_back"
+    AWAY_FOR_GOOD = "away_for_good"
+    OUTLIERS = "outliers"
+    SIGNAL_UNKNOWN = "signal_unknown"  # seconds, longest (s)
+    NO_TACHOMETER = "no_tachometer"  # names: the rotors
+    FRAME_TURNED = "frame_turned"  # names: the signal, the frame that it is in
+    ATTITUDE_DOUBTED = "attitude_doubted"  # agreement, upright
+    BODY_RATE_DOUBTED = "body_rate_doubted"  # left (share)
+    VELOCITY_DOUBTED = "velocity_doubted"  # agreement
+    COMMAND_DERIVED = "command_derived"
+    ONE_OF_SEVERAL = "one_of_several"  # number of the mission
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something that reading found or changed.
+
+    Attributes
+    ----------
+    code
+        What it is.
+    kind
+        ``info`` for what was done, ``warning`` for what a user should look at.
+    topic
+        The topic or signal concerned; empty for the whole recording.
+    count
+        How many samples, or whatever else the code counts, it concerns.
+    numbers, names
+        What `NoteCode` lists beside the code.
+    """
+
+    code: NoteCode
+    kind: Kind = "warning"
+    topic: str = ""
+    count: int = 0
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def read(cls, raw: Mapping[str, Any]) -> Note:
+        """Return the note of what `dataclasses.asdict` made of one."""
+        return cls(**{**raw, "code": NoteCode(raw["code"]), "names": tuple(raw["names"])})

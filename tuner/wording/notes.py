@@ -1,0 +1,94 @@
+"""What reading a recording found or changed, as a clause of a sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tuner.flights.notes import Note, NoteCode
+from tuner.wording.phrases import listed
+
+#: Code -> text with the note's count and numbers in braces; ``first`` and ``second`` for one of its
+#: names, ``others`` for all but the first, ``samples`` for the count with all signals,
+#: ``milliseconds`` and ``ppm`` for its seconds and its drift.
+TEXTS: Mapping[NoteCode, str] = {
+    NoteCode.TOPIC_MAP: "topic map '{first}' finds {count} signals",
+    NoteCode.OTHERS_MATCH: "{first} from {topic}; {others} would also match",
+    NoteCode.LAYOUT_UNKNOWN: "it is not known where {topic} ({first}) holds the {second}",
+    NoteCode.FIELD_MISSING: "{where} '{first}' for the {second}{alike}",
+    NoteCode.WITHOUT_POSE: (
+        "no pose was recorded: the {seconds:.1f} s with turning motors are fitted without motion "
+        "capture, by body rate and specific force"
+    ),
+    NoteCode.OTHER_CLOCK: "stamped by another clock, {seconds:.3f} s off: moved",
+    NoteCode.STAMPS_UNSET: "its stamps are not set: its times are those of recording",
+    NoteCode.NO_HEADER: "has no header: its times are those of recording",
+    NoteCode.STAMPS_REPLACED: (
+        "{count} stamps far from their neighbours replaced by the time of recording"
+    ),
+    NoteCode.CLOCK_JUMPED: (
+        "its clock jumped {count} times, by up to {seconds:.3f} s: joined again"
+    ),
+    NoteCode.POSE_ON_TIME: (
+        "stamps are {milliseconds:+.1f} ms late against the gyro, by correlation"
+    ),
+    NoteCode.POSE_MOVED: (
+        "its clock is {milliseconds:+.1f} ms late against the gyro, by correlation: moved"
+    ),
+    NoteCode.CLOCK_DRIFTS: "the publisher's clock drifts by {ppm:+.0f} ppm against its stamps",
+    NoteCode.ROWS_WITHOUT_TIME: "{count} rows without a time left out",
+    NoteCode.OUT_OF_RANGE: "{samples} outside {lower:g} to {upper:g} dropped",
+    NoteCode.NOT_A_NUMBER: "{samples} without a number dropped",
+    NoteCode.OUT_OF_ORDER: "{samples} out of order, put in order",
+    NoteCode.FAR_IN_TIME: "{samples} stamped hours away from the others dropped",
+    NoteCode.STAMPED_TWICE: "{samples} with a stamp seen before dropped",
+    NoteCode.SAMPLES_MISSING: "{samples} seem to be missing between those recorded",
+    NoteCode.NO_UNIT_QUATERNION: "{samples} that are no unit quaternion dropped or normalised",
+    NoteCode.REPEATED: "{samples} repeat the one before while the vehicle moves: dropped",
+    NoteCode.AWAY_AND_BACK: "{samples} jump away and back within a second: dropped",
+    NoteCode.AWAY_FOR_GOOD: "{samples} leap and do not come back: check the recording",
+    NoteCode.OUTLIERS: "{samples} far from their neighbours dropped as outliers",
+    NoteCode.SIGNAL_UNKNOWN: "{first} is unknown for {seconds:.2f} s, {longest:.2f} s at a time",
+    NoteCode.NO_TACHOMETER: "rotors {all} have no tachometer",
+    NoteCode.FRAME_TURNED: "{first} is {second}, which the topic map does not say: turned",
+    NoteCode.ATTITUDE_DOUBTED: (
+        "the attitude does not tilt as the vehicle accelerates (agreement {agreement:.2f}, "
+        "upright {upright:.2f}): check its frame and order"
+    ),
+    NoteCode.BODY_RATE_DOUBTED: (
+        "the body rate is not the attitude's change ({left:.1f} of it is left)"
+    ),
+    NoteCode.VELOCITY_DOUBTED: (
+        "the velocity is not the position's change (agreement {agreement:.2f})"
+    ),
+    NoteCode.COMMAND_DERIVED: (
+        "its motor commands are those that, by the vehicle file's arms and curve, give the "
+        "commanded thrust and torque: what was found of thrust and inertia is relative to that"
+    ),
+    NoteCode.ONE_OF_SEVERAL: "mission {number:.0f} of {count} in this recording",
+}
+PASSED_OVER = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)
+
+
+def reason_in_words(note: Note) -> str:
+    """Return what was found or changed."""
+    first, second, alike, *_ = (*note.names, "", "", "")
+    return TEXTS[note.code].format(
+        **note.numbers,
+        count=note.count,
+        topic=note.topic,
+        first=first,
+        second=second,
+        all=", ".join(note.names),
+        others=", ".join(note.names[1:]),
+        samples=f"{note.count} {listed(note.names or ('',))} samples",
+        where=f"{note.topic} has no field" if note.topic else "there is no column",
+        alike=f", did you mean '{alike}'?" if alike else "",
+        milliseconds=1e3 * note.numbers.get("seconds", 0.0),
+        ppm=1e6 * note.numbers.get("drift", 0.0),
+    )
+
+
+def note_in_words(note: Note) -> str:
+    """Return the same, and that a source was passed over for it where it was."""
+    reason = reason_in_words(note)
+    return f"passed over: {reason}" if note.code in PASSED_OVER else reason
