@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from tuner.bench.combine import combine
+from tuner.bench.measurement import Measurement
 from tuner.config import Settings, values_of
-from tuner.errors import RecordingError
+from tuner.errors import ConfigError, RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.inertial import InertialFlight, read_inertial
 from tuner.inertial.measurement import agreeing, measure_inertial
@@ -83,7 +87,13 @@ def fit_without_pose(
     alone = combine(measured, known)
     measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
     combination = combine(measurements, known)
-    vehicle = vehicle_of(Path(flights[0].path), start, combination)
+    path = Path(flights[0].path)
+    try:
+        vehicle = vehicle_of(path, start, combination)
+    except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
+        measurements = tuple(_without_yaw(m) for m in measurements)
+        combination = combine(measurements, known)
+        vehicle = vehicle_of(path, start, combination)
     return written(
         folder,
         start,
@@ -95,6 +105,17 @@ def fit_without_pose(
         source={"flights": ", ".join(flight.name for flight in flights)},
         header=f"From flights without a pose; the rest as in {start.name}.",
         began=began,
+    )
+
+
+def _without_yaw(measurement: Measurement) -> Measurement:
+    """Return a measurement without what it says of inertia_zz, which it does not say alone."""
+    kept = [i for i, row in enumerate(measurement.rows) if "inertia_zz" not in row]
+    return replace(
+        measurement,
+        rows=tuple(measurement.rows[i] for i in kept),
+        value=measurement.value[kept],
+        covariance=measurement.covariance[np.ix_(kept, kept)],
     )
 
 
