@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""
+ROUNDING = 1e-12
+"""Share of the largest eigenvalue, at unit diagonal, below which information is rounding error."""
 MAX_LEVERAGE = 0.95
 """Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
 
@@ -67,21 +69,23 @@ def covariance_of(information: FisherInformation) -> Covariance:
     """
     total = information.total
     unit = 1.0 / np.sqrt(np.diag(total))
-    inverse = _inverse(total, unit)
-    white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
     priors = information.prior + information.nuisance_prior
     if information.ground is not None:  # its noise is as large as it says
         priors = priors + information.ground
-    independent = inverse @ (white + priors) @ inverse
-    clustered = inverse @ (_score_products(information, unit) + priors) @ inverse
+    inverse = _Inverse.of(total, unit, priors)
+    white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
+    independent = inverse.sandwiched(white, priors)
+    clustered = inverse.sandwiched(_score_products(information, unit), priors)
     ratio = np.diag(clustered) / np.diag(independent) - np.sqrt(
-        2.0 / _effective_stretches(information, inverse)
+        2.0 / _effective_stretches(information, inverse.matrix)
     )
     inflation = np.sqrt(np.maximum(ratio, 1.0))
     data = information.data + information.prior / WIDE**2
-    data_inverse = _inverse(data, 1.0 / np.sqrt(np.diag(data)))
+    data_inverse = _Inverse.of(
+        data, 1.0 / np.sqrt(np.diag(data)), information.prior / WIDE**2
+    ).matrix
     matrix = independent * np.outer(inflation, inflation)
-    beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse))
+    beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse.matrix))
     return Covariance(
         matrix=matrix,
         data_only=data_inverse * np.outer(beyond_noise, beyond_noise),
@@ -99,12 +103,51 @@ def _effective_stretches(information: FisherInformation, inverse: Array) -> Arra
     return np.asarray(np.maximum(by_stretch.sum(axis=0) ** 2 / squares, 1.0))
 
 
-def _inverse(matrix: Array, unit: Array) -> Array:
-    """Invert a positive definite matrix whose diagonal spans many powers of ten."""
-    scaled = matrix * np.outer(unit, unit)
-    values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(values, 1e-15 * values.max())
-    return np.asarray((vectors / values) @ vectors.T * np.outer(unit, unit))
+@dataclass(frozen=True)
+class _Inverse:
+    """The inverse of a positive definite matrix whose diagonal spans many powers of ten.
+
+    Attributes
+    ----------
+    unit
+        (K,) that scales the matrix to a unit diagonal.
+    values, vectors
+        (K,) and (K, K) eigenvalues and eigenvectors of the scaled matrix.
+    rounded
+        (K,) along which of them the flights only leave rounding errors. However much they know of
+        the rest, the rounding errors of that are no knowledge: the prior alone counts there.
+    """
+
+    unit: Array
+    values: Array
+    vectors: Array
+    rounded: NDArray[np.bool_]
+
+    @staticmethod
+    def of(matrix: Array, unit: Array, prior: Array) -> _Inverse:
+        """Return the inverse of information (K, K), of which ``prior`` is no sum over flights."""
+        scale = np.outer(unit, unit)
+        values, vectors = np.linalg.eigh(matrix * scale)
+        along = np.einsum("pk,pq,qk->k", vectors, prior * scale, vectors, optimize=True)
+        rounded = values < ROUNDING * values.max()
+        values = np.where(rounded, np.maximum(along, 1e-30 * values.max()), values)
+        return _Inverse(unit, values, vectors, rounded)
+
+    @property
+    def matrix(self) -> Array:
+        """The inverse (K, K)."""
+        scale = np.outer(self.unit, self.unit)
+        return np.asarray((self.vectors / self.values) @ self.vectors.T * scale)
+
+    def sandwiched(self, meat: Array, priors: Array) -> Array:
+        """Return H⁻¹ (meat + priors) H⁻¹, the flights' meat without rounding errors."""
+        scale = np.outer(self.unit, self.unit)
+        from_flights = self.vectors.T @ (meat * scale) @ self.vectors
+        from_flights[self.rounded] = 0.0
+        from_flights[:, self.rounded] = 0.0
+        inside = from_flights + self.vectors.T @ (priors * scale) @ self.vectors
+        divided = inside / np.outer(self.values, self.values)
+        return np.asarray(self.vectors @ divided @ self.vectors.T * scale)
 
 
 def _score_products(information: FisherInformation, unit: Array) -> Array:

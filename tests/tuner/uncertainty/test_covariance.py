@@ -92,3 +92,16 @@ def test_a_direction_without_data_is_known_from_the_prior_alone() -> None:
     assert covariance.data_error[0] > 10.0
     assert covariance.data_error[1] == pytest.approx(covariance.error[1], rel=0.1)
     assert covariance.correlation[0, 2] < -0.9
+
+
+@pytest.mark.parametrize("size", [1e5, 1e8])
+def test_rounding_errors_of_what_is_known_well_are_no_information(size: float) -> None:
+    generator = np.random.default_rng(11)
+    design = size * smooth_design(5)
+    design[:, 2] = design[:, 0] * (1.0 + 1e-13 * generator.normal(size=len(design)))
+    information, _ = regression(generator.normal(size=BLOCKS * LENGTH), design)
+    information = FisherInformation(**{**vars(information), "prior": np.eye(COUNT) / 0.5**2})
+    covariance = covariance_of(information)
+    assert covariance.error[0] == pytest.approx(0.5 / np.sqrt(2), rel=0.02)
+    assert covariance.data_error[0] > 10.0
+    assert covariance.error[1] < 1.0 / size
