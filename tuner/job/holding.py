@@ -39,15 +39,19 @@ def with_undetermined_held(
 ) -> tuple[Fitted, Examination]:
     """Return the fit once all that it does not identify is held, and its examination.
 
-    A fit that predicts from recorded states keeps all its values: together they predict, even where
-    the flights do not tell them apart, and each one's verdict says so.
+    A fit that predicts from recorded states keeps the values of all but those that trade off:
+    together they predict, even where the flights do not tell them apart, and each one's verdict
+    says so.
     """
     examination = examine(fitted)
     segments = fitted.objective.segments
-    if segments.windowed and segments.freedom is None:
-        return fitted, examination
+    predicts = segments.windowed and segments.freedom is None
     for _ in range(MAX_ROUNDS):
-        stand_ins = stand_ins_of(examination.uncertainty) | dict(fitted.held)
+        found = stand_ins_of(examination.uncertainty)
+        if predicts:
+            traded = {stand_in for name, stand_in in found.items() if name != stand_in}
+            found = {name: stand_in for name, stand_in in found.items() if stand_in in traded}
+        stand_ins = found | dict(fitted.held)
         names = sorted(set(stand_ins.values()))
         if set(names) <= set(fitted.held.values()):
             break

@@ -115,7 +115,8 @@ def test_commands_recorded_too_seldom_are_reported(flight, bag, updated, full_fl
 def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     full_flight, full_bag, updated, tmp_path
 ):
-    free = (*FREE, "mass", "inertia_zz")
+    # a rolling moment that is as given tells the scale of all others, to some percent
+    free = (*FREE, "mass", "inertia_zz", "rolling_moment_coefficient")
     job = job_through("rotor_speed", full_flight, full_bag, updated, free=free)
     messages = []
     fitted, examination = with_undetermined_held(
