@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test test-fast lint docs bench clean
+.PHONY: demo test test-all test-fast lint docs bench clean
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -14,11 +14,14 @@ $(READY): pyproject.toml
 demo: $(READY)  ## fit the five recordings that ship with the project
 	$(BIN)/tune --flights reference_flights/*.bag --out runs/demo
 
-test: $(READY)  ## every test, the slow ones too
+test: $(READY)  ## every test but what is marked long: that repeats others at length
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"
+
+test-all: $(READY)  ## every test; half an hour on two cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-fast: $(READY)  ## what a change is checked against while it is being made
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow and not long"
 
 lint: $(READY)  ## style, types, and who may import whom
 	$(BIN)/ruff check .

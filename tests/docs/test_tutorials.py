@@ -26,7 +26,13 @@ NOT_RUN = {
     "tune --flights reference_flights/*.bag --config runs/quad.job.yaml": "another fit as long as "
     "the shared one; what its files hold is read instead",
 }
-FOLLOWED = [page for page in TUTORIALS if page.stem != "service"]
+LENGTHY = ("missing-terms",)
+"""Tutorials with a search of their own that takes minutes."""
+FOLLOWED = [
+    pytest.param(page, id=page.stem, marks=pytest.mark.long if page.stem in LENGTHY else ())
+    for page in TUTORIALS
+    if page.stem != "service"
+]
 """All but the one that needs a server, see `tests.docs.test_service_tutorial`."""
 SHARED = "tune --flights reference_flights/*.bag --out runs/first"
 """The fit of ``make demo``, which is made once for all tests."""
@@ -51,7 +57,7 @@ def words_of(command: str) -> list[str]:
     return words
 
 
-@pytest.mark.parametrize("page", FOLLOWED, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", FOLLOWED)
 def test_its_commands_run_and_print_what_it_shows(
     page: Path, place: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -12,6 +12,7 @@ from tuner.result import read_run
 ROOT = Path(__file__).resolve().parents[2]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_example_goes_from_recordings_to_a_simulator(tmp_path):
     done = subprocess.run(

@@ -136,7 +136,9 @@ def test_folds_are_the_same_elsewhere(two_flights, two_workers, folds_here, tmp_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moment", range(20))
+@pytest.mark.parametrize(
+    "moment", [0, 1, *(pytest.param(moment, marks=pytest.mark.long) for moment in range(2, 20))]
+)
 def test_folds_are_the_same_though_a_worker_is_lost(
     two_flights, two_workers, folds_here, tmp_path, moment
 ):

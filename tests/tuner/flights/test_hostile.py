@@ -51,7 +51,9 @@ def refused(path: Path) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize(("first", "cases"), [(0, 8), pytest.param(8, 92, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("first", "cases"), [(0, 8), pytest.param(8, 92, marks=[pytest.mark.slow, pytest.mark.long])]
+)
 def test_broken_files_are_read_or_refused(first: int, cases: int) -> None:
     asked = ["all", "--first", str(first), "--cases", str(cases)]
     run = subprocess.run(

@@ -13,6 +13,7 @@ from tuner.job.run import run
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_wrong_rig_is_named_and_a_right_one_agrees(tmp_path):
     truth = yaml.safe_load((FLIGHTS / "truth.yaml").read_text())

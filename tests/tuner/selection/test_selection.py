@@ -20,6 +20,7 @@ def selected(drag, *, seed=0, job=None):
     return result, messages
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_term_that_was_flown_is_found_and_its_interval_holds_the_truth():
     for seed in (0, 3):  # in one test: they share programs that take longer to trace than to run
@@ -31,7 +32,7 @@ def test_a_term_that_was_flown_is_found_and_its_interval_holds_the_truth():
         assert result.job.space.names == (*BASE_IN_ORDER, "fuselage_drag"), seed
         low, high = uncertainty_of(result.fitted).estimates["fuselage_drag"].ci95
         assert low < DRAG < high, seed
-        assert messages == ["Fitting again with fuselage_drag."], seed
+        assert messages[0].startswith("The flights call for more than the base model"), seed
 
 
 @pytest.mark.slow

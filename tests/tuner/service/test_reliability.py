@@ -112,6 +112,7 @@ def test_a_server_that_is_killed_loses_nothing_and_does_nothing_twice(tmp_path, 
     assert len(results_in(tmp_path / "data")) == 1
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_server_that_is_killed_at_twenty_random_moments(tmp_path, table):
     found = killed_again_and_again(tmp_path / "data", table, kills=KILLS)

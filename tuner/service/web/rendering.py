@@ -9,8 +9,10 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
+from tuner.flights.notes import Note
 from tuner.service.shapes import iso
 from tuner.service.states import State
+from tuner.wording.notes import note_in_words
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
 STATES: Mapping[str, tuple[str, str]] = {
@@ -41,6 +43,7 @@ def environment() -> Environment:
         "ago": _ago,
         "moment": lambda value: "" if value is None else iso(value),
         "lasting": _lasting,
+        "note": lambda raw: note_in_words(Note.read(raw)),
     }
     made.filters |= filters
     made.globals |= {"states": STATES}
