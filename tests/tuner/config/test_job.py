@@ -4,6 +4,7 @@ import pytest
 
 from tuner.config import JobFile, configs_folder, read_job
 from tuner.config.job import (
+    CHANNELS,
     CoefficientSettings,
     ExportSettings,
     FlightSettings,
@@ -87,9 +88,6 @@ def test_what_cannot_be_meant_is_refused_in_one_line(tmp_path, text, expected):
 
 
 def test_every_channel_off_is_refused(tmp_path):
-    channels = "".join(
-        f"  {name}: false\n"
-        for name in ("position", "attitude", "body_rate", "rotor_speed", "command")
-    )
+    channels = "".join(f"  {name}: false\n" for name in CHANNELS)
     with pytest.raises(ConfigError, match="every channel is switched off"):
         read(tmp_path, "channels:\n" + channels)
