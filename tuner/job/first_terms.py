@@ -12,14 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.coefficients import term_groups
 from tuner.coefficients.space import extended
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
 from tuner.objective.battery import require_voltage
 from tuner.objective.inlets import INLETS
 from tuner.objective.start import rests
-from tuner.selection.candidates import groups_named, start_of
+from tuner.selection.candidates import candidate_groups, groups_named, start_of
 
 MARKERS = ("marker_offset", "marker_tilt")
 """The groups of the motion capture's frame."""
@@ -42,15 +41,10 @@ def with_first_terms(job: Job) -> Job:
     if not isinstance(settings.terms, str):
         groups = groups_named(settings.terms, job.space)
     elif settings.terms == "auto" and settings.free is None and _tilted(job, tilt):
-        groups = {name: term_groups()[name] for name in MARKERS}
+        candidates = candidate_groups(job.settings.vehicle, job.space, settings)
+        groups = {name: candidates[name] for name in MARKERS if name in candidates}
     else:
         groups = {}
-    taken = {*job.space.free, *settings.fixed}
-    groups = {
-        group: left
-        for group, names in groups.items()
-        if (left := tuple(name for name in names if name not in taken))
-    }
     names = [name for group in groups.values() for name in group]
     if not names:
         return job

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -24,8 +23,7 @@ from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
 from tuner.model import with_coefficients
-from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
-from tuner.objective.many_points import sums_at
+from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -37,6 +35,7 @@ from tuner.selection.candidates import (
     with_terms,
 )
 from tuner.selection.linear import Linear, linear_at
+from tuner.selection.prediction import offsets_fitted, predicted_losses
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.wording.phrases import listed
@@ -50,8 +49,6 @@ WORTH_FITTING = (
     SelectionCode.PREDICTS_SECTIONS,
     SelectionCode.NOT_PREDICTED,
 )
-LONGEST_STEP = 1.0
-"""Standard deviations of a prior that a coefficient may move when a flight is left out."""
 
 
 @dataclass(frozen=True)
@@ -269,9 +266,10 @@ class _Selection:
         start = np.asarray(point.coefficients)
         vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
         at = Point(jnp.asarray(vector), fitted.point.offsets)
-        offsets_fitted = _offsets_fitted(fitted)
         return _State(
-            fitted, added, linear_at(objective, at, fitted.criterion, offsets_fitted=offsets_fitted)
+            fitted,
+            added,
+            linear_at(objective, at, fitted.criterion, offsets_fitted=offsets_fitted(fitted)),
         )
 
     @property
@@ -352,79 +350,18 @@ class _Selection:
         show it, not worse by as much.
         """
         scale = state.fitted.criterion.scale
-        gains = self._predictions(state, scale) - self._predictions(trial, scale)
+        gains = self._predicted(state, scale) - self._predicted(trial, scale)
         if len(gains) < 2:
             return bool(gains.sum() > 0.0)
         scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
-    def _predictions(self, state: _State, scale: Mapping[str, Array]) -> NDArray[np.float64]:
-        """Return the loss (N,) of each flight with the coefficients that the others ask for.
-
-        One linear step leads from the joint fit to the fit without the flight; there the flight is
-        simulated. Its own offsets follow.
-
-        Parameters
-        ----------
-        state
-            The joint fit.
-        scale
-            Channel -> (N,) factor on the standard deviations.
-        """
-        fitted, linear = state.fitted, state.linear
-        objective, criterion = fitted.objective, _with_scale(fitted.criterion, scale)
-        space, flight = objective.space, np.asarray(objective.segments.flight)
+    def _predicted(self, state: _State, scale: Mapping[str, Array]) -> NDArray[np.float64]:
         model = self._columns([*self.job.space.names, *_names(state.added)])
-        own = self._columns(space.names)
-        movable, vectors, losses = _offsets_fitted(fitted), [], []
-        for number in range(objective.flights):
-            change = linear.step(model, inside=linear.flight != number)[own]
-            far = LONGEST_STEP * space.prior_sd
-            scaled = linear.scaled[own] + np.clip(change, -far, far)
-            vectors.append(space.at_share((scaled - space.lower) / space.width))
-        offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
-        of_each = sums_at(
-            objective, Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets)), criterion
-        )
-        for number in range(objective.flights):
-            sums = jax.tree.map(lambda leaf, at=number: leaf[at], of_each)
-            inside = flight == number
-            losses.append(
-                float(np.asarray(sums.loss)[inside].sum())
-                - _gain_of_offsets(sums, inside, len(space), movable[:, number])
-            )
-        return np.array(losses)
+        own = self._columns(state.fitted.objective.space.names)
+        return predicted_losses(state.fitted, state.linear, model, own, scale)
 
 
 def _names(groups: Groups) -> tuple[str, ...]:
     """Return the coefficients of some groups."""
     return tuple(name for names in groups.values() for name in names)
-
-
-def _with_scale(criterion: Criterion, scale: Mapping[str, Array]) -> Criterion:
-    return Criterion(
-        horizon=criterion.horizon,
-        scale=dict(scale),
-        reference_offset=criterion.reference_offset,
-        huber=criterion.huber,
-        prior=criterion.prior,
-        states=criterion.states,
-    )
-
-
-def _gain_of_offsets(
-    sums: SegmentSums, inside: NDArray[np.bool_], count: int, movable: NDArray[np.bool_]
-) -> float:
-    """Return by how much a flight's loss falls when its offsets follow, in one linear step."""
-    free = count + np.flatnonzero(movable)
-    if not len(free):
-        return 0.0
-    gradient = np.asarray(sums.gradient)[free][:, inside].sum(axis=-1)
-    hessian = np.asarray(sums.hessian)[np.ix_(free, free)][..., inside].sum(axis=-1)
-    hessian = hessian + np.eye(len(free)) / OFFSET_SD**2
-    return float(0.5 * gradient @ np.linalg.solve(hessian, gradient))
-
-
-def _offsets_fitted(fitted: Fitted) -> NDArray[np.bool_]:
-    """Return which offsets (offsets, N) the fit moved: those that are not exactly zero."""
-    return np.asarray(np.asarray(fitted.point.offsets) != 0.0)

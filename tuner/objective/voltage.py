@@ -5,8 +5,10 @@ with some tens of millivolts of noise, a hundredth of which would be thrust if i
 stands. What the voltage itself does is a slow decline, and a sag with the load: the current of a
 rotor goes with its power, the cube of its speed. The sag follows rotor speeds or motor commands,
 which are recorded often and well, and one resistance per set of flights is all that is estimated of
-it (a partially linear model, Speckman 1988); the decline is a smoothing spline whose stiffness is
-chosen by generalised cross-validation (Craven and Wahba 1979).
+it (a partially linear model, Speckman 1988). The decline that is left is a polynomial in the charge
+drawn, of the degree that the readings support (Schwarz 1978). Where no load was recorded, decline
+and sag together are a smoothing spline, its stiffness chosen by generalised cross-validation
+(Craven and Wahba 1979).
 """
 
 from __future__ import annotations

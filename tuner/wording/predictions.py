@@ -52,7 +52,7 @@ def _clocks(flights: Sequence[FlightResult]) -> str:
     if fitted:
         parts.append(f"the clock offset of {listed(fitted)} was fitted")
     if assumed:
-        parts.append(f"that of {listed(assumed)} is taken to be zero")
+        parts.append(f"the clock offset of {listed(assumed)} is taken to be zero")
     return f" ({'; '.join(parts)})" if parts else ""
 
 
