@@ -12,8 +12,9 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.job.prepare import Job
-from tuner.objective.inlets import INLETS, sparse
+from tuner.objective.inlets import INLETS
 from tuner.objective.motor_order import order_findings
+from tuner.objective.recorded_inputs import sparse
 from tuner.objective.setpoints import setpoint_findings
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 from tuner.config import ControllerFile, VehicleFile
 from tuner.config.job import InletName
+from tuner.errors import RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.objective.explained import Explained, Source, explained
-from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.inlets import INLETS
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 
 EXPLAINS = 0.15
@@ -89,3 +90,30 @@ def _finding(flight: Flight, inlet: InletName, doubt: Explained) -> Finding:
         "gyro": round(doubt.gyro_rate),
     }
     return Finding(Code.INLET_CHOSEN, "info", flight.name, numbers, (inlet, doubt.source))
+
+
+def inlet_for(flight: Flight, requested: str) -> InletName:
+    """Return the inlet of a flight: the one requested, or for ``auto`` the first preferred one.
+
+    Raises
+    ------
+    RecordingError
+        The recording does not hold what the inlet needs.
+    """
+    if requested == "auto":
+        for inlet in INLETS.values():
+            if inlet.is_preferred(flight):
+                return inlet.name
+        raise RecordingError(
+            flight.path,
+            "holds neither a reference with velocities, nor rate set-points, nor four motor "
+            "commands, nor four rotor speeds, nor thrust set-points",
+            "name its trajectory in the job file",
+        )
+    (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)
+    if not inlet.can_be_fed(flight):
+        missing = " and no ".join(inlet.needs)
+        raise RecordingError(
+            flight.path, f"holds no {missing} for the {inlet.name} inlet", inlet.remedy
+        )
+    return inlet.name

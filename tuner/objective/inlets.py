@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import ClassVar
 
 import jax
@@ -32,9 +31,16 @@ from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.coefficients import term_groups
 from tuner.config.job import InletName
-from tuner.errors import RecordingError
-from tuner.flights.flight import SIGNALS, Array, Flight, Series
+from tuner.flights.flight import Flight
 from tuner.flights.resample import without_gaps
+from tuner.objective.recorded_inputs import (
+    linear_interpolation,
+    reference_points,
+    sparse,
+    with_body_rate,
+    zero_order_hold,
+    zeroed,
+)
 from tuner.padding import padded_size
 
 OF_MOTORS = (
@@ -61,10 +67,6 @@ TURNING = (
     *(f"torque_trim_{axis}" for axis in "xyz"),
 )
 """Coefficients that turn the vehicle, and do nothing else."""
-MISSED = 1.5
-"""Periods of a loop between two samples beyond which its output was not recorded in full."""
-
-
 STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
 """Rotors differ and the mass is never quite in the middle: recorded inputs hold a steady torque
 that turns nothing, and that a simulation which is fed with them has to know of."""
@@ -194,7 +196,7 @@ class RecordedReference(RecordedInlet):
         """Lay the reference out tick by tick, its last point repeated."""
         del schedule
         length = padded_size(max(len(flight.time) for flight in flights))
-        columns = [_points(flight, length) for flight in flights]
+        columns = [reference_points(flight, length) for flight in flights]
         position, velocity, acceleration = (
             Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
         )
@@ -340,7 +342,7 @@ class RecordedAttitude(RecordedInlet):
 
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
         """Lay attitudes and body rates out step by step, beside what turns the rotors."""
-        with_rate = [_with_body_rate(flight) for flight in flights]
+        with_rate = [with_body_rate(flight) for flight in flights]
         attitude = jnp.stack(self._resampled("attitude", flights, schedule))
         return AttitudeInlet(
             Quaternion.of(attitude).normalized(),
@@ -360,33 +362,6 @@ INLETS: Mapping[InletName, RecordedInlet] = {
         RecordedAttitude(),
     )
 }
-
-
-def inlet_for(flight: Flight, requested: str) -> InletName:
-    """Return the inlet of a flight: the one requested, or for ``auto`` the first preferred one.
-
-    Raises
-    ------
-    RecordingError
-        The recording does not hold what the inlet needs.
-    """
-    if requested == "auto":
-        for inlet in INLETS.values():
-            if inlet.is_preferred(flight):
-                return inlet.name
-        raise RecordingError(
-            flight.path,
-            "holds neither a reference with velocities, nor rate set-points, nor four motor "
-            "commands, nor four rotor speeds, nor thrust set-points",
-            "name its trajectory in the job file",
-        )
-    (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)
-    if not inlet.can_be_fed(flight):
-        missing = " and no ".join(inlet.needs)
-        raise RecordingError(
-            flight.path, f"holds no {missing} for the {inlet.name} inlet", inlet.remedy
-        )
-    return inlet.name
 
 
 def bypassed_by(names: Sequence[InletName], flights: Sequence[Flight]) -> frozenset[str]:
@@ -445,7 +420,7 @@ def _laid(
     for inlet in used:
         example = flights[recorded.index(inlet)]
         feeding = [
-            flight if own is inlet else _zeroed(flight, {*inlet.needs, *inlet.fed(example)})
+            flight if own is inlet else zeroed(flight, {*inlet.needs, *inlet.fed(example)})
             for own, flight in zip(recorded, flights, strict=True)
         ]
         parts.append(inlet.lay(feeding, schedule))
@@ -456,68 +431,3 @@ def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:
     """Return what feeds an inlet of the simulator."""
     (recorded,) = (r for r in INLETS.values() if type(inlet) is r.feeds)
     return recorded
-
-
-def _zeroed(flight: Flight, names: Collection[str]) -> Flight:
-    """Return a flight whose signals are zero throughout, its attitude level."""
-    rows = {name: np.zeros(SIGNALS[name][0]) for name in names}
-    if "attitude" in rows:
-        rows["attitude"][0] = 1.0
-    ends = np.array([0.0, flight.duration])
-    signals = {name: np.tile(row, (len(flight.time), 1)) for name, row in rows.items()}
-    series = {name: Series(ends, np.tile(row, (2, 1))) for name, row in rows.items()}
-    return replace(
-        flight, signals={**flight.signals, **signals}, series={**flight.series, **series}
-    )
-
-
-def _with_body_rate(flight: Flight) -> Flight:
-    """Return a flight with a body rate: the attitude's change, where no gyro was recorded."""
-    if flight.has("body_rate"):
-        return flight
-    turns = flight.series["attitude"]
-    w, x, y, z = turns.values.T
-    dw, dx, dy, dz = np.gradient(turns.values, turns.time, axis=0).T
-    rate = 2.0 * np.column_stack(
-        [
-            w * dx - x * dw - y * dz + z * dy,
-            w * dy + x * dz - y * dw - z * dx,
-            w * dz - x * dy + y * dx - z * dw,
-        ]
-    )
-    return replace(flight, series={**flight.series, "body_rate": Series(turns.time, rate)})
-
-
-def sparse(flights: Sequence[Flight], signal: str, update_rate: float) -> bool:
-    """Return whether a signal was recorded less often than it was computed, at a rate in Hz."""
-    gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in flights])
-    return bool(np.median(gaps) * update_rate > MISSED)
-
-
-def zero_order_hold(series: Series, clock: Array) -> Array:
-    """Read a signal (n, k) that holds until its next sample, at (m,) times in s."""
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        place = np.searchsorted(series.time[known], clock + 1e-9, side="right") - 1
-        columns.append(column[known][np.maximum(place, 0)])
-    return np.column_stack(columns)
-
-
-def linear_interpolation(series: Series, clock: Array) -> Array:
-    """Read a signal (n, k) that moves linearly between its samples, at (m,) times in s."""
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        columns.append(np.interp(clock, series.time[known], column[known]))
-    return np.column_stack(columns)
-
-
-def _points(flight: Flight, length: int) -> list[Array]:
-    """Return position, velocity and acceleration, each (3, length), the last point repeated."""
-    parts = []
-    for name in ("reference_position", "reference_velocity", "reference_acceleration"):
-        values = flight.signals.get(name)
-        rows = np.zeros((len(flight.time), 3)) if values is None else np.nan_to_num(values)
-        parts.append(np.pad(rows, ((0, length - len(rows)), (0, 0)), mode="edge").T)
-    return parts

@@ -29,7 +29,7 @@ from tuner.config import ControllerFile
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Array, Flight, Series
 from tuner.model import controller_of
-from tuner.objective.inlets import linear_interpolation, zero_order_hold
+from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 
 POINTS = 1024
 """Set-points that are looked at, spread over a flight: one compiled program serves all."""

@@ -9,8 +9,9 @@ from tuner.config import CHANNELS
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.informs import inlets
+from tuner.objective.choice import inlet_for
 from tuner.objective.initial_conditions import STATES
-from tuner.objective.inlets import INLETS, inlet_for
+from tuner.objective.inlets import INLETS
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():

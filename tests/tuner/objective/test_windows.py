@@ -9,7 +9,9 @@ from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.errors import RecordingError
 from tuner.flights.flight import Series
-from tuner.objective.inlets import INLETS, inlet_for, linear_interpolation, zero_order_hold
+from tuner.objective.choice import inlet_for
+from tuner.objective.inlets import INLETS
+from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 
