@@ -23,6 +23,7 @@ from distributed.comm import CommClosedError
 from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import Engine, Report, Task
+from tuner.engine.interrupts import interrupts_kept_from_children
 from tuner.engine.store import Store
 from tuner.engine.worker import SetUp, Shared, run_task, stop_name
 from tuner.errors import EngineError
@@ -146,12 +147,13 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
     store = Store(f"{base.rstrip('/')}/{uuid.uuid4().hex}")  # what this engine shares, and no other
     with contextlib.ExitStack() as stack:
         stack.callback(store.clear)
-        cluster = stack.enter_context(cluster_of(file))
-        client = stack.enter_context(connected(cluster, file))
         local = file.address is None and file.jobs is None and file.kubernetes is None
         pool = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-        client.register_plugin(
-            SetUp(devices, tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
-        )
+        with interrupts_kept_from_children():
+            cluster = stack.enter_context(cluster_of(file))
+            client = stack.enter_context(connected(cluster, file))
+            client.register_plugin(
+                SetUp(devices, tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
+            )
         at_once = file.workers if file.address is None else max(1, len(client.nthreads()))
         yield OnDask(client, at_once, store, devices)

@@ -6,8 +6,6 @@ import contextlib
 import logging
 import os
 import pickle
-import signal
-import threading
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
@@ -54,8 +52,6 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Worker) -> None:
         """Set a worker up."""
         if self.pool:
-            if threading.current_thread() is threading.main_thread():
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the starter's to handle
             first = self.cores * int(worker.name)
             pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
         if self.gpus:

@@ -75,11 +75,15 @@ def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path):
 
 
 IMPATIENT = """
+import signal
 import sys
 from tests.tuner.engine import tasks
 from tuner.engine import engine_for
 
 if __name__ == "__main__":
+    # a suite that a shell's script runs in the background hands down that it is ignored
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    print("begins", flush=True)
     try:
         with engine_for(2) as engine:
             engine.map(
@@ -106,9 +110,9 @@ def processes_of(group):
     return [command for command in found if command]
 
 
-@pytest.mark.long
 @pytest.mark.slow
-def test_ctrl_c_ends_every_process(tmp_path):
+@pytest.mark.parametrize("moment", ["workers start", "workers work"])
+def test_ctrl_c_ends_every_process(tmp_path, moment):
     script = tmp_path / "impatient.py"
     script.write_text(IMPATIENT)
     user = subprocess.Popen(
@@ -120,7 +124,12 @@ def test_ctrl_c_ends_every_process(tmp_path):
         start_new_session=True,
     )
     assert user.stdout is not None
-    assert user.stdout.readline() == "works\n"
+    assert user.stdout.readline() == "begins\n"
+    if moment == "workers work":
+        assert user.stdout.readline() == "works\n"
+    else:
+        while len(processes_of(user.pid)) < 3:
+            time.sleep(0.02)
     assert len(processes_of(user.pid)) >= 3
     os.killpg(user.pid, signal.SIGINT)
     said, complaints = user.communicate(timeout=60)
