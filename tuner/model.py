@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -81,6 +81,16 @@ def with_coefficients(model: Model, values: Mapping[str, Scalar]) -> Model:
         is_leaf=lambda node: node is before,
     )
     return with_effects
+
+
+def with_terms_computed(model: Model, names: Collection[str]) -> Model:
+    """Return the model with some terms in it, at their neutral values where it leaves them out.
+
+    Nothing flies otherwise, and models with and without these terms share their programs.
+    """
+    given = coefficients_in(model)
+    neutral = {name: jnp.asarray(COEFFICIENTS[name].neutral) for name in names if name not in given}
+    return with_coefficients(model, neutral)
 
 
 def vehicle_of(file: VehicleFile) -> Vehicle:

@@ -19,6 +19,7 @@ from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 
 BEST_FIT_FILE = "best_fit.yaml"
+EFFECTIVE_FILE = "effective.yaml"
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"
 
 
@@ -173,10 +174,70 @@ class SearchResult(Part):
     message: Ending
 
 
+class PoseRmse(Part):
+    """Over all flights of a run, free yaw spins apart, the root mean square of a flight's RMSE.
+
+    The distance in position (m), and roll, pitch and yaw together (deg); None where one crashed.
+    """
+
+    position: FiniteOrNone
+    attitude: FiniteOrNone
+
+
+class LostTerm(Part):
+    """A group of terms that the target simulator lacks, and the RMSE where it alone is missing."""
+
+    group: str
+    names: tuple[str, ...]
+    rmse_without: PoseRmse
+
+
+class EffectiveResult(Part):
+    """The second answer: with which coefficients the target simulator flies most like the vehicle.
+
+    Those of its own model, fitted by least squares from the physical ones, the first answer, to the
+    same flights. Terms that it has a place for stay as they are, and so does what belongs to the
+    set-up: latencies, clocks, markers, wind.
+
+    Attributes
+    ----------
+    target
+        The simulator.
+    coefficients
+        Name -> value of all that flies there; `effective.yaml` is the vehicle.
+    lost
+        What it lacks, of what acts in the physical answer.
+    carried
+        What of the terms beyond its motor model it has a place for, as in the first answer.
+    rmse_physical
+        Of the physical answer, all terms in it.
+    rmse_unfitted
+        Of the physical coefficients without the terms that are lost.
+    rmse_effective
+        Of the effective coefficients.
+    flights
+        Flight -> RMSE with the effective coefficients.
+    converged
+        Whether the fit stopped because its steps gained nothing, not at its limit.
+    """
+
+    target: Literal["gazebo"]
+    coefficients: dict[str, float]
+    lost: tuple[LostTerm, ...]
+    carried: tuple[str, ...]
+    rmse_physical: PoseRmse
+    rmse_unfitted: PoseRmse
+    rmse_effective: PoseRmse
+    flights: dict[str, AxesRmse]
+    converged: bool
+
+
 class RunResult(ResultFile):
     """The content of ``result.json``.
 
-    ``selection`` holds the terms that the fit could have added, empty where it was not asked.
+    ``coefficients`` is the first answer of a run, what is true of the vehicle; ``effective`` the
+    second, None where the target simulator lacks nothing and both are the same. ``selection`` holds
+    the terms that the fit could have added, empty where it was not asked.
     """
 
     FILE = "result.json"
@@ -192,17 +253,22 @@ class RunResult(ResultFile):
     findings: tuple[Finding, ...]
     search: SearchResult
     selection: tuple[SelectionRow, ...] = ()
+    effective: EffectiveResult | None = None
     sources: dict[str, Sources] = Field(default_factory=dict)
 
 
 class Run(BaseModel):
-    """A result folder that was read: its result, and the vehicle with the best coefficients."""
+    """A result folder that was read: its result, and the vehicle with the best coefficients.
+
+    ``effective`` is the one for the target simulator, where that is another.
+    """
 
     model_config = ConfigDict(frozen=True)
 
     folder: Path
     result: RunResult
     vehicle: VehicleFile = Field(description="best_fit.yaml")
+    effective: VehicleFile | None = Field(default=None, description="effective.yaml")
 
 
 def read_run(folder: str | Path) -> Run:
@@ -217,9 +283,15 @@ def read_run(folder: str | Path) -> Run:
     if not (exists(folder) and folder.is_dir()):
         raise InputError(folder, "is no folder", "give the result folder of a run")
     result = RunResult.read(folder, REMEDY)
-    for name in result.coefficients:
+    effective = result.effective
+    for name in (*result.coefficients, *(effective.coefficients if effective else ())):
         if name not in COEFFICIENTS:
             raise InputError(
                 folder / RunResult.FILE, f"unknown coefficient '{name}'", "was it edited?"
             )
-    return Run(folder=folder, result=result, vehicle=read_vehicle(folder / BEST_FIT_FILE))
+    return Run(
+        folder=folder,
+        result=result,
+        vehicle=read_vehicle(folder / BEST_FIT_FILE),
+        effective=read_vehicle(folder / EFFECTIVE_FILE) if effective else None,
+    )

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
-    from tuner.result import RunResult
+    from tuner.result import EffectiveResult, RunResult
 
 
 def print_run(folder: Path, result: RunResult) -> None:
@@ -29,6 +29,8 @@ def print_run(folder: Path, result: RunResult) -> None:
     screen.print(_coefficients(result))
     if result.selection:
         _print_selection(screen, result)
+    if result.effective is not None:
+        _print_effective(screen, result, result.effective)
     screen.print(_errors(result))
     for line in starts_in_words(result.flights):
         screen.print(line, markup=False)
@@ -39,8 +41,9 @@ def print_run(folder: Path, result: RunResult) -> None:
         f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "
         f"{search.wall_time:.0f} s."
     )
+    vehicles = "best_fit.yaml" if result.effective is None else "best_fit.yaml, effective.yaml"
     screen.print(
-        f"written to {folder}/ (report.html, best_fit.yaml, result.json, metrics.csv, "
+        f"written to {folder}/ (report.html, {vehicles}, result.json, metrics.csv, "
         "sensitivity.csv)",
         markup=False,
     )
@@ -150,6 +153,25 @@ def _print_selection(screen: Console, result: RunResult) -> None:
         table.add_row(row.group, *gains, "yes" if row.kept else "no", reason_in_words(row))
     screen.print(table)
     screen.print(selection_in_words(result.selection), markup=False)
+
+
+def _print_effective(screen: Console, result: RunResult, effective: EffectiveResult) -> None:
+    """Print with which coefficients Gazebo flies most like the vehicle, where they differ."""
+    from tuner.wording.effective import effective_in_words, rmse_in_words
+
+    table = Table(box=None, title="In Gazebo", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("physical", "effective", "unit"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
+    for name, value in effective.coefficients.items():
+        row = result.coefficients.get(name)
+        if row is not None and value != row.best:
+            table.add_row(name, f"{row.best:.5g}", f"{value:.5g}", row.unit)
+    screen.print(table)
+    screen.print(effective_in_words(effective), markup=False)
+    for term in effective.lost:
+        missed = rmse_in_words(term.rmse_without)
+        screen.print(f"Without {term.group} alone: {missed}.", markup=False)
 
 
 def _errors(result: RunResult) -> Table:

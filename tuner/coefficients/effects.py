@@ -6,7 +6,7 @@ neutral value, it does not act and costs nothing. Coefficients of one group are 
 
 from __future__ import annotations
 
-from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried
+from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Written
 
 _AXES = {"x": "forward", "y": "left", "z": "up"}
 
@@ -21,12 +21,16 @@ def _effect(
     limit: float,
     prior_sd: float,
     step: float,
-    gazebo: str = "Gazebo's motor model has no such term",
+    gazebo: str | Written = "Gazebo's motor model has no such term",
     px4: str = "the SIH model has no such term",
     mass_exponent: int = 0,
     informed_by: str | None = None,
 ) -> Coefficient:
-    """Return the row of an effect that vanishes at zero and is searched between ±limit."""
+    """Return the row of an effect that vanishes at zero and is searched between ±limit.
+
+    ``gazebo`` is where SDF holds it, or why it does not.
+    """
+    in_sdf = gazebo if isinstance(gazebo, Written) else NotCarried(gazebo, 0.0)
     return Coefficient(
         name=name,
         unit=unit,
@@ -40,16 +44,22 @@ def _effect(
         mass_exponent=mass_exponent,
         neutral=0.0,
         group=group,
-        exported_as={"sdf": NotCarried(gazebo, 0.0), "px4": NotCarried(px4, 0.0)},
+        exported_as={"sdf": in_sdf, "px4": NotCarried(px4, 0.0)},
         informed_by=informed_by,
     )
 
 
 def _ratio(
-    name: str, meaning: str, source: str, *, group: str, bounds: float, prior_sd: float
+    name: str,
+    meaning: str,
+    source: str,
+    *,
+    group: str,
+    bounds: float,
+    prior_sd: float,
+    sdf: Written | None = None,
 ) -> Coefficient:
     """Return the row of a ratio that does nothing at one and is searched by its logarithm."""
-    reason = "Gazebo's motor model has no such ratio"
     return Coefficient(
         name=name,
         unit="",
@@ -62,7 +72,7 @@ def _ratio(
         neutral=1.0,
         group=group,
         exported_as={
-            "sdf": NotCarried(reason, 1.0),
+            "sdf": sdf or NotCarried("Gazebo's motor model has no such ratio", 1.0),
             "px4": NotCarried("the SIH model has no such ratio", 1.0),
         },
     )
@@ -139,8 +149,8 @@ EFFECT_ROWS = (
             limit=0.1,
             prior_sd=0.01,
             step=0.005,
-            gazebo="the exported model's inertial pose is left as it is",
-            px4="the control allocation's rotor positions are left as they are",
+            gazebo=Written("pose", "centre"),
+            px4="the control allocation is left as it flew",
         )
         for axis, direction in _AXES.items()
     ),
@@ -152,6 +162,7 @@ EFFECT_ROWS = (
             group="rotor_thrust_scale" if number < 4 else "",
             bounds=1.5,
             prior_sd=0.03,
+            sdf=Written("motorConstant", "rotor"),
         )
         for number in range(1, 5)
     ),

@@ -166,6 +166,10 @@ SURROUNDING_ROWS = (
         prior_sd=0.004,
         neutral=0.0,
         group="battery_decline",
+        exported_as={
+            "sdf": NotCarried("the motor plugins know no battery", 0.0),
+            "px4": NotCarried("the SIH model's thrust does not depend on the battery", 0.0),
+        },
     ),
     *(
         Coefficient(

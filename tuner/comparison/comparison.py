@@ -11,7 +11,7 @@ likeliest start for the vehicle that flies, and with the likeliest trim, is anot
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,7 +33,7 @@ from tuner.comparison.errors import (
 from tuner.config import ControllerFile, VehicleFile, check_mixer
 from tuner.config.job import InletName
 from tuner.flights.flight import Array
-from tuner.model import Model, model_of, schedule_of
+from tuner.model import Model, model_of, schedule_of, with_terms_computed
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Criterion, Point, units_of
 from tuner.objective.inlets import INLETS, window_seconds
@@ -120,8 +120,18 @@ class Comparison:
                 errors |= group.fly(vehicle, fitted_starts=True)
         return {name: errors[name] for name in self._names if name in errors}
 
-    def fly(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+    def fly(
+        self, vehicle: VehicleFile, *, computed: Collection[str] = ()
+    ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
+
+        Parameters
+        ----------
+        vehicle
+            What flies.
+        computed
+            Coefficients of terms that are computed although the vehicle may lack them, so that
+            vehicles with and without them share a program.
 
         Raises
         ------
@@ -130,7 +140,7 @@ class Comparison:
         """
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
-            errors |= group.fly(vehicle)
+            errors |= group.fly(vehicle, computed=computed)
         return {name: errors[name] for name in self._names}
 
 
@@ -186,12 +196,19 @@ class _Group:
             input_late={r.flight.name: r.input_late for r in self._recordings},
         )
 
-    def fly(self, vehicle: VehicleFile, *, fitted_starts: bool = False) -> dict[str, FlightErrors]:
+    def fly(
+        self,
+        vehicle: VehicleFile,
+        *,
+        fitted_starts: bool = False,
+        computed: Collection[str] = (),
+    ) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
         if self._has_mixer:
             check_mixer(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
+        model = with_terms_computed(model, computed)
         owner = np.asarray(self._segments.flight)
         segments, states = self._segments, None
         if fitted_starts:

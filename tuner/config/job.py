@@ -188,6 +188,10 @@ class JobFile(Section):
     terms
         What the fit may hold beyond Gazebo's motor model: ``auto`` adds those without which flights
         left out are predicted worse, ``none`` adds none; else the groups, or coefficients, to add.
+    target
+        Which of a run's two answers the exports for simulators hold: ``gazebo``, the coefficients
+        with which Gazebo, which lacks some of the terms, flies most like the vehicle; ``physical``,
+        the vehicle's own. Both are in the result.
     coefficients
         Bounds, scale and prior of single coefficients.
     ties
@@ -213,6 +217,7 @@ class JobFile(Section):
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()
     terms: Literal["auto", "none"] | tuple[TermName, ...] = "auto"
+    target: Literal["gazebo", "physical"] = "gazebo"
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()
     channels: dict[ChannelName, Flag] = Field(default_factory=dict)

@@ -9,6 +9,7 @@ from pathlib import Path
 from tuner.disk import check_file
 from tuner.errors import ExportError
 from tuner.exporters.draft import write
+from tuner.exporters.effective import in_simulator
 from tuner.exporters.gates import Gate, Refly, check
 from tuner.exporters.provenance import exported_vehicle, provenance
 from tuner.exporters.target import (
@@ -19,6 +20,7 @@ from tuner.exporters.target import (
     target_of,
 )
 from tuner.result import Run
+from tuner.wording.effective import what_is_exported, what_is_lost
 
 FOLDER = "export"
 """Of a result folder, for its exports."""
@@ -59,7 +61,8 @@ def export(
     Parameters
     ----------
     run
-        A result folder.
+        A result folder. A target that lacks some of its terms gets its effective coefficients,
+        unless its job wants the physical ones.
     kind
         The name of a target, as ``yaml``, ``sdf`` or ``px4``.
     refly
@@ -87,9 +90,14 @@ def export(
     check_file(path, folder_is_made=True)
     if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
+    physical, run = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(vehicle, target)
-    draft = target.draft(vehicle, provenance(run, today, accept), Choices(into, simulator))
+    line, effective = provenance(run, today, accept), physical.result.effective
+    if run is not physical and effective is not None:
+        line = f"{what_is_exported(effective)}; {line}"
+        decided = (*decided, *what_is_lost(effective, target.entry))
+    draft = target.draft(vehicle, line, Choices(into, simulator))
     gates = check(run, draft.vehicle, refly)
     refused = [objection for gate in gates for objection in gate.objections]
     if refused and not accept:

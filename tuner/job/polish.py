@@ -26,8 +26,9 @@ def polished(
     free: Free,
     title: str,
     on_progress: Callable[[Progress], None],
+    stages: int = 2,
 ) -> Fitted:
-    """Return a fit polished again, by the last two stages from its point.
+    """Return a fit polished again, by the last stages from its point.
 
     Parameters
     ----------
@@ -41,8 +42,9 @@ def polished(
         What stands before the stages' names in messages.
     on_progress
         Called after every iteration.
+    stages
+        How many of the last stages.
     """
-    *_, first, last = _stages(fitted.objective, job)
     names = [flight.name for flight in job.fitted]
     progress = Progress(
         stage=0,
@@ -60,7 +62,13 @@ def polished(
         feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
     )
     return _grown(
-        job, fitted, progress, (first, last), free=free, title=title, on_progress=on_progress
+        job,
+        fitted,
+        progress,
+        _stages(fitted.objective, job)[-stages:],
+        free=free,
+        title=title,
+        on_progress=on_progress,
     )
 
 

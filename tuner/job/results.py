@@ -30,8 +30,10 @@ from tuner.objective.segments import OFFSETS
 from tuner.recordings import Recording
 from tuner.result import (
     BEST_FIT_FILE,
+    EFFECTIVE_FILE,
     RMSE_UNITS,
     CoefficientResult,
+    EffectiveResult,
     Ending,
     FlightResult,
     RunResult,
@@ -66,6 +68,7 @@ def result_of(
     sources: Mapping[str, Sources] | None = None,
     command: str = "",
     selection: tuple[SelectionRow, ...] = (),
+    effective: EffectiveResult | None = None,
 ) -> RunResult:
     """Assemble ``result.json``."""
     settings = job.settings
@@ -102,6 +105,7 @@ def result_of(
             message=Ending.NO_FURTHER_GAIN if fitted.converged else Ending.ITERATION_LIMIT,
         ),
         selection=selection,
+        effective=effective,
     )
 
 
@@ -231,13 +235,29 @@ def _clock(job: Job, fitted: Fitted, recording: Recording) -> Literal["given", "
     return "fitted" if moved and not recording.holdout else "assumed"
 
 
-def write_folder(folder: Path, result: RunResult, vehicle: VehicleFile, job: Job) -> None:
-    """Write ``best_fit.yaml``, ``controller.yaml``, ``metrics.csv``, and last ``result.json``."""
+def write_folder(
+    folder: Path,
+    result: RunResult,
+    vehicle: VehicleFile,
+    job: Job,
+    effective: VehicleFile | None = None,
+) -> None:
+    """Write the vehicles, ``controller.yaml``, ``metrics.csv``, and last ``result.json``.
+
+    ``best_fit.yaml`` is the vehicle; ``effective.yaml`` the one for Gazebo, where that is another.
+    """
     settings = result.settings
     fitted = ", ".join(flight.name for flight in job.fitted)
     source = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", "flights": fitted}
     named = vehicle.replace(name=f"{job.settings.vehicle.name}_fitted", source=source)
     write_vehicle(named, folder / BEST_FIT_FILE, header=f"Fitted by tune to {fitted}.")
+    if effective is not None and result.effective is not None:
+        lost = ", ".join(term.group for term in result.effective.lost)
+        write_vehicle(
+            effective.replace(name=f"{named.name}_in_gazebo", source=source),
+            folder / EFFECTIVE_FILE,
+            header=f"Effective in Gazebo, which lacks {lost}; fitted by tune to {fitted}.",
+        )
     flown = commented("The controller as the fit flew it.") + dump_yaml(settings["controller"])
     write_text(folder / CONTROLLER_FILE, flown)
     write_text(folder / METRICS_FILE, metrics(result))

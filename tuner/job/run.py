@@ -22,6 +22,7 @@ from tuner.findings import Finding
 from tuner.job.best_fit import vehicle_fitted
 from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate
+from tuner.job.effective import effective_fit
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.findings import (
     finer_than_steps,
@@ -131,6 +132,14 @@ def run(
     _report(worse, listener, force=True)
     findings = (*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts)
     fitted = replace(fitted, findings=findings)
+    effective = effective_fit(
+        job,
+        fitted,
+        vehicle,
+        validation.best,
+        on_progress=_reporting(listener),
+        on_message=listener.on_message,
+    )
     result = result_of(
         job,
         fitted,
@@ -139,8 +148,9 @@ def run(
         sources=sources,
         command=command,
         selection=selected.rows,
+        effective=None if effective is None else effective.result,
     )
-    write_folder(folder, result, vehicle, job)
+    write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)
     simulations = {"initial": validation.initial, "best": validation.best}
     write_traces(folder, simulations)
     table_of(simulations).write(folder)

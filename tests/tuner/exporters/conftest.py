@@ -29,7 +29,15 @@ def rmse(scale):
 def make_run(tmp_path):
     """Return a function that writes a result folder; what it is given replaces what is usual."""
 
-    def make(*, coefficients=None, flights=None, vehicle="hovergames_updated", values=None):
+    def make(
+        *,
+        coefficients=None,
+        flights=None,
+        vehicle="hovergames_updated",
+        values=None,
+        effective=None,
+        target="gazebo",
+    ):
         start = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
         best = read_vehicle(configs_folder() / "vehicles" / f"{vehicle}.yaml")
         best = with_values(best, values or {})
@@ -76,7 +84,8 @@ def make_run(tmp_path):
             status="converged",
             seed=0,
             versions={"tune": "0.1.0"},
-            settings={},
+            settings={"job": {"target": target}},
+            effective=effective,
             coefficients={name: CoefficientResult(**data) for name, data in rows.items()},
             flights=tuple(shown),
             findings=(),
@@ -91,6 +100,10 @@ def make_run(tmp_path):
                 message="no_further_gain",
             ),
         )
+        if effective is not None:
+            in_gazebo = best.replace(effects={}).replace(name="in_gazebo")
+            in_gazebo = with_values(in_gazebo, effective.coefficients)
+            write_vehicle(in_gazebo, folder / "effective.yaml")
         result.write(folder)
         return read_run(folder)
 

@@ -53,6 +53,15 @@ def test_base_and_others_together_are_the_wanted_whole(others, base):
     np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
 
 
+def test_the_base_moves_to_where_the_common_centre_is_wanted():
+    other = solid_box(0.5, pose_of([0.1, 0, 0.05, 0, 0, 1.0]), [0.02, 0.1, 0.03])
+    wanted, centre = np.diag([0.05, 0.06, 0.08]), np.array([0.003, -0.002, 0.015])
+    base = base_for(2.0, wanted, pose_of([0.3, 0, 0, 0.2, 0, 0]), [other], centre=centre)
+    whole = together([base, other])
+    np.testing.assert_allclose(whole.pose.position, centre, atol=1e-16)
+    np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
+
+
 def test_links_heavier_than_the_vehicle_are_refused():
     heavy = solid_box(3.0, pose_of([0] * 6), [1, 1, 1])
     with pytest.raises(ValueError, match="weigh 3 kg, the vehicle only 2 kg"):

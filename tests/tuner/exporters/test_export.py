@@ -11,6 +11,7 @@ from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export
 from tuner.exporters.gates import check
+from tuner.result import EffectiveResult, LostTerm, PoseRmse
 from tuner.wording.exports import export_sentence
 
 TODAY = date(2024, 5, 6)
@@ -200,3 +201,72 @@ def test_gates_fly_what_the_format_holds(make_run, tmp_path):
         run.model_copy(update={"vehicle": curved}), "yaml", refly=refly, out=tmp_path / "a.yaml"
     )
     assert [vehicle.motor.quadratic for vehicle in flown] == [0.0, 30.0]
+
+
+EFFECTIVE = EffectiveResult(
+    target="gazebo",
+    coefficients={"rotor_drag_coefficient": 3e-4, "mass": 2.243},
+    lost=(
+        LostTerm(
+            group="fuselage_drag",
+            names=("fuselage_drag",),
+            rmse_without=PoseRmse(position=0.05, attitude=0.4),
+        ),
+    ),
+    carried=(),
+    rmse_physical=PoseRmse(position=0.002, attitude=0.1),
+    rmse_unfitted=PoseRmse(position=0.05, attitude=0.4),
+    rmse_effective=PoseRmse(position=0.0123, attitude=0.2),
+    flights={"circle": rmse(0.005), "held": rmse(0.006)},
+    converged=True,
+)
+DRAGGY = {
+    "values": {"fuselage_drag": 0.03},
+    "coefficients": {"fuselage_drag": {"initial": 0.0, "fitted": True}},
+}
+
+
+def in_both(run, _vehicle, flown=None):
+    """Stand in for flying again: the run's flights as they are met by what it exports."""
+    if flown is not None:
+        flown.append(_vehicle)
+    return {flight.name: flight.rmse_best for flight in run.result.flights}
+
+
+@pytest.mark.parametrize("kind", ["sdf", "px4"])
+def test_a_simulator_gets_the_effective_coefficients_and_the_file_says_so(make_run, kind):
+    run, flown = make_run(**DRAGGY, effective=EFFECTIVE), []
+    done = exported(run, kind, refly=lambda r, v: in_both(r, v, flown))
+    assert flown[0].aerodynamics.rotor_drag_coefficient == 3e-4
+    assert not flown[0].effects.get("fuselage_drag")
+    text = done.path.read_text()
+    assert "effective coefficients, not physical ones: Gazebo lacks fuselage_drag" in text
+    assert "by 1.2 cm and 0.2° where all terms miss them by 2 mm and 0.1°" in text
+    lost = [note for note in done.notes if note.startswith("fuselage_drag is not exported")]
+    assert len(lost) == 1
+    assert "missed by 5 cm and 0.4°" in lost[0]
+
+
+def test_what_holds_every_term_gets_the_physical_coefficients(make_run):
+    done = exported(make_run(**DRAGGY, effective=EFFECTIVE), "yaml")
+    vehicle = read_vehicle(done.path)
+    assert vehicle.effects["fuselage_drag"] == 0.03
+    assert vehicle.aerodynamics.rotor_drag_coefficient == 1.45e-4
+    assert "effective" not in done.path.read_text()
+
+
+def test_a_job_can_want_physical_coefficients_in_the_simulator(make_run):
+    run = make_run(**DRAGGY, effective=EFFECTIVE, target="physical")
+    done = exported(run, "sdf")
+    assert "<rotorDragCoefficient>0.000145<" in done.path.read_text()
+    assert "effective" not in done.path.read_text()
+    assert any(note.startswith("fuselage_drag 0.03 N s²/m² is not exported") for note in done.notes)
+
+
+def test_gates_ask_of_the_effective_coefficients_what_they_ask_of_others(make_run):
+    worse = EFFECTIVE.model_copy(update={"flights": {"circle": rmse(0.005), "held": rmse(0.2)}})
+    with pytest.raises(ExportError, match=r"held position 0\.3 m, before 0\.15"):
+        exported(make_run(**DRAGGY, effective=worse), "sdf")
+    bound = EFFECTIVE.model_copy(update={"coefficients": {"rotor_drag_coefficient": 4.03e-3}})
+    with pytest.raises(ExportError, match=r"rotor_drag_coefficient 0\.00403 is its upper bound"):
+        exported(make_run(**DRAGGY, effective=bound), "sdf")

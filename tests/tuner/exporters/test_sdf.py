@@ -8,6 +8,7 @@ from lxml import etree
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.coefficients import REGISTRY, Written
+from tuner.config import values_of
 from tuner.errors import ExportError
 from tuner.exporters.draft import write
 from tuner.exporters.sdf.model import read_model
@@ -278,8 +279,71 @@ def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     write(draft, path)
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
     classic = simulator == "gazebo-classic"
-    assert values_in(model, path, 4) == carried_values(vehicle, channels=classic)
+    assert values_in(model, path, vehicle) == carried_values(vehicle, channels=classic)
     assert draft.vehicle == vehicle
     assert draft.text.count("<channel ") == (4 if simulator == "gazebo-classic" else 0)
     path.write_text(draft.text.replace("1.45e-05", "1.46e-05"), encoding="utf-8")
     assert draft.faults(path)
+
+
+UNEVEN = {f"rotor_thrust_scale_{n + 1}": scale for n, scale in enumerate((1.02, 0.985, 0.99))}
+CENTRE = {"center_of_mass_x": 0.003, "center_of_mass_y": -0.002, "center_of_mass_z": 0.015}
+
+
+def uneven(vehicle, **effects):
+    return vehicle.replace(effects={**UNEVEN, **CENTRE, **effects})
+
+
+@pytest.mark.parametrize("path", [CLASSIC, GZ], ids=lambda path: path.name)
+def test_centre_of_mass_and_uneven_rotors_are_in_the_model(path, vehicle, tmp_path):
+    draft = sdf_draft(path, uneven(vehicle), "by a test")
+    whole = composite(read_model(draft.text, path, 4))
+    rotors = np.array([rotor.position for rotor in vehicle.rotors])
+    links = {link.attributes.get("name"): link for link in read_model(draft.text, path, 4).links}
+    model = read_model(draft.text, path, 4)
+    places = np.array([model.pose_of_link(links[f"rotor_{n}"]).position for n in range(4)])
+    arms = places - whole.pose.position
+    np.testing.assert_allclose(
+        arms.mean(axis=0), (rotors - [0.003, -0.002, 0.015]).mean(axis=0), atol=1e-12
+    )
+    np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
+    final = etree.fromstring(draft.text.encode())
+    constants = [float(element.text) for element in final.iter("motorConstant")]
+    last = 1.0 / (1.02 * 0.985 * 0.99)
+    assert constants == pytest.approx([1.45e-5 * s for s in (1.02, 0.985, 0.99, last)], rel=1e-11)
+    assert values_of(draft.vehicle) == pytest.approx(values_of(uneven(vehicle)), rel=1e-12)
+    assert any("moves to" in note for note in draft.notes)
+    again = tmp_path / path.name
+    write(draft, again)
+    assert sdf_draft(again, uneven(vehicle), "by a test").text == draft.text
+    again.write_text(draft.text.replace("1.479e-05", "1.478e-05"), encoding="utf-8")
+    assert any("motor_constant of rotor_0" in fault for fault in draft.faults(again))
+    unmoved = re.sub(r"(</inertia>)\s*<pose>[^<]*</pose>", r"\1", draft.text, count=1)
+    again.write_text(unmoved, encoding="utf-8")
+    assert any("center_of_mass_x" in fault for fault in draft.faults(again))
+
+
+def test_rotors_that_differ_need_plugins_of_their_own(vehicle, tmp_path):
+    with pytest.raises(ExportError, match="draws its rotors from a template"):
+        sdf_draft(TEMPLATE, uneven(vehicle), "by a test")
+    text = CLASSIC.read_text(encoding="utf-8").replace(
+        "<motorConstant>8.55e-06</motorConstant>", "<motorConstant>{{ kf }}</motorConstant>"
+    )
+    text = text.replace("<sdf ", "{% set kf = 8.55e-06 %}\n<sdf ")
+    with pytest.raises(ExportError, match="of all rotors at once"):
+        patched(tmp_path, uneven(vehicle), text, "model.sdf.jinja")
+
+
+def test_a_centre_of_mass_needs_rotors_to_count_from(vehicle, tmp_path):
+    text = CLASSIC.read_text(encoding="utf-8").replace("'rotor_", "'prop_")
+    with pytest.raises(ExportError, match="no places of rotors"):
+        patched(tmp_path, uneven(vehicle), text)
+
+
+def test_a_snippet_holds_centre_of_mass_and_uneven_rotors(vehicle, tmp_path):
+    draft = snippet_draft(uneven(vehicle), "gz-sim", "by a test")
+    assert "<pose>0.003 -0.002 0.015 0 0 0</pose>" in draft.text
+    assert values_of(draft.vehicle) == pytest.approx(values_of(uneven(vehicle)), rel=1e-12)
+    path = tmp_path / "snippet.sdf"
+    write(draft, path)
+    assert draft.faults(path) == []

@@ -22,8 +22,11 @@ from tuner.report import write_traces
 from tuner.report.record import SearchRecord, Start
 from tuner.result import (
     CoefficientResult,
+    EffectiveResult,
     Ending,
     FlightResult,
+    LostTerm,
+    PoseRmse,
     RunResult,
     SearchResult,
     Status,
@@ -47,6 +50,7 @@ def write_run(folder: Path, free: Sequence[str], undetermined: Direction) -> Non
     """Write what a run would write whose flights do not determine one direction."""
     vehicle = read_vehicle(find_config("vehicles", "hovergames", Path()))
     write_vehicle(vehicle, folder / "best_fit.yaml", header="A test's.")
+    write_vehicle(vehicle, folder / "effective.yaml", header="A test's.")
     initial = {name: _errors(name, 0.2) for name in FLIGHTS}
     best = {name: _errors(name, 0.002) for name in FLIGHTS}
     simulations = {"initial": initial, "best": best}
@@ -221,7 +225,25 @@ def _result(
         )
         for number, name in enumerate(FLIGHTS)
     )
+    drag = {name: 1.2 * result.best for name, result in coefficients.items() if "drag" in name}
     return RunResult(
+        effective=EffectiveResult(
+            target="gazebo",
+            coefficients={name: result.best for name, result in coefficients.items()} | drag,
+            lost=(
+                LostTerm(
+                    group="fuselage_drag",
+                    names=("fuselage_drag",),
+                    rmse_without=PoseRmse(position=0.03, attitude=None),
+                ),
+            ),
+            carried=("center_of_mass_x",),
+            rmse_physical=PoseRmse(position=0.002, attitude=0.1),
+            rmse_unfitted=PoseRmse(position=0.04, attitude=0.5),
+            rmse_effective=PoseRmse(position=0.012, attitude=0.3),
+            flights={name: best[name].rmse for name in FLIGHTS},
+            converged=True,
+        ),
         schema_version=2,
         status=Status.CONVERGED,
         seed=7,

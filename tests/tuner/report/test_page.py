@@ -36,8 +36,11 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     text = words(report)
     assert "on the held-out flights the position RMSE went from" in text
     assert "7 coefficients were fitted to 1 flight, of which the flights do not identify 1" in text
+    assert "Gazebo cannot fly fuselage_drag" in text
+    assert "rotor_drag_coefficient 0.000806 0.0009672 N s²/(rad m) +20 %" in text
     for heading in (
         "Coefficients",
+        "In Gazebo",
         "Terms beyond the motor model",
         "RMSE of each flight",
         "Simulated against recorded",
@@ -113,7 +116,7 @@ def test_a_folder_that_is_no_runs_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_damaged_file_is_named(report: Path, tmp_path: Path) -> None:
-    for name in ("result.json", "best_fit.yaml"):
+    for name in ("result.json", "best_fit.yaml", "effective.yaml"):
         (tmp_path / name).write_bytes((report.parent / name).read_bytes())
     (tmp_path / "sensitivity.json").write_text('{"schema_version": 2}')
     with pytest.raises(InputError, match=r"sensitivity\.json"):

@@ -63,7 +63,12 @@ def together(bodies: Sequence[Inertial]) -> Inertial:
 
 
 def base_for(
-    whole_mass: float, whole_inertia: Array, base: Pose, others: Sequence[Inertial]
+    whole_mass: float,
+    whole_inertia: Array,
+    base: Pose,
+    others: Sequence[Inertial],
+    *,
+    centre: Array | None = None,
 ) -> Inertial:
     """Return the base body that makes, with the others, the wanted whole.
 
@@ -74,9 +79,11 @@ def base_for(
     whole_inertia
         (3, 3) kg m², about the common centre of mass, along the model's axes.
     base
-        Inertial frame of the base, which stays where it is.
+        Inertial frame of the base, which stays where it is unless a centre is wanted.
     others
         The other bodies.
+    centre
+        (3,) where the common centre of mass shall lie; None leaves it where it comes to lie.
 
     Raises
     ------
@@ -89,6 +96,9 @@ def base_for(
             f"the links beside the base weigh {whole_mass - mass:.6g} kg, the vehicle only "
             f"{whole_mass:.6g} kg"
         )
+    if centre is not None:
+        moment = sum((other.mass * other.pose.position for other in others), np.zeros(3))
+        base = Pose((whole_mass * centre - moment) / mass, base.rotation)
     bare = Inertial(mass, base, np.zeros((3, 3)))
     centre = together((bare, *others)).pose.position
     rest = _about(centre, bare) + sum((_about(centre, other) for other in others), np.zeros((3, 3)))

@@ -66,6 +66,11 @@ class Model:
                     plugins.append(plugin)
         return plugins
 
+    def motor_number(self, motor: Element) -> int | None:
+        """Return which rotor a motor plugin drives; None where a template leaves that open."""
+        index = self._number_in(motor, "motorNumber")
+        return None if index is None else int(index)
+
     def channels(self) -> list[Element]:
         """Return the control channels of the vehicle's rotors (Gazebo classic only)."""
         channels = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,27 @@ from tuner.errors import ExportError
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf.composite import Array, Inertial, base_for, together
 from tuner.exporters.sdf.model import Model, inertials, read_model
-from tuner.exporters.sdf.read_back import values_in
-from tuner.exporters.sdf.spans import Edit, Element, append_child, apply, number, set_value
-from tuner.exporters.sdf.tags import as_flown, as_text, carried_values, lost_in, values
+from tuner.exporters.sdf.read_back import rotor_origin, values_in
+from tuner.exporters.sdf.spans import (
+    Edit,
+    Element,
+    append_child,
+    apply,
+    content,
+    number,
+    set_value,
+)
+from tuner.exporters.sdf.tags import (
+    MOTOR_CONSTANT,
+    as_flown,
+    as_text,
+    carried_values,
+    center_of_mass,
+    lost_in,
+    motor_constants,
+    of_rotor,
+    values,
+)
 from tuner.exporters.sdf.template import blanked, rendered
 
 #: Products of inertia below this part of the trace are taken as none.
@@ -50,11 +68,15 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     whole = read_model(rendered(text, path), path, rotors)
     base = _base(whole, vehicle)
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
+    if center_of_mass(vehicle) is not None:
+        edits += _pose_edits(model, whole, base)
     edits = [_through_variable(text, blank, edit, path) for edit in edits]
     edits.append(_provenance_edit(text, model, provenance))
-    patched = apply(text, dict.fromkeys(edits))
+    edits = list(dict.fromkeys(edits))
+    _refuse_contradictions(edits, path)
+    patched = apply(text, edits)
     wanted = carried_values(vehicle, channels=bool(whole.channels()))
-    written_values = values_in(rendered(patched, path), path, rotors)
+    written_values = values_in(rendered(patched, path), path, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
@@ -63,21 +85,34 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         as_flown(vehicle, written_values),
         tuple(_notes(whole, vehicle, base)),
         lambda written: differences(
-            wanted, values_in(rendered(read_file(written), written), written, rotors)
+            wanted, values_in(rendered(read_file(written), written), written, vehicle)
         ),
     )
 
 
 def _base(model: Model, vehicle: VehicleFile) -> Inertial:
-    """Return the base link's body that makes the whole model weigh and turn like the vehicle."""
+    """Return the base link's body that makes the whole model weigh and turn like the vehicle.
+
+    It moves only for a vehicle whose centre of mass is not where rotor positions count from.
+    """
     others = [body for link, body in inertials(model) if link is not model.base]
-    inertia = vehicle.inertia
+    inertia, offset, centre = vehicle.inertia, center_of_mass(vehicle), None
+    if offset is not None:
+        origin = rotor_origin(model, vehicle)
+        if origin is None:
+            raise ExportError(
+                model.path,
+                "shows no places of rotors to put the centre of mass against",
+                f"call their links rotor_0 to rotor_{len(vehicle.rotors) - 1}",
+            )
+        centre = origin + np.array(offset)
     try:
         return base_for(
             vehicle.mass,
             np.diag([inertia.xx, inertia.yy, inertia.zz]),
             model.pose_of_inertial(model.base),
             others,
+            centre=centre,
         )
     except ValueError as error:
         raise ExportError(
@@ -106,9 +141,56 @@ def _inertial_edits(model: Model, base: Inertial) -> Iterator[Edit]:
             yield from _set(tensor, model.text, {tag: 0.0 if none else value})
 
 
+def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
+    """Yield the edit that puts the base's inertial frame where the base's centre lies.
+
+    ``model`` is the text to edit, ``whole`` what it is once rendered. The frame's angles stay as
+    they are written; places have all digits, for the centre is the small difference of large ones.
+    """
+    link = whole.pose_of_link(whole.base)
+    place = link.rotation.T @ (base.pose.position - link.position)
+    inertial = model.base.find("inertial")
+    assert inertial is not None, "its mass was set"
+    pose = inertial.find("pose")
+    angles = content(pose, model.text).split()[3:] if pose else ["0", "0", "0"]
+    written = " ".join([*(repr(float(number)) for number in place), *(angles or ["0", "0", "0"])])
+    if pose is None:
+        yield append_child(inertial, model.text, "pose", written)
+    elif content(pose, model.text) != written:
+        yield set_value(pose, model.text, written)
+
+
+def _refuse_contradictions(edits: Sequence[Edit], path: Path) -> None:
+    """Refuse a model that says once what differs from rotor to rotor.
+
+    Raises
+    ------
+    ExportError
+        Two edits of the same place differ.
+    """
+    places = [(edit.start, edit.end) for edit in edits if edit.end > edit.start]
+    if len(set(places)) < len(places):
+        raise ExportError(
+            path,
+            "sets the motorConstant of all rotors at once, and this vehicle's differ",
+            "give each rotor's plugin a number of its own",
+        )
+
+
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
+    uneven = motor_constants(vehicle)
     for motor in model.motors():
-        yield from _set(motor, model.text, values(vehicle, "motor"))
+        wanted = values(vehicle, "motor")
+        if uneven is not None:
+            index = model.motor_number(motor)
+            if index is None:
+                raise ExportError(
+                    model.path,
+                    "draws its rotors from a template, and this vehicle's differ in motor_constant",
+                    "give each rotor a plugin of its own",
+                )
+            wanted[MOTOR_CONSTANT] = uneven[of_rotor(index)]
+        yield from _set(motor, model.text, wanted)
     for channel in model.channels():
         yield from _set(channel, model.text, values(vehicle, "channel"))
 
@@ -185,18 +267,23 @@ def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
             f"SIM_GZ_EC_MIN1..{last} to {low:.0f} and SIM_GZ_EC_MAX1..{last} to "
             f"{low + motor.input_scaling:.0f}, as the px4 export does"
         )
+    if center_of_mass(vehicle) is not None:
+        place = ", ".join(as_text(round(number, 9)) for number in base.pose.position)
+        yield f"the inertial of '{name}' moves to ({place}) m for the vehicle's centre of mass"
     yield from lost_in(vehicle)
 
 
 def _rotor_places(model: Model, vehicle: VehicleFile, centre: Array) -> Iterator[tuple[str, str]]:
     """Yield the rotors whose place from the centre of mass is not the vehicle file's."""
     links = {link.attributes.get("name"): link for link in model.links}
+    offset = np.array(center_of_mass(vehicle) or (0.0, 0.0, 0.0))
     for index, rotor in enumerate(vehicle.rotors):
         link = links.get(f"rotor_{index}")
         if link is not None:
             place = model.pose_of_link(link).position - centre
-            if np.abs(place - rotor.position).max() > PLACE_TOLERANCE:
+            expected = np.array(rotor.position) - offset
+            if np.abs(place - expected).max() > PLACE_TOLERANCE:
                 yield (
                     f"rotor_{index} sits {place.round(4).tolist()} m from the centre of mass",
-                    str(list(rotor.position)),
+                    str(expected.round(4).tolist()),
                 )

@@ -9,7 +9,17 @@ from jinja2 import Environment, StrictUndefined
 from tuner.config import VehicleFile
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf.read_back import values_in
-from tuner.exporters.sdf.tags import as_flown, as_text, carried_values, lost_in, values
+from tuner.exporters.sdf.tags import (
+    MOTOR_CONSTANT,
+    as_flown,
+    as_text,
+    carried_values,
+    center_of_mass,
+    lost_in,
+    motor_constants,
+    of_rotor,
+    values,
+)
 from tuner.exporters.target import Simulator
 
 TEMPLATE = Path(__file__).parent / "snippet.sdf.jinja"
@@ -30,7 +40,7 @@ def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -
 
     def held_by(text: str, path: Path) -> dict[str, float]:
         model = f"<model><link name='base_link'>{text}</link></model>"
-        return values_in(model, path, len(vehicle.rotors))
+        return values_in(model, path, vehicle)
 
     wanted = carried_values(vehicle, channels=simulator == "gazebo-classic")
     text = _text(vehicle, simulator, provenance)
@@ -46,7 +56,12 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
     environment = Environment(
         undefined=StrictUndefined, keep_trailing_newline=True, autoescape=True
     )
-    inertia = vehicle.inertia
+    inertia, uneven, centre = vehicle.inertia, motor_constants(vehicle), center_of_mass(vehicle)
+    motor = {tag: as_text(value) for tag, value in values(vehicle, "motor").items()}
+    motors = [
+        motor if uneven is None else motor | {MOTOR_CONSTANT: as_text(uneven[of_rotor(index)])}
+        for index in range(len(vehicle.rotors))
+    ]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         provenance=provenance.replace("--", "- -"),
         simulator=simulator,
@@ -54,7 +69,7 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
         ixx=as_text(inertia.xx),
         iyy=as_text(inertia.yy),
         izz=as_text(inertia.zz),
-        rotors=vehicle.rotors,
-        motor={tag: as_text(value) for tag, value in values(vehicle, "motor").items()},
+        center_of_mass=None if centre is None else " ".join(map(as_text, centre)),
+        rotors=list(zip(vehicle.rotors, motors, strict=True)),
         channel={tag: as_text(value) for tag, value in values(vehicle, "channel").items()},
     )

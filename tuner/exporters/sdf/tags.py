@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 from tuner.coefficients import COEFFICIENTS, NotCarried, Written
@@ -11,6 +12,9 @@ Parent = Literal["inertial", "inertia", "motor", "channel"]
 
 #: A motor plugin's tag that is no coefficient, as flights do not show it -> key of `Motor`.
 SPEED_LIMIT, SPEED_LIMIT_KEY = "maxRotVelocity", "max_rotor_velocity"
+
+MOTOR_CONSTANT = "motorConstant"
+CENTER_OF_MASS = tuple(f"center_of_mass_{axis}" for axis in "xyz")
 
 
 def tags_in(parent: Parent) -> dict[str, str]:
@@ -41,6 +45,36 @@ def values(vehicle: VehicleFile, parent: Parent) -> dict[str, float]:
     return {tag: numbers[name] for tag, name in tags_in(parent).items() if name in numbers}
 
 
+def center_of_mass(vehicle: VehicleFile) -> tuple[float, ...] | None:
+    """Return m from where rotor positions count to the centre of mass; None where they agree."""
+    if not any(vehicle.effects.get(name) for name in CENTER_OF_MASS):
+        return None
+    return tuple(vehicle.effects.get(name, 0.0) for name in CENTER_OF_MASS)
+
+
+def motor_constants(vehicle: VehicleFile) -> dict[str, float] | None:
+    """Return what each rotor's motor constant is called -> its value; None where all are alike.
+
+    The rotors' scales are factors on thrust and torque, whose product is 1: the last one follows.
+    """
+    count = len(vehicle.rotors)
+    scales = [vehicle.effects.get(f"rotor_thrust_scale_{i + 1}") for i in range(count)]
+    if all(scale in (None, 1.0) for scale in scales):
+        return None
+    if scales[-1] is None:
+        scales[-1] = 1.0 / math.prod(scale for scale in scales if scale is not None)
+    constant = vehicle.aerodynamics.motor_constant
+    return {
+        of_rotor(i): constant if scale is None else constant * scale
+        for i, scale in enumerate(scales)
+    }
+
+
+def of_rotor(index: int) -> str:
+    """Return what the motor constant of one rotor among uneven ones is called."""
+    return f"motor_constant of rotor_{index}"
+
+
 def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
     """Return name -> value of what a model of a vehicle must hold.
 
@@ -55,7 +89,18 @@ def carried_values(vehicle: VehicleFile, *, channels: bool) -> dict[str, float]:
         if isinstance(entry, Written) and (channels or entry.parent != "channel"):
             carried.add(name)
     carried.add(SPEED_LIMIT_KEY)
-    return {name: value for name, value in numbers_of(vehicle).items() if name in carried}
+    numbers = {
+        name: value
+        for name, value in numbers_of(vehicle).items()
+        if name in carried and name not in vehicle.effects
+    }
+    uneven, centre = motor_constants(vehicle), center_of_mass(vehicle)
+    if centre is not None:
+        numbers |= dict(zip(CENTER_OF_MASS, centre, strict=True))
+    if uneven is not None:
+        del numbers["motor_constant"]
+        numbers |= uneven
+    return numbers
 
 
 def as_text(value: float) -> str:
@@ -64,14 +109,17 @@ def as_text(value: float) -> str:
 
 
 def as_flown(vehicle: VehicleFile, read: dict[str, float]) -> VehicleFile:
-    """Return the vehicle that the plugins fly: what a model holds, and what they have built in."""
+    """Return the vehicle that the plugins fly: what a model holds, and what they have built in.
+
+    Of uneven rotors it holds each one's motor constant, which are the vehicle's own.
+    """
     built_in = {}
     for name in values_of(vehicle):
         entry = COEFFICIENTS[name].exported_as.get("sdf")
         if isinstance(entry, NotCarried) and entry.built_in is not None:
             built_in[name] = entry.built_in
     limit = read[SPEED_LIMIT_KEY]
-    coefficients = {name: value for name, value in read.items() if name != SPEED_LIMIT_KEY}
+    coefficients = {name: value for name, value in read.items() if name in COEFFICIENTS}
     flown = with_values(vehicle, built_in | coefficients)
     return flown.replace(
         motor=flown.motor.replace(max_rotor_velocity=limit),

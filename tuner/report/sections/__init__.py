@@ -12,6 +12,7 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
+from tuner.report.sections.effective import effective
 from tuner.report.sections.effects import effects
 from tuner.report.sections.errors import errors
 from tuner.report.sections.findings import findings
@@ -31,6 +32,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,
     coefficients,
     selection,
+    effective,
     bench,
     sources,
     errors,
