@@ -16,6 +16,7 @@ FLIGHTS = Path(__file__).parents[1] / "reference_flights"
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
     """Return the result folder, and its result; the flights' paths count from the root."""
+    from tuner.cli.profile import profiling  # noqa: PLC0415
     from tuner.config import Options  # noqa: PLC0415 (jax)
     from tuner.job.run import run  # noqa: PLC0415
 
@@ -27,5 +28,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / RunResult.FILE).exists():
             bags = [str(path) for path in sorted(FLIGHTS.glob("*.bag"))]
-            run(Options(bags), out=folder)
+            with profiling(True, quiet=True) as profile_into:
+                run(Options(bags), out=folder)
+                profile_into(folder)
     return folder, read_run(folder).result

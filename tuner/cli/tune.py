@@ -50,6 +50,7 @@ def tune(
     workers: Workers = None,
     cluster: Cluster = None,
     dry_run: Annotated[bool, Parameter(negative=())] = False,
+    profile: Annotated[bool, Parameter(negative=())] = False,
     quiet: Quiet = False,
 ) -> None:
     """Fit the coefficients, validate them on held-out flights, and write the report.
@@ -77,53 +78,65 @@ def tune(
         Start the random numbers from this seed. Default: the job file's, else 0.
     dry_run
         Print the job script that would bring the cluster file's workers, and do nothing.
+    profile
+        Measure where the seconds go: a table by stage, on the terminal and in profile.csv, and
+        profile.json, a trace that https://ui.perfetto.dev opens.
     """
     from tuner.engine.choose import engine_for, job_script_for
 
     if dry_run:
         print(job_script_for(cluster))
         return
-    from tuner.cli.progress import listening
-    from tuner.cli.results import print_bench, print_run
-    from tuner.runtime import configure
+    from tuner.cli.profile import profiling
+    from tuner.spans import span
 
-    configure()
-    from tuner.config import Options, settle
-    from tuner.job.inertial import fit_without_pose, without_pose
-    from tuner.job.run import run
+    with profiling(profile, quiet=quiet) as profile_into:
+        with span("import"):
+            from tuner.cli.progress import listening
+            from tuner.cli.results import print_bench, print_run
+            from tuner.runtime import configure
 
-    options = Options(
-        flights,
-        holdout=holdout,
-        vehicle=vehicle,
-        controller=controller,
-        mass=mass,
-        config=config,
-        topics=topics,
-        namespace=namespace,
-        fit=fit,
-        fix=fix,
-        method=method,
-        seed=seed,
-        bench=bench,
-    )
-    if bare := without_pose(settle(options)):
-        with listening(quiet=quiet) as listener:
-            measured = fit_without_pose(
-                settle(options), bare, out=out, listener=listener, command=TYPED.get()
-            )
-        if not quiet:
-            print_bench(measured)
-        return
-    with engine_for(workers, cluster), listening(quiet=quiet) as listener:
-        folder, result = run(
-            options,
-            out=out,
-            resume=resume,
-            force=force,
-            cross_validated=cross_validate,
-            listener=listener,
-            command=TYPED.get(),
+            configure()
+            from tuner.config import Options, settle
+            from tuner.job.inertial import fit_without_pose, without_pose
+            from tuner.job.run import run
+
+        options = Options(
+            flights,
+            holdout=holdout,
+            vehicle=vehicle,
+            controller=controller,
+            mass=mass,
+            config=config,
+            topics=topics,
+            namespace=namespace,
+            fit=fit,
+            fix=fix,
+            method=method,
+            seed=seed,
+            bench=bench,
         )
-    if not quiet:
-        print_run(folder, result)
+        with span("reading"):
+            bare = without_pose(settle(options))
+        if bare:
+            with listening(quiet=quiet) as listener:
+                measured = fit_without_pose(
+                    settle(options), bare, out=out, listener=listener, command=TYPED.get()
+                )
+            profile_into(measured.folder)
+            if not quiet:
+                print_bench(measured)
+            return
+        with engine_for(workers, cluster), listening(quiet=quiet) as listener:
+            folder, result = run(
+                options,
+                out=out,
+                resume=resume,
+                force=force,
+                cross_validated=cross_validate,
+                listener=listener,
+                command=TYPED.get(),
+            )
+        profile_into(folder)
+        if not quiet:
+            print_run(folder, result)

@@ -13,7 +13,7 @@ from math import nan
 from pathlib import Path
 
 from tuner.comparison.tabulate import table_of
-from tuner.config import Options, settle, with_values, write_vehicle
+from tuner.config import Options, Settings, settle, with_values, write_vehicle
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.exporters.after_run import exports_of_job
@@ -33,19 +33,21 @@ from tuner.job.findings import (
 )
 from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
-from tuner.job.held_out import validate
+from tuner.job.held_out import Validation, validate
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
-from tuner.job.selection import with_terms_selected
+from tuner.job.selection import Selected, with_terms_selected
 from tuner.prediction.input_lag import with_inputs_on_time
 from tuner.recordings import read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.search.fitted import Fitted
 from tuner.search.progress import Progress
+from tuner.spans import span
 from tuner.uncertainty.ground import sources_of
 from tuner.wording.exports import export_sentence
 from tuner.wording.findings import one_line, remedy, sentence
@@ -96,27 +98,17 @@ def run(
     settings = settle(options)
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
-    recordings, left_out = read_usable(settings)
-    recordings = with_inputs_on_time(recordings, settings.vehicle)
-    job = with_first_terms(job_of(settings, recordings))
-    findings = (*left_out, *inputs_late(job), *check(job))
+    job, findings = _checked(settings)
     _report(findings, listener, force=force)
 
     make_folder(folder)
     on_progress = _keeping_best(folder, listener)
-    try:
-        fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
-        selected = with_terms_selected(job, fitted, on_progress, listener.on_message)
-    except (KeyboardInterrupt, OutputError, EngineError):
-        listener.on_message(
-            f"The best coefficients so far are in {folder}. "
-            f"Continue the search with --out {folder} --resume."
-        )
-        raise
+    selected = _searched(job, folder, on_progress, findings, listener, resume=resume)
     drawing = BackgroundDrawing()
     job, fitted = selected.job, selected.fitted
     listener.on_message("Examining how well each coefficient is known.")
-    fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
+    with span("examination"):
+        fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
     uncertainty = examination.uncertainty
     count = len(uncertainty.names)
     sources = sources_of(fitted, uncertainty, examination.information.total[:count, :count])
@@ -124,7 +116,8 @@ def run(
     _report(conflicts, listener, force=True)
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
-    validation = validate(job, fitted, vehicle)
+    with span("validation"):
+        validation = validate(job, fitted, vehicle)
     worse = (
         *flights_worse(validation.initial, validation.best),
         *turning_unexplained(validation.turning_explained),
@@ -132,14 +125,15 @@ def run(
     _report(worse, listener, force=True)
     findings = (*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts)
     fitted = replace(fitted, findings=findings)
-    effective = effective_fit(
-        job,
-        fitted,
-        vehicle,
-        validation.best,
-        on_progress=_reporting(listener),
-        on_message=listener.on_message,
-    )
+    with span("effective coefficients"):
+        effective = effective_fit(
+            job,
+            fitted,
+            vehicle,
+            validation.best,
+            on_progress=_reporting(listener),
+            on_message=listener.on_message,
+        )
     result = result_of(
         job,
         fitted,
@@ -150,25 +144,73 @@ def run(
         selection=selected.rows,
         effective=None if effective is None else effective.result,
     )
-    write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)
+    with span("results"):
+        write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)
+        _write_flown(folder, validation, fitted)
+    if cross_validated:
+        with span("cross-validation"):
+            folds = cross_validate(job, fitted, folder, lambda now: listener.on_iteration(now, nan))
+        listener.on_folds(folds)
+
+    listener.on_message("Simulating which flight would be the most informative next.")
+    with span("examination"):
+        write_knowledge(folder, job, examination, fitted)
+    drawing.begin(folder)
+    with span("next flight"):
+        write_next_flight(folder, job, examination, fitted)
+    with span("page"):
+        render(folder, wait_for_plots=drawing.wait)
+    with span("exports"):
+        _export(folder, settings, listener)
+    return folder, result
+
+
+def _checked(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
+    """Return the job of some settings, and what there is to say of it before it is searched."""
+    with span("reading"):
+        recordings, left_out = read_usable(settings)
+    with span("check"):
+        recordings = with_inputs_on_time(recordings, settings.vehicle)
+        job = with_first_terms(job_of(settings, recordings))
+        return job, (*left_out, *inputs_late(job), *check(job))
+
+
+def _searched(
+    job: Job,
+    folder: Path,
+    on_progress: OnProgress,
+    findings: tuple[Finding, ...],
+    listener: Listener,
+    *,
+    resume: bool,
+) -> Selected:
+    """Return where the search ends, with the terms that the flights call for."""
+    try:
+        with span("search"):
+            fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
+        with span("selection of terms"):
+            return with_terms_selected(job, fitted, on_progress, listener.on_message)
+    except (KeyboardInterrupt, OutputError, EngineError):
+        listener.on_message(
+            f"The best coefficients so far are in {folder}. "
+            f"Continue the search with --out {folder} --resume."
+        )
+        raise
+
+
+def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
+    """Write how each flight is simulated, and how the search went."""
     simulations = {"initial": validation.initial, "best": validation.best}
     write_traces(folder, simulations)
     table_of(simulations).write(folder)
     write_search(folder, fitted)
-    if cross_validated:
-        listener.on_folds(
-            cross_validate(job, fitted, folder, lambda now: listener.on_iteration(now, nan))
-        )
 
-    listener.on_message("Simulating which flight would be the most informative next.")
-    write_knowledge(folder, job, examination, fitted)
-    drawing.begin(folder)
-    write_next_flight(folder, job, examination, fitted)
-    render(folder, wait_for_plots=drawing.wait)
+
+def _export(folder: Path, settings: Settings, listener: Listener) -> None:
+    """Write the exports that the job asks for."""
     today = datetime.date.today()
     for kind, outcome in exports_of_job(folder, settings.job.export, refly=refly, today=today):
         listener.on_message(export_sentence(kind, outcome))
-    return folder, result
 
 
 def _report(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:

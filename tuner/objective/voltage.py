@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import make_smoothing_spline
+from scipy.interpolate import BSpline, make_smoothing_spline
 
 from tuner.flights.flight import Array as Numbers
 from tuner.flights.flight import Flight, Series
@@ -202,8 +203,14 @@ def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
     """Return the curve through noisy values, its stiffness chosen by cross-validation."""
     if len(time) < FEWEST:
         return lambda at: np.asarray(np.interp(at, time, values))
-    spline = make_smoothing_spline(time, values)
+    spline = _spline_of(time.tobytes(), values.astype(float).tobytes())
     return lambda at: np.asarray(spline(at))
+
+
+@lru_cache(maxsize=256)
+def _spline_of(time: bytes, values: bytes) -> BSpline:
+    """Return the spline of float64 samples; a fit, its check and its exports ask for the same."""
+    return make_smoothing_spline(np.frombuffer(time), np.frombuffer(values))
 
 
 def _averaged(series: Series) -> Series:

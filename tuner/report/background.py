@@ -1,7 +1,7 @@
 """The figures of ``plots/`` drawn by another process, while the rest of a run goes on.
 
 ``python -m tuner.report.background`` reads a folder's name from its input, draws what the folder
-holds by then, and prints the keys of the figures.
+holds by then, and prints the keys of the figures, and when it began and ended.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 from tuner.report.contents import read_contents
 from tuner.report.paper import write_plots
 from tuner.report.sections import sections_of
+from tuner.spans import add_beside
 
 
 class BackgroundDrawing:
@@ -43,7 +45,11 @@ class BackgroundDrawing:
         They are none if it could not draw: then the caller draws them.
         """
         output, _ = self._process.communicate()
-        return frozenset(json.loads(output)) if self._process.returncode == 0 else frozenset()
+        if self._process.returncode != 0:
+            return frozenset()
+        answer = json.loads(output)
+        add_beside("figures", *answer["times"])
+        return frozenset(answer["keys"])
 
 
 def main() -> None:
@@ -51,10 +57,12 @@ def main() -> None:
     folder = sys.stdin.readline().rstrip("\n")
     if not folder:
         return  # the run ended before it had anything to draw
+    began = time.time()
     contents = read_contents(folder)
     charts = [chart for section in sections_of(contents) for chart in section.charts]
     write_plots(charts, contents.folder)
-    sys.stdout.write(json.dumps([chart.key for chart in charts]))
+    answer = {"keys": [chart.key for chart in charts], "times": [began, time.time()]}
+    sys.stdout.write(json.dumps(answer))
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from tuner.report.section import Section
 from tuner.report.sections import sections_of
 from tuner.report.static import data_uri
 from tuner.report.summary import summary
+from tuner.spans import span
 
 REPORT_FILE = "report.html"
 
@@ -47,8 +48,10 @@ def render(
     charts = [chart for section in sections for chart in section.charts]
     figures = json.dumps([figure_of(chart) for chart in charts], allow_nan=False)
     library = _plotly()
-    drawn = wait_for_plots()
-    write_plots([chart for chart in charts if chart.key not in drawn], contents.folder)
+    with span("waiting for figures"):
+        drawn = wait_for_plots()
+    with span("figures"):
+        write_plots([chart for chart in charts if chart.key not in drawn], contents.folder)
     images = {
         chart.key: data_uri(plot_file(contents.folder, chart).read_text()) for chart in charts
     }

@@ -1,5 +1,6 @@
 """The whole job on the shipped recordings, held against the truth that they were flown with."""
 
+import csv
 import io
 import json
 import re
@@ -65,6 +66,18 @@ def test_time_constants_within_four_percent(finished, truth, name):
 def test_estimate_latency_within_half_a_millisecond(finished, truth):
     latency = finished[1].coefficients["estimate_latency"].best
     assert latency == pytest.approx(truth["estimate_latency"], abs=5e-4)
+
+
+@pytest.mark.slow
+def test_a_profile_names_every_stage_and_what_another_process_draws(finished):
+    folder, _ = finished
+    rows = list(csv.DictReader((folder / "profile.csv").open()))
+    seconds = {row["stage"]: float(row["seconds [s]"]) for row in rows}
+    assert {"reading", "check", "search", "selection of terms", "examination"} <= set(seconds)
+    assert {"validation", "results", "next flight", "page", "exports"} <= set(seconds)
+    assert seconds["elsewhere"] < 0.1 * sum(seconds.values())
+    events = json.loads((folder / "profile.json").read_text())["traceEvents"]
+    assert any(event["tid"] == 2 and event["name"] == "figures" for event in events)
 
 
 @pytest.mark.slow

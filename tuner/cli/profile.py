@@ -1,0 +1,109 @@
+"""What ``tune --profile`` leaves: a table by stage and a trace that Perfetto opens."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tuner.disk import write_text
+from tuner.files import csv_text
+from tuner.spans import OF_JAX, Recorder, Row, Span, recording, table_of
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+TABLE_FILE = "profile.csv"
+TRACE_FILE = "profile.json"
+_MICRO = 1e6
+_HERE, _BESIDE = 1, 2
+"""Rows of the trace: this process's main thread, and other processes."""
+
+
+@contextmanager
+def profiling(wanted: bool, *, quiet: bool) -> Iterator[Callable[[Path], None]]:
+    """Yield what takes the result folder that a profile of the block is written into, if wanted.
+
+    The table is printed, too, unless ``quiet``.
+    """
+    folders: list[Path] = []
+    if not wanted:
+        yield folders.append
+        return
+    with recording() as recorder:
+        yield folders.append
+    seconds, processor = recorder.now(), time.process_time()
+    rows = table_of(recorder.spans, seconds, processor)
+    for folder in folders:
+        write_text(folder / TABLE_FILE, csv_text(_HEADER, map(_cells, rows)))
+        write_text(folder / TRACE_FILE, json.dumps(trace_of(recorder.spans)))
+        if not quiet:
+            _print(rows, recorder, folder)
+
+
+_COLUMNS = ("seconds", "processor", *OF_JAX.values(), "rest")
+_HEADER = ("stage", *(f"{name} [s]" for name in _COLUMNS), "programs")
+
+
+def _seconds(row: Row) -> tuple[float, ...]:
+    return (row.seconds, row.processor, *row.jax.values(), row.rest)
+
+
+def _cells(row: Row) -> tuple[object, ...]:
+    return (row.stage, *(f"{value:.3f}" for value in _seconds(row)), row.programs)
+
+
+def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
+    """Return spans in Chrome's trace format, which Perfetto reads: complete events, in µs."""
+    names = {_HERE: "tune", _BESIDE: "beside it"}
+    return {
+        "displayTimeUnit": "ms",
+        "traceEvents": [
+            *(
+                {"ph": "M", "name": "thread_name", "pid": 1, "tid": tid, "args": {"name": name}}
+                for tid, name in names.items()
+            ),
+            *(
+                {
+                    "ph": "X",
+                    "name": f"{span.name} {span.detail}".strip(),
+                    "cat": "stage" if span.is_stage else span.name,
+                    "pid": 1,
+                    "tid": _BESIDE if span.beside else _HERE,
+                    "ts": round(span.begin * _MICRO),
+                    "dur": round(span.end * _MICRO) - round(span.begin * _MICRO),
+                }
+                for span in sorted(spans, key=lambda span: (span.begin, -span.end))
+            ),
+        ],
+    }
+
+
+def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
+    from tuner.cli.tables import console
+
+    screen = console()
+    screen.print(_table(rows))
+    for beside in recorder.spans:
+        if beside.beside:
+            seconds = beside.end - beside.begin
+            screen.print(f"{beside.name}, drawn beside it by another process: {seconds:.1f} s")
+    screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}", markup=False)
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    from rich.table import Table
+
+    table = Table(title="Where the seconds went", title_justify="left", box=None)
+    table.add_column("stage")
+    for name in (*_COLUMNS, "programs"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        cells = (f"{value:.1f}" if value >= 0.05 else "" for value in _seconds(row))
+        table.add_row(row.stage, *cells, str(row.programs or ""))
+    sums = (f"{sum(column):.1f}" for column in zip(*map(_seconds, rows), strict=True))
+    table.add_row("all", *sums, str(sum(row.programs for row in rows)))
+    return table
