@@ -6,9 +6,11 @@ import contextlib
 import logging
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import dask.config
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
@@ -18,6 +20,14 @@ from tuner.errors import InputError
 
 ANSWER = 10
 """s within which a scheduler answers."""
+SPARING = {
+    "distributed": {
+        "worker": {"profile": {"enabled": False}},
+        "admin": {"tick": {"interval": "500ms"}},
+    }
+}
+"""What local workers' cores are spared, unless the user's Dask configuration says otherwise: looks
+at the stack a hundred times a second, and at each event loop's delay fifty times."""
 CLASSES = {
     "slurm": "SLURMCluster",
     "pbs": "PBSCluster",
@@ -40,6 +50,7 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         return _jobs(file, file.jobs)
     if file.kubernetes is not None:
         return _kubernetes(file, file.kubernetes)
+    _spare()
     cluster: AbstractContextManager[Any] = LocalCluster(
         n_workers=file.workers,
         threads_per_worker=1,
@@ -49,6 +60,11 @@ def cluster_of(file: ClusterFile) -> AbstractContextManager[Any]:
         silence_logs=logging.CRITICAL + 1,
     )
     return cluster
+
+
+@cache
+def _spare() -> None:
+    dask.config.update_defaults(SPARING)
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from distributed import Event, Worker, WorkerPlugin, get_worker
+from distributed import Event, Status, Worker, WorkerPlugin, get_worker
 
 from tuner.engine.engine import HERE, using
 from tuner.engine.store import Store
@@ -92,7 +92,7 @@ def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
     Raises
     ------
     Stopped
-        It was cancelled: noticed when it reports.
+        It was cancelled, or the worker is ending: noticed when it reports.
     EngineError
         This worker cannot compute it.
     """
@@ -108,7 +108,8 @@ def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
         ) from None
 
     def report(message: Any) -> None:
-        if stop.is_set():
+        # to ask a cluster that is ending would connect anew, and leave that open
+        if worker.status in (Status.closing, Status.closed) or stop.is_set():
             raise Stopped
         worker.log_event(topic, {"task": identity, "report": message})
 
