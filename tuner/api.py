@@ -59,6 +59,7 @@ def fit(
     resume: bool = False,
     force: bool = False,
     cross_validate: bool = False,
+    bootstrap: int | None = None,
     workers: int | None = None,
     cluster: str | None = None,
 ) -> Run:
@@ -93,7 +94,11 @@ def fit(
     force
         Whether to search even where the check before the search reports a failure.
     cross_validate
-        Whether to fit without each flight in turn as well, into ``cross_validation.csv``.
+        Whether to fit without each flight in turn as well, into ``cross_validation.csv``, for the
+        jackknife's standard errors.
+    bootstrap
+        How many refits to flights drawn with replacement are made, into ``bootstrap.csv``, for the
+        standard errors that follow; None for none.
     workers, cluster
         Local processes, or the cluster file or scheduler, that compute what is independent; the
         numbers are the same. A script that names them needs ``if __name__ == "__main__":``.
@@ -133,6 +138,7 @@ def fit(
             resume=resume,
             force=force,
             cross_validated=cross_validate,
+            refits=bootstrap,
             command=f"tuner.fit from Python: {options.flights}",
         )
     return read_run(folder)

@@ -54,6 +54,9 @@ class CoefficientResult(Part):
         Standard error and 95 % interval; None where it was not fitted or they are not finite.
     identifiable
         Whether the flights determine it; None where it was not fitted.
+    jackknife_error, bootstrap_error
+        Standard errors by refits with each flight left out in turn, and to flights drawn with
+        replacement; None where it was not asked for.
     verdict, reason
         How well it is known, and the code and numbers behind that.
     note
@@ -69,6 +72,8 @@ class CoefficientResult(Part):
     std_error: FiniteOrNone = None
     ci95: tuple[float, float] | None = None
     identifiable: bool | None = None
+    jackknife_error: FiniteOrNone = None
+    bootstrap_error: FiniteOrNone = None
     verdict: Verdict
     reason: Reason
     note: str = ""

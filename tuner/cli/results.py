@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 def print_run(folder: Path, result: RunResult) -> None:
     """Print the coefficients, the RMSE before and after, and where everything lies."""
     from tuner.wording.predictions import starts_in_words
+    from tuner.wording.refits import refits_in_words
     from tuner.wording.status import ending_sentence
 
     screen = console()
@@ -31,6 +32,9 @@ def print_run(folder: Path, result: RunResult) -> None:
         _print_selection(screen, result)
     if result.effective is not None:
         _print_effective(screen, result, result.effective)
+    if said := refits_in_words(result):
+        screen.print(_refits(result))
+        screen.print(" ".join(said), markup=False)
     screen.print(_errors(result))
     for line in starts_in_words(result.flights):
         screen.print(line, markup=False)
@@ -135,6 +139,19 @@ def _coefficients(result: RunResult) -> Table:
             coefficient.unit,
             judgement_in_words(coefficient.verdict, coefficient.reason),
         )
+    return table
+
+
+def _refits(result: RunResult) -> Table:
+    """Return the standard errors of the fit beside those of refits to other flights."""
+    table = Table(box=None, title="Standard errors by refits", title_justify="left")
+    table.add_column("coefficient")
+    for name in ("this fit", "jackknife", "bootstrap"):
+        table.add_column(name, justify="right")
+    for name, found in result.coefficients.items():
+        errors = (found.std_error, found.jackknife_error, found.bootstrap_error)
+        if found.fitted:
+            table.add_row(name, *("" if error is None else f"{error:.2g}" for error in errors))
     return table
 
 

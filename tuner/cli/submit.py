@@ -42,6 +42,7 @@ def submit(
     method: Method = None,
     force: Annotated[bool, Parameter(negative=())] = False,
     cross_validate: Annotated[bool, Parameter(negative=())] = False,
+    bootstrap: int | None = None,
     seed: int | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -65,6 +66,8 @@ def submit(
         Search even where the check before the search reports a failure.
     cross_validate
         Also fit without each flight in turn.
+    bootstrap
+        Also fit so many times to flights drawn with replacement.
     seed
         Start the random numbers from this seed. Default: the job file's, else 0.
     """
@@ -90,7 +93,9 @@ def submit(
     )
     with client_of(server, token) as client:
         folder = folder_for(out) if wait else None
-        job = client.submit(options, name=name, force=force, cross_validate=cross_validate)
+        job = client.submit(
+            options, name=name, force=force, cross_validate=cross_validate, bootstrap=bootstrap
+        )
         if folder is None:
             print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
             return

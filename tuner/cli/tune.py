@@ -46,6 +46,7 @@ def tune(
     resume: Annotated[bool, Parameter(negative=())] = False,
     force: Annotated[bool, Parameter(negative=())] = False,
     cross_validate: Annotated[bool, Parameter(negative=())] = False,
+    bootstrap: int | None = None,
     seed: int | None = None,
     workers: Workers = None,
     cluster: Cluster = None,
@@ -73,7 +74,11 @@ def tune(
     force
         Search even where the check before the search reports a failure.
     cross_validate
-        Also fit without each flight in turn, and tabulate how well the other flights predict it.
+        Also fit without each flight in turn, tabulate how well the other flights predict it, and
+        give the jackknife's standard errors.
+    bootstrap
+        Also fit so many times to flights drawn with replacement, and give the standard errors that
+        follow.
     seed
         Start the random numbers from this seed. Default: the job file's, else 0.
     dry_run
@@ -134,6 +139,7 @@ def tune(
                 resume=resume,
                 force=force,
                 cross_validated=cross_validate,
+                refits=bootstrap,
                 listener=listener,
                 command=TYPED.get(),
             )

@@ -57,6 +57,7 @@ class Client:
         out: Named | None = None,
         force: bool = False,
         cross_validate: bool = False,
+        bootstrap: int | None = None,
         name: str = "",
     ) -> Run:
         """Fit the coefficients of a vehicle to recordings, on the server; see `tuner.fit`.
@@ -65,7 +66,7 @@ class Client:
         ----------
         flights, holdout, vehicle, controller, mass, config, free, fixed, method, seed, topics
             As of `tuner.fit`; paths are of this machine.
-        namespace, force, cross_validate
+        namespace, force, cross_validate, bootstrap
             As well.
         out
             Folder that the result is fetched into; None makes one under ``runs/``.
@@ -99,7 +100,9 @@ class Client:
             namespace=namespace,
         )
         folder = folder_for(None if out is None else Path(out))
-        job = self.submit(options, name=name, force=force, cross_validate=cross_validate)
+        job = self.submit(
+            options, name=name, force=force, cross_validate=cross_validate, bootstrap=bootstrap
+        )
         self.wait(job)
         return self.fetch(job, folder)
 
@@ -110,6 +113,7 @@ class Client:
         name: str = "",
         force: bool = False,
         cross_validate: bool = False,
+        bootstrap: int | None = None,
         key: str | None = None,
         on_upload: Callable[[Path], None] = lambda _: None,
     ) -> str:
@@ -121,7 +125,7 @@ class Client:
             As of the command line.
         name
             What lists call the job.
-        force, cross_validate
+        force, cross_validate, bootstrap
             As of `fit`.
         key
             Of this submission: with the same key there is one job; None makes one up.
@@ -135,6 +139,7 @@ class Client:
         """
         recordings, request = request_of(options)
         request |= {"name": name, "force": force, "cross_validate": cross_validate}
+        request["bootstrap"] = bootstrap
         request["recordings"] = [self.upload(path, on_upload) for path in recordings]
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         return str(self._connection.post("/jobs", request, headers)["id"])

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from tuner.config import with_values
 from tuner.disk import write_text
-from tuner.engine import Report, current
-from tuner.errors import ConfigError, RecordingError
+from tuner.engine import Report
+from tuner.errors import ConfigError
 from tuner.files import csv_text
 from tuner.job.best_fit import best_values, comparison_of
-from tuner.job.polish import polished
 from tuner.job.prepare import Job
-from tuner.job.search import free_offsets
-from tuner.objective.normal import Objective
+from tuner.job.refits import Whole, check_flights, coefficients_of, in_engine, refitted
 from tuner.result import RMSE_UNITS, AxesRmse
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import Iteration
-from tuner.search.optimiser import Free
 
 CROSS_VALIDATION_FILE = "cross_validation.csv"
 
@@ -48,14 +42,6 @@ class Fold:
     rmse: AxesRmse | None
 
 
-@dataclass(frozen=True)
-class _Whole:
-    """What all folds start from."""
-
-    job: Job
-    fitted: Fitted
-
-
 def cross_validate(
     job: Job, fitted: Fitted, folder: Path, on_iteration: Callable[[Iteration], None]
 ) -> tuple[Fold, ...]:
@@ -68,42 +54,20 @@ def cross_validate(
     RecordingError
         There are fewer than two flights to fit.
     """
-    if len(job.fitted) < 2:
-        raise RecordingError("--cross-validate", "leaves no flight to fit", "give two or more")
-    engine, last = current(), dict[int, Iteration]()
-
-    def heard(fold: int, report: dict[str, Any]) -> None:
-        before, last[fold] = last.get(fold), Iteration(**report)
-        if engine.at_once == 1:
-            on_iteration(last[fold])
-        elif before is not None and before.stage != last[fold].stage:
-            on_iteration(before)
-
-    whole = engine.share(_Whole(job, fitted))
-    folds = engine.map(_fold, [(whole, number) for number in range(len(job.fitted))], heard)
-    if engine.at_once > 1:
-        for iteration in last.values():
-            on_iteration(iteration)
+    check_flights(job, "--cross-validate", "leaves no flight to fit")
+    folds = in_engine(_fold, job, fitted, range(len(job.fitted)), on_iteration)
     write_cross_validation(folds, folder)
     return tuple(folds)
 
 
-def _fold(task: tuple[Callable[[], _Whole], int], report: Report) -> Fold:
-    """Return the fold without one flight.
-
-    The flight left out keeps its place with weights of zero, so that nothing compiles again.
-    """
+def _fold(task: tuple[Callable[[], Whole], int], report: Report) -> Fold:
+    """Return the fold without one flight."""
     whole, number = task[0](), task[1]
     job, fitted = whole.job, whole.fitted
-    flight, held = job.fitted[number], set(fitted.held.values())
-    polished_fit = polished(
-        job,
-        replace(fitted, objective=_without(fitted.objective, number)),
-        free=Free(np.array([name not in held for name in job.space.names]), free_offsets(job)),
-        title=f"without {flight.name}",
-        on_progress=lambda progress: report(progress.iterations[-1].model_dump()),
-    )
-    values = best_values(job, polished_fit)
+    flight = job.fitted[number]
+    counts = np.ones(len(job.fitted))
+    counts[number] = 0.0
+    values = best_values(job, refitted(whole, counts, f"without {flight.name}", report))
     comparison = comparison_of(job, fitted)
     try:
         rmse = comparison.fly(with_values(job.settings.vehicle, values))[flight.name].rmse
@@ -112,15 +76,17 @@ def _fold(task: tuple[Callable[[], _Whole], int], report: Report) -> Fold:
     return Fold(flight.name, values, rmse)
 
 
-def _without(objective: Objective, flight: int) -> Objective:
-    """Return an objective to which one flight contributes nothing."""
-    others = jnp.asarray(objective.segments.flight) != flight
-    changed: Objective = eqx.tree_at(
-        lambda o: [measured.weight for measured in o.segments.measured.values()],
-        objective,
-        [measured.weight * others for measured in objective.segments.measured.values()],
-    )
-    return changed
+def jackknife_errors(folds: Sequence[Fold]) -> dict[str, float]:
+    """Return each coefficient's standard error by the jackknife over flights.
+
+    With F flights left out in turn, the square root of (F - 1)/F times the sum of squares about the
+    mean (Efron and Tibshirani 1993, section 11.2).
+    """
+    share = (len(folds) - 1) / len(folds)
+    return {
+        name: float(np.sqrt(share * np.sum((values - values.mean()) ** 2)))
+        for name, values in coefficients_of([fold.coefficients for fold in folds]).items()
+    }
 
 
 def write_cross_validation(folds: Sequence[Fold], folder: Path) -> None:

@@ -185,6 +185,24 @@ def _judgements(
     return judgements
 
 
+def with_errors_of_refits(
+    result: RunResult, jackknife: Mapping[str, float], bootstrapped: Mapping[str, float]
+) -> RunResult:
+    """Return a result with the standard errors of refits: coefficient -> error, empty for none."""
+    coefficients = {
+        name: found.model_copy(
+            update={
+                "jackknife_error": jackknife.get(name),
+                "bootstrap_error": bootstrapped.get(name),
+            }
+        )
+        if found.fitted
+        else found
+        for name, found in result.coefficients.items()
+    }
+    return result.model_copy(update={"coefficients": coefficients})
+
+
 def _fixed(name: str, value: float) -> CoefficientResult:
     return CoefficientResult(
         unit=COEFFICIENTS[name].unit,

@@ -20,8 +20,9 @@ from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
 from tuner.job.best_fit import vehicle_fitted
+from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check
-from tuner.job.cross_validation import cross_validate
+from tuner.job.cross_validation import cross_validate, jackknife_errors
 from tuner.job.effective import effective_fit
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.findings import (
@@ -37,7 +38,7 @@ from tuner.job.held_out import Validation, validate
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, job_of
-from tuner.job.results import result_of, write_folder
+from tuner.job.results import result_of, with_errors_of_refits, write_folder
 from tuner.job.search import OnProgress, parameters_of, search
 from tuner.job.selection import Selected, with_terms_selected
 from tuner.prediction.input_lag import with_inputs_on_time
@@ -46,6 +47,7 @@ from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.search.fitted import Fitted
+from tuner.search.iteration import Iteration
 from tuner.search.progress import Progress
 from tuner.spans import span
 from tuner.uncertainty.ground import sources_of
@@ -61,6 +63,7 @@ def run(
     resume: bool = False,
     force: bool = False,
     cross_validated: bool = False,
+    refits: int | None = None,
     listener: Listener = SILENT,
     command: str = "",
 ) -> tuple[Path, RunResult]:
@@ -78,6 +81,8 @@ def run(
         Search although the check before it failed.
     cross_validated
         Also leave each fitted flight out in turn.
+    refits
+        How many refits to flights drawn with replacement are made; None for none.
     listener
         Whom to report to.
     command
@@ -95,6 +100,8 @@ def run(
     OutputError
         The result folder cannot be written to; a search goes on from there with ``resume``.
     """
+    if refits is not None:
+        check_bootstrap(refits)
     settings = settle(options)
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
@@ -147,10 +154,15 @@ def run(
     with span("results"):
         write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)
         _write_flown(folder, validation, fitted)
-    if cross_validated:
-        with span("cross-validation"):
-            folds = cross_validate(job, fitted, folder, lambda now: listener.on_iteration(now, nan))
-        listener.on_folds(folds)
+    if cross_validated or refits is not None:
+        result = _with_refits(
+            (job, fitted),
+            result,
+            folder,
+            cross_validated=cross_validated,
+            refits=refits,
+            listener=listener,
+        )
 
     listener.on_message("Simulating which flight would be the most informative next.")
     with span("examination"):
@@ -211,6 +223,35 @@ def _export(folder: Path, settings: Settings, listener: Listener) -> None:
     today = datetime.date.today()
     for kind, outcome in exports_of_job(folder, settings.job.export, refly=refly, today=today):
         listener.on_message(export_sentence(kind, outcome))
+
+
+def _with_refits(
+    fit: tuple[Job, Fitted],
+    result: RunResult,
+    folder: Path,
+    *,
+    cross_validated: bool,
+    refits: int | None,
+    listener: Listener,
+) -> RunResult:
+    """Return the result with the standard errors of refits to other flights, and write it again."""
+
+    def on_iteration(now: Iteration) -> None:
+        listener.on_iteration(now, nan)
+
+    jackknife: dict[str, float] = {}
+    bootstrapped: dict[str, float] = {}
+    if cross_validated:
+        with span("cross-validation"):
+            folds = cross_validate(*fit, folder, on_iteration)
+        listener.on_folds(folds)
+        jackknife = jackknife_errors(folds)
+    if refits is not None:
+        with span("bootstrap"):
+            bootstrapped = bootstrap(*fit, refits, folder, on_iteration)
+    result = with_errors_of_refits(result, jackknife, bootstrapped)
+    result.write(folder)
+    return result
 
 
 def _report(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
+from jaxtyping import Float
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
@@ -56,6 +57,8 @@ class Objective(eqx.Module):
     """bytes that derivatives may take while they are computed: segments beyond take turns."""
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
     """What surrounds each flight and is estimated with it, of `tuner.coefficients.conditions`."""
+    multiplicity: Float[Array, " N"] | None = None
+    """How often each flight counts in loss, gradient and Hessian; None is once."""
 
     @property
     def of_flight(self) -> tuple[str, ...]:
@@ -106,7 +109,15 @@ class Objective(eqx.Module):
             np.asarray(criterion.horizon),
             np.asarray(criterion.huber),
         )
-        return sums
+        if self.multiplicity is None:
+            return sums
+        often = np.asarray(self.multiplicity)[np.asarray(self.segments.flight)]
+        return replace(
+            sums,
+            loss=sums.loss * often,
+            gradient=sums.gradient * often,
+            hessian=sums.hessian * often,
+        )
 
     def jacobian(
         self, point: Point, criterion: Criterion, *, columns: int | None = None

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from annotated_types import Len
+from annotated_types import Interval, Len
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
 from tuner.config import ControllerFile, Options, VehicleFile, settle
@@ -39,6 +39,7 @@ def _one_line(text: str) -> str:
 M = TypeVar("M", bound=Section)
 Word = Annotated[str, Len(max_length=200), AfterValidator(_one_line)]
 Named = Word | dict[str, JsonValue]
+Refits = Annotated[Whole, Interval(ge=2, le=1000)]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 
@@ -58,7 +59,7 @@ class JobRequest(Section):
         The keys of ``tune.yaml``.
     name
         What lists call the job.
-    mass, fit, fix, method, seed, namespace, cross_validate, force
+    mass, fit, fix, method, seed, namespace, cross_validate, bootstrap, force
         As the options of `tune`.
     """
 
@@ -81,6 +82,7 @@ class JobRequest(Section):
     seed: Whole | None = None
     namespace: Word | None = None
     cross_validate: Flag = False
+    bootstrap: Refits | None = None
     force: Flag = False
 
 
@@ -107,6 +109,7 @@ class Asked(Section):
     seed: Whole | None = None
     namespace: str | None = None
     cross_validate: Flag = False
+    bootstrap: Refits | None = None
     force: Flag = False
 
     def lay_out(self, folder: Path) -> None:
@@ -185,6 +188,7 @@ def checked(
             for key in ("mass", "fit", "fix", "method", "seed", "namespace")
         },
         cross_validate=request.cross_validate,
+        bootstrap=request.bootstrap,
         force=request.force,
     )
     with tempfile.TemporaryDirectory(prefix="tune-check-") as name:

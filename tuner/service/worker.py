@@ -103,6 +103,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
             resume=(RESULT / "checkpoint.npz").exists(),
             force=asked.force,
             cross_validated=asked.cross_validate,
+            refits=asked.bootstrap,
             listener=_listener(channel),
             command=f"job {assignment.job} of a tuning service",
         )

@@ -13,6 +13,7 @@ from tests.tuner.engine import tasks
 from tests.tuner.uncertainty import making
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.engine import using
+from tuner.job.bootstrap import BOOTSTRAP_FILE, bootstrap
 from tuner.job.cross_validation import CROSS_VALIDATION_FILE, cross_validate
 from tuner.job.prepare import job_of
 from tuner.job.unfitted import unfitted
@@ -133,6 +134,19 @@ def test_folds_are_the_same_elsewhere(two_flights, two_workers, folds_here, tmp_
         there = table_of(two_flights, tmp_path / "there", lambda now: heard.append(now.stage))
     assert there == folds_here[0]
     assert set(heard) == folds_here[1]
+
+
+@pytest.mark.slow
+def test_bootstrap_refits_are_the_same_elsewhere(two_flights, two_workers, tmp_path):
+    def table(folder):
+        folder.mkdir()
+        errors = bootstrap(*two_flights, 3, folder, lambda _: None)
+        assert set(errors) == set(FREE)
+        return (folder / BOOTSTRAP_FILE).read_text()
+
+    here = table(tmp_path / "here")
+    with using(two_workers):
+        assert table(tmp_path / "there") == here
 
 
 @pytest.mark.slow

@@ -144,9 +144,11 @@ def short_job():
 
 
 @pytest.mark.slow
-def test_each_flight_is_predicted_from_the_others_and_the_fit_stays(tmp_path):
+def test_refits_to_other_flights_predict_give_errors_and_leave_the_fit(tmp_path):
     bags = [str(FLIGHTS / f"{name}.bag") for name in ("yaw_spin_3rps", "circle_3mps")]
-    folder, result = run(Options(bags, **SHORT), out=tmp_path / "run", cross_validated=True)
+    folder, result = run(
+        Options(bags, **SHORT), out=tmp_path / "run", cross_validated=True, refits=3
+    )
     rows = [line.split(",") for line in (folder / "cross_validation.csv").read_text().splitlines()]
     assert [row[0] for row in rows] == ["left_out", "yaw_spin_3rps", "circle_3mps", "spread"]
     column = rows[0].index("moment_constant")
@@ -155,6 +157,14 @@ def test_each_flight_is_predicted_from_the_others_and_the_fit_stays(tmp_path):
     assert float(rows[3][column]) == pytest.approx(np.std(values, ddof=1))
     written = values_of(read_vehicle(folder / "best_fit.yaml"))
     assert written["moment_constant"] == result.coefficients["moment_constant"].best
+    found = read_run(folder).result.coefficients["moment_constant"]
+    assert found.jackknife_error == pytest.approx(abs(values[0] - values[1]) / 2)
+    drawn = list(csv.DictReader((folder / "bootstrap.csv").read_text().splitlines()))
+    for row in drawn:
+        assert int(row["drawn_yaw_spin_3rps"]) + int(row["drawn_circle_3mps"]) == 2
+    refits = [float(row["moment_constant"]) for row in drawn]
+    assert found.bootstrap_error == pytest.approx(np.std(refits, ddof=1))
+    assert "Refits to other flights" in (folder / "report.html").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
 from tuner.report.sections.profiles import profiles
 from tuner.report.sections.provenance import provenance
+from tuner.report.sections.refits import refits
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 from tuner.report.sections.selection import selection
@@ -35,6 +36,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     effective,
     bench,
     sources,
+    refits,
     errors,
     flights,
     forces,
