@@ -21,6 +21,8 @@ NOT_IMPORTED = {
     *("pytest-xdist", "ruff", "mypy", "import-linter", "types-pyyaml", "lxml-stubs"),
     *("mkdocs", "mkdocs-material", "mkdocstrings"),
 }
+#: What a test uses where somebody has installed it; why it is in no extra stands there.
+WHERE_INSTALLED = {"test": {"s3fs", "moto"}}
 TOOLS = {"dev", "docs"}
 """Extras of nothing but those."""
 OURS = {"sim_jax", "tuner", "tests", "benchmarks", "examples", "docs"}
@@ -91,7 +93,8 @@ def imported(*folders: str) -> set[str]:
 
 @pytest.mark.parametrize("extra", USES, ids=str)
 def test_everything_imported_is_declared(extra):
-    assert imported(*USES[extra]) <= declared(None) | declared(extra, others=True)
+    known = declared(None) | declared(extra, others=True) | WHERE_INSTALLED.get(extra, set())
+    assert imported(*USES[extra]) <= known
 
 
 @pytest.mark.parametrize("extra", USES, ids=str)
