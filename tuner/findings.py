@@ -41,6 +41,8 @@ class Code(StrEnum):
     SATURATION_FEEDBACK = "saturation_feedback"  # feedback: 1 if the integrator stops, else 0
     CLOCK_OFFSET = "clock_offset"  # seconds; names: the clock
     TURNING_UNEXPLAINED = "turning_unexplained"  # explained (share)
+    INERTIA_BALANCED = "inertia_balanced"  # error, NAME_fitted, NAME_balanced; names: NAMEs
+    INERTIA_NOT_BALANCED = "inertia_not_balanced"  # likewise
     INPUT_LATE = "input_late"  # seconds
     GYRO_OFFSET = "gyro_offset"  # rate (rad/s); names: the axis
     FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise

@@ -19,6 +19,7 @@ from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
+from tuner.job.balanced import with_inputs_balanced
 from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check
@@ -116,6 +117,10 @@ def run(
     listener.on_message("Examining how well each coefficient is known.")
     with span("examination"):
         fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
+    with span("balance"):
+        fitted, examination, inertia = with_inputs_balanced(
+            job, fitted, examination, listener.on_message
+        )
     uncertainty = examination.uncertainty
     count = len(uncertainty.names)
     sources = sources_of(fitted, uncertainty, examination.information.total[:count, :count])
@@ -127,11 +132,13 @@ def run(
         validation = validate(job, fitted, vehicle)
     worse = (
         *flights_worse(validation.initial, validation.best),
-        *turning_unexplained(validation.turning_explained),
+        *(inertia or turning_unexplained(validation.turning_explained)),
     )
     _report(worse, listener, force=True)
-    findings = (*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts)
-    fitted = replace(fitted, findings=findings)
+    fitted = replace(
+        fitted,
+        findings=(*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts),
+    )
     with span("effective coefficients"):
         effective = effective_fit(
             job,

@@ -311,6 +311,28 @@ def _setpoints_foreign(finding: Finding) -> str:
     )
 
 
+def _inertia_balanced(finding: Finding) -> str:
+    values = listed(
+        [
+            f"{name} {finding.numbers[f'{name}_balanced']:.3g} instead of "
+            f"{finding.numbers[f'{name}_fitted']:.3g} kg m²"
+            for name in finding.names
+        ]
+    )
+    error = finding.numbers["error"]
+    if finding.code is Code.INERTIA_BALANCED:
+        return (
+            "Errors in the measured rotor speeds would pass for inertia and damping, so that the "
+            f"coefficients are those at which recorded motion and rotor speeds balance: {values}. "
+            f"Flights that are left out are predicted with {error:.2f} times the error."
+        )
+    return (
+        "Errors in the measured rotor speeds pass for inertia and damping: recorded motion and "
+        f"rotor speeds balance at {values}. What predicts these flights is kept, for flights that "
+        f"are left out would be predicted with {error:.2f} times the error."
+    )
+
+
 def _flight_unmatched(finding: Finding) -> str:
     multiples = ", ".join(
         f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
@@ -328,6 +350,8 @@ SENTENCES: Mapping[Code, Callable[[Finding], str]] = {
     Code.SATURATION_FEEDBACK: _saturation_feedback,
     Code.FLIGHT_UNMATCHED: _flight_unmatched,
     Code.INLET_CHOSEN: _inlet_chosen,
+    Code.INERTIA_BALANCED: _inertia_balanced,
+    Code.INERTIA_NOT_BALANCED: _inertia_balanced,
     Code.SETPOINTS_SCALED: _setpoints_scaled,
     Code.SETPOINTS_FOREIGN: _setpoints_foreign,
 }
@@ -337,6 +361,10 @@ REMEDIES: Mapping[Code, Callable[[Finding], str]] = {
     Code.SALVAGED: lambda _: "Record the flight again if what was lost matters.",
     Code.SATURATION_FEEDBACK: _saturation_remedy,
     Code.INLET_CHOSEN: _inlet_remedy,
+    Code.INERTIA_BALANCED: lambda _: "",
+    Code.INERTIA_NOT_BALANCED: lambda _: (
+        "Take these inertias for effective ones, and measure them on the ground (tune bench)."
+    ),
     Code.SETPOINTS_SCALED: _setpoints_remedy,
     Code.SETPOINTS_FOREIGN: lambda _: (
         "Give the controller that flew (--controller), or enter below it (inlet: body_rate)."

@@ -30,6 +30,20 @@ MADE = {
     Code.SPARSE_INPUT: Finding(
         Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
     ),
+    Code.INERTIA_BALANCED: Finding(
+        Code.INERTIA_BALANCED,
+        "info",
+        "moments of inertia",
+        {"inertia_xx_fitted": 3e-5, "inertia_xx_balanced": 2e-5, "error": 1.1},
+        ("inertia_xx",),
+    ),
+    Code.INERTIA_NOT_BALANCED: Finding(
+        Code.INERTIA_NOT_BALANCED,
+        "warning",
+        "moments of inertia",
+        {"inertia_xx_fitted": 3e-5, "inertia_xx_balanced": 1e-5, "error": 2.3},
+        ("inertia_xx",),
+    ),
     Code.INLET_CHOSEN: Finding(
         Code.INLET_CHOSEN,
         "info",
