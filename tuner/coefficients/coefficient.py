@@ -91,6 +91,8 @@ class Coefficient:
     group
         Of an effect: what a selection of terms adds together; empty for one that follows from the
         others of its kind and is never chosen by itself.
+    stands_in
+        Of an effect: whether it describes as a whole what other terms do one by one.
     exported_as
         Export target -> where the coefficient stands in it, or why it does not.
     informed_by
@@ -120,6 +122,7 @@ class Coefficient:
     hold_rank: int | None = None
     neutral: float | None = None
     group: str = ""
+    stands_in: bool = False
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None
     plausible: tuple[float, float] | None = None

@@ -25,6 +25,7 @@ def _effect(
     px4: str = "the SIH model has no such term",
     mass_exponent: int = 0,
     informed_by: str | None = None,
+    stands_in: bool = False,
 ) -> Coefficient:
     """Return the row of an effect that vanishes at zero and is searched between ±limit.
 
@@ -44,6 +45,7 @@ def _effect(
         mass_exponent=mass_exponent,
         neutral=0.0,
         group=group,
+        stands_in=stands_in,
         exported_as={"sdf": in_sdf, "px4": NotCarried(px4, 0.0)},
         informed_by=informed_by,
     )
@@ -110,6 +112,7 @@ EFFECT_ROWS = (
             prior_sd=0.2,
             step=0.1,
             mass_exponent=1,
+            stands_in=True,
         )
         for axis, direction in _AXES.items()
     ),
@@ -177,6 +180,7 @@ EFFECT_ROWS = (
             prior_sd=0.02,
             step=0.005,
             mass_exponent=1,
+            stands_in=True,
         )
         for axis, direction in _AXES.items()
     ),
@@ -234,6 +238,7 @@ EFFECT_ROWS = (
             prior_sd=0.01,
             step=0.005,
             mass_exponent=1,
+            stands_in=True,
         )
         for axis, direction in _AXES.items()
     ),

@@ -84,7 +84,8 @@ def searched_again(
     """Return a fit searched for again by all stages from a start vector (K,).
 
     The other arguments are those of `polished`. What terms that were missing did to a fit, a
-    coefficient at its bound say, is forgotten that way.
+    coefficient at its bound say, is forgotten that way. The last polish is left to a fit of what
+    proves to be needed.
     """
     progress = replace(
         beginning(fitted.objective, vector[None]),
@@ -92,7 +93,7 @@ def searched_again(
         evaluations=fitted.evaluations,
         feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
     )
-    stages = _stages(fitted.objective, job)
+    stages = _stages(fitted.objective, job)[:-1]
     return _grown(job, fitted, progress, stages, free=free, title=title, on_progress=on_progress)
 
 
@@ -136,4 +137,5 @@ def _grown(
         evaluations=progress.evaluations,
         loss_best=float(progress.losses[0]),
         converged=progress.converged,
+        polished=True,
     )

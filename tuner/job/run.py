@@ -40,8 +40,8 @@ from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
-from tuner.job.search import OnProgress, parameters_of, search
-from tuner.job.selection import Selected, with_terms_selected
+from tuner.job.search import OnProgress, parameters_of
+from tuner.job.selection import Selected, search_with_terms
 from tuner.prediction.input_lag import with_inputs_on_time
 from tuner.recordings import read_usable
 from tuner.report import render, write_search, write_traces
@@ -205,10 +205,14 @@ def _searched(
 ) -> Selected:
     """Return where the search ends, with the terms that the flights call for."""
     try:
-        with span("search"):
-            fitted = search(job, folder, resume=resume, on_progress=on_progress, findings=findings)
-        with span("selection of terms"):
-            return with_terms_selected(job, fitted, on_progress, listener.on_message)
+        return search_with_terms(
+            job,
+            folder,
+            resume=resume,
+            on_progress=on_progress,
+            on_message=listener.on_message,
+            findings=findings,
+        )
     except (KeyboardInterrupt, OutputError, EngineError):
         listener.on_message(
             f"The best coefficients so far are in {folder}. "

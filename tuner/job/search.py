@@ -34,6 +34,8 @@ from tuner.search.stages import Stage, left, plan
 
 CHECKPOINT = "checkpoint.npz"
 SECOND_CHECKPOINT = "checkpoint_hybrid.npz"
+FAR_OFF = 3.0
+"""Multiple of the noise beyond which a flight is not met well enough to be polished at once."""
 AGREE = 0.01
 """Starts whose losses differ by less than this share have reached the same minimum."""
 
@@ -47,6 +49,7 @@ def search(
     resume: bool,
     on_progress: OnProgress,
     findings: tuple[Finding, ...] = (),
+    provisional: bool = False,
 ) -> Fitted:
     """Look for the best coefficients of a job.
 
@@ -64,6 +67,9 @@ def search(
         Called after every iteration.
     findings
         Of the check before the search, to be handed on.
+    provisional
+        Whether to end before the polish where most flights are still far off: the model may lack
+        something, and the search can be gone on with.
 
     Raises
     ------
@@ -72,10 +78,15 @@ def search(
     """
     method = job.settings.job.search.method
     first = _Attempt(
-        job, folder / CHECKPOINT, "gradient" if method == "auto" else method, on_progress, findings
+        job,
+        folder / CHECKPOINT,
+        "gradient" if method == "auto" else method,
+        on_progress,
+        findings,
+        provisional,
     )
     fitted = first.run(resume=resume)
-    doubt = _doubt(job, fitted) if method == "auto" else None
+    doubt = _doubt(job, fitted) if method == "auto" and fitted.polished else None
     if doubt is None:
         return fitted
     second = replace(first, checkpoint=folder / SECOND_CHECKPOINT, method="hybrid")
@@ -104,6 +115,12 @@ def _doubt(job: Job, fitted: Fitted) -> Finding | None:
     return None
 
 
+def _is_far_off(progress: Progress) -> bool:
+    """Return whether most flights are met much worse than noise would have it, by some channel."""
+    worst = np.max(list(progress.scales.values()), axis=0)
+    return bool(np.median(worst) > FAR_OFF)
+
+
 def _misfit(fitted: Fitted) -> float:
     """Return how far all channels of all flights are met, each by its own noise."""
     return float(np.mean([np.log(s) for scale in fitted.scales.values() for s in scale.values()]))
@@ -118,6 +135,7 @@ class _Attempt:
     method: str
     on_progress: OnProgress
     findings: tuple[Finding, ...]
+    provisional: bool
 
     def run(self, *, resume: bool) -> Fitted:
         """Run the method from the starts, or from where its checkpoint stands."""
@@ -145,10 +163,12 @@ class _Attempt:
             clipped=job.clipped,
             on_progress=on_progress,
             seed=job.settings.job.search.seed,
+            worth_polishing=lambda progress: not (self.provisional and _is_far_off(progress)),
         )
         seconds = time.perf_counter() - began
         save(self.checkpoint, key, progress, seconds)
-        return self._fitted(stages[-1], progress, starts, seconds)
+        fitted = self._fitted(stages[-1], progress, starts, seconds)
+        return replace(fitted, polished=progress.stage == len(stages))
 
     def _stages(self) -> tuple[Stage, ...]:
         """Return the method's stages; flights that windows prepare are flown whole at once."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +19,11 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.findings import Finding
 from tuner.job.extension import extended
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
-from tuner.job.search import OnProgress, free_offsets
+from tuner.job.search import OnProgress, free_offsets, search
 from tuner.model import with_coefficients
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
@@ -31,6 +33,7 @@ from tuner.search.progress import Progress
 from tuner.selection.candidates import (
     Groups,
     candidate_groups,
+    is_stand_in,
     start_of,
     with_terms,
 )
@@ -38,6 +41,7 @@ from tuner.selection.linear import Linear, linear_at
 from tuner.selection.prediction import offsets_fitted, predicted_losses
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.spans import span
 from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 4
@@ -60,6 +64,40 @@ class Selected:
     rows: tuple[SelectionRow, ...] = ()
 
 
+def search_with_terms(
+    job: Job,
+    folder: Path,
+    *,
+    resume: bool,
+    on_progress: OnProgress,
+    on_message: Callable[[str], None],
+    findings: tuple[Finding, ...] = (),
+) -> Selected:
+    """Look for the best coefficients of a job, and for the terms that its flights call for.
+
+    Where most flights are far off, terms are tried before the base model is polished, and before
+    CMA-ES looks for another beginning. Arguments and errors are those of `search`.
+    """
+
+    def searched(*, resume: bool, provisional: bool) -> Selected:
+        with span("search"):
+            fitted = search(
+                job,
+                folder,
+                resume=resume,
+                on_progress=on_progress,
+                findings=findings,
+                provisional=provisional,
+            )
+        with span("selection of terms"):
+            return with_terms_selected(job, fitted, on_progress, on_message)
+
+    selected = searched(resume=resume, provisional=bool(candidates_of(job)))
+    if selected.fitted.polished:
+        return selected
+    return searched(resume=True, provisional=False)
+
+
 def with_terms_selected(
     job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
 ) -> Selected:
@@ -76,15 +114,22 @@ def with_terms_selected(
 def _selected(
     job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
 ) -> Selected:
-    settings = job.settings.job
-    if not isinstance(settings.terms, str):
+    if not isinstance(job.settings.job.terms, str):
         return Selected(job, fitted, _first_rows(job, SelectionCode.ASKED_FOR))
-    candidates = candidate_groups(job.settings.vehicle, job.space, settings)
-    if settings.terms == "none" or settings.free is not None or not candidates:
+    candidates = candidates_of(job)
+    if not candidates:
         return Selected(job, fitted)
     selected = _Selection(job, fitted, candidates, on_progress, on_message).run()
     first = _first_rows(job, SelectionCode.HOVERS_TILTED)
     return replace(selected, rows=(*first, *selected.rows))
+
+
+def candidates_of(job: Job) -> Groups:
+    """Return the groups among which a job's flights choose: none where it says what is free."""
+    settings = job.settings.job
+    if settings.terms != "auto" or settings.free is not None:
+        return {}
+    return candidate_groups(job.settings.vehicle, job.space, settings)
 
 
 def _first_rows(job: Job, reason: SelectionCode) -> tuple[SelectionRow, ...]:
@@ -184,7 +229,10 @@ class _Selection:
             f"The flights call for more than the base model: searching again with all "
             f"{len(self.candidates)} groups of terms, to see which can go."
         )
-        trial = self._pruned(self._refitted(base, self.candidates, anew=True))
+        rough = self._refitted(base, self.candidates, anew=True)
+        trial = self._pruned(rough)
+        if trial is rough:
+            trial = self._refitted(rough, rough.added)
         if trial.added and self._predicts_better(trial, base, by_flight=True):
             return trial
         return None
@@ -212,6 +260,7 @@ class _Selection:
             {group: self._columns(names) for group, names in state.added.items()},
             candidates=len(self.candidates),
             neutral=self._neutral,
+            stand_ins=[group for group in state.added if is_stand_in(group)],
         )
         if not taken or not kept:
             return state if kept else replace(state, added={})

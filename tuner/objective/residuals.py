@@ -129,6 +129,8 @@ def simulate_segments(
         start = in_trim(
             model.vehicle, model.controller, start, segments.resting, speed_factor=factor
         )
+    if segments.wander is not None:
+        start = moved(start, segments.wander)
     if segments.turning is not None:
         start = spun_up(start, model.vehicle, segments.turning)
     if states is not None and segments.freedom is not None:

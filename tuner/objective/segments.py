@@ -24,6 +24,7 @@ from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import freedom_of
 from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.start import recent_command, rests, start_of
+from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
 from tuner.padding import padded_size
 
@@ -83,6 +84,8 @@ class Segments(eqx.Module):
     """Which segments start at rest, level; None where none does."""
     log_voltage: Float[Array, "ticks F"] | None = None
     """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
+    wander: Float[Array, "L F"] | None = None
+    """How far from rest each hover was at its end (`tuner.objective.wander`); None at rest."""
     freedom: Float[Array, "L F"] | None = None
     """Standard deviations of the start (`tuner.objective.initial_conditions`); None if known."""
 
@@ -137,12 +140,14 @@ def segments_of(
                 "holds no reference and none is named",
                 "name its trajectory in the job file, or fit through another inlet",
             )
+    wander = wander_of(flights)
     return Segments(
         inlet=INLETS["reference"].lay(flights, schedule),
         start=start_of([flight.initial for flight in flights]),
         measured=_all_measured(flights, noise, weights),
         flight=jnp.arange(len(flights)),
         resting=jnp.asarray([rests(flight.initial) for flight in flights]),
+        wander=None if wander is None else jnp.asarray(wander),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
     )
 

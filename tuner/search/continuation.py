@@ -46,6 +46,7 @@ def grow(
     clipped: bool,
     on_progress: OnProgress,
     seed: int = 0,
+    worth_polishing: Callable[[Progress], bool] = lambda _: True,
 ) -> Progress:
     """Run the remaining stages and return where the search ended.
 
@@ -66,10 +67,15 @@ def grow(
         Called after every iteration with where the search then stands.
     seed
         Of an optimiser that draws at random.
+    worth_polishing
+        Whether to go on where the search stands before its first polish.
     """
     search = _Search(objective, free, on_progress, seed)
     while progress.stage < len(stages):
         stage = stages[progress.stage]
+        polished = progress.stage > 0 and stages[progress.stage - 1].prunes
+        if stage.prunes and not polished and not worth_polishing(progress):
+            break
         tries_feedback = stage.tries_feedback and clipped
         run = search.run_with_and_without_feedback if tries_feedback else search.run
         progress = run(stage, progress)

@@ -64,6 +64,9 @@ class Fitted:
         In the final weights.
     converged
         Whether the last stage stopped because its steps gained nothing, not at its limit.
+    polished
+        Whether the search went to its end: a model that is far off is not polished before terms
+        have been tried.
     findings
         Everything noticed on the way.
     held
@@ -84,5 +87,6 @@ class Fitted:
     loss_initial: float
     loss_best: float
     converged: bool
+    polished: bool = True
     findings: tuple[Finding, ...] = field(default=())
     held: Mapping[str, str] = field(default_factory=dict)

@@ -46,6 +46,11 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
     return named
 
 
+def is_stand_in(group: str) -> bool:
+    """Return whether a group describes as a whole what other terms do one by one."""
+    return any(COEFFICIENTS[name].stands_in for name in term_groups()[group])
+
+
 def start_of(names: Sequence[str]) -> dict[str, float]:
     """Return the neutral value of each coefficient of a term."""
     values = {}

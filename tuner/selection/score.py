@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,10 +114,13 @@ def surviving(
     *,
     candidates: int,
     neutral: NDArray[np.float64],
+    stand_ins: Collection[str] = (),
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
-    The group that predicts least is taken away first, then all others are scored without it.
+    The group that predicts least is taken away first, then all others are scored without it. Of
+    groups that can do without each other the stand-ins go first: with more coefficients they do
+    what one term of the vehicle does, and noise would choose between the two.
 
     Parameters
     ----------
@@ -127,6 +130,8 @@ def surviving(
         Columns of the coefficients that stay.
     groups
         Group -> columns.
+    stand_ins
+        Names of groups that describe as a whole what others do one by one.
     """
     left, taken = dict(groups), dict[str, Score]()
     while True:
@@ -140,7 +145,7 @@ def surviving(
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:
             return scores, taken
-        least = min(idle, key=lambda name: scores[name].gain_holdout)
+        least = min(idle, key=lambda name: (name not in stand_ins, scores[name].gain_holdout))
         taken[least] = scores[least]
         del left[least]
 

@@ -81,6 +81,36 @@ def test_backward_elimination_leaves_the_term_of_the_truth_at_the_fit_with_both(
     assert (list(kept), list(taken)) == (["first"], ["second"])
 
 
+@pytest.mark.parametrize("stand_in", ["first", "copy"])
+def test_of_two_that_do_the_same_the_stand_in_goes(stand_in):
+    linear = moved_to_minimum(linear_fit(0.5), FIRST)
+    twin = replace(linear, **_with_a_twin(linear))
+    kept, taken = surviving(
+        twin,
+        np.array([0]),
+        {"first": FIRST, "copy": np.array([len(linear.scaled)])},
+        candidates=2,
+        neutral=np.zeros(len(linear.scaled) + 1),
+        stand_ins=[stand_in],
+    )
+    assert list(taken) == [stand_in]
+    assert len(kept) == 1
+
+
+def _with_a_twin(linear):
+    """Return the fields of a loss in which one more coefficient does what the first term does."""
+    (first,) = FIRST
+    columns = [*range(len(linear.scaled)), first]
+    prior = linear.prior[np.ix_(columns, columns)] * np.eye(len(columns))
+    return {
+        "scaled": linear.scaled[columns],
+        "hessian": linear.hessian[:, columns][:, :, columns],
+        "score": linear.score[:, columns],
+        "prior": prior + 1e-3 * np.eye(len(columns)),
+        "pull": linear.pull[columns],
+    }
+
+
 def test_what_the_flights_disagree_about_lowers_the_loss_and_is_not_added():
     found = score(linear_fit(1.0, 0.0, 0.0, 0.0), MODEL, FIRST, candidates=1)
     assert found.gain_fit > 0.01
