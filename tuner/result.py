@@ -15,6 +15,7 @@ from tuner.errors import InputError
 from tuner.files import FiniteOrNone, Part, ResultFile
 from tuner.findings import Finding
 from tuner.selection.table import SelectionRow
+from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 
@@ -52,6 +53,8 @@ class CoefficientResult(Part):
         Bounds of the search; None where there were none.
     std_error, ci95
         Standard error and 95 % interval; None where it was not fitted or they are not finite.
+    std_error_parts
+        What the standard error is made of, each part in the coefficient's unit.
     identifiable
         Whether the flights determine it; None where it was not fitted.
     jackknife_error, bootstrap_error
@@ -70,6 +73,7 @@ class CoefficientResult(Part):
     lower: float | None = None
     upper: float | None = None
     std_error: FiniteOrNone = None
+    std_error_parts: ErrorParts | None = None
     ci95: tuple[float, float] | None = None
     identifiable: bool | None = None
     jackknife_error: FiniteOrNone = None

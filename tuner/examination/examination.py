@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.alternatives import residuals_at
 from tuner.objective.flight_batches import portion, portions
+from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.local import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.estimates import Uncertainty, references, uncertainty_at
@@ -56,6 +59,7 @@ def examine(
     *,
     names: Sequence[str] | None = None,
     offsets_fitted: NDArray[np.bool_] | None = None,
+    otherwise: Mapping[str, Objective] = MappingProxyType({}),
 ) -> Examination:
     """Examine a fit, or a point where nothing was fitted.
 
@@ -69,6 +73,8 @@ def examine(
         Of the fitted flights in the order of the objective; those of ``fitted.scales`` by default.
     offsets_fitted
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
+    otherwise
+        What might be simulated differently -> the problem so simulated, for the parts of errors.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
@@ -81,7 +87,15 @@ def examine(
         jacobian = batch[0].jacobian(*batch[1:], columns=full_problem.columns)
         flight_names = [names[number] for number in flights]
         free = None if offsets_fitted is None else offsets_fitted[:, flights]
-        informations.append(information_from_jacobian(*batch, jacobian, offsets_fitted=free))
+        moved = {
+            name: residuals_at(
+                *portion(replace(other, space=objective.space), point, criterion, flights)
+            )
+            for name, other in otherwise.items()
+        }
+        informations.append(
+            information_from_jacobian(*batch, jacobian, offsets_fitted=free, otherwise=moved)
+        )
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
         )
@@ -122,6 +136,7 @@ def _restricted(information: FisherInformation, indices: NDArray[np.intp]) -> Fi
         nuisance_prior=information.nuisance_prior[square],
         prior=information.prior[square],
         ground=None if information.ground is None else information.ground[square],
+        changes={name: change[:, indices] for name, change in information.changes.items()},
     )
 
 

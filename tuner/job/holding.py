@@ -20,6 +20,7 @@ from tuner.examination.examination import Examination, examine
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
+from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -43,7 +44,7 @@ def with_undetermined_held(
     together they predict, even where the flights do not tell them apart, and each one's verdict
     says so.
     """
-    examination = examine(fitted)
+    examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
     segments = fitted.objective.segments
     predicts = segments.windowed and segments.freedom is None
     for _ in range(MAX_ROUNDS):
@@ -60,7 +61,7 @@ def with_undetermined_held(
             "others are fitted again."
         )
         fitted = hold(job, fitted, stand_ins, on_progress)
-        examination = examine(fitted)
+        examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
     return fitted, examination
 
 

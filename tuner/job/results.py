@@ -156,6 +156,7 @@ def _coefficients(
             lower=lower,
             upper=upper,
             std_error=estimate.std_error,
+            std_error_parts=estimate.parts,
             ci95=_interval(estimate.ci95),
             identifiable=reason.identifiable,
             verdict=verdict,

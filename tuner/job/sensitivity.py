@@ -18,6 +18,7 @@ from tuner.job.best_fit import comparison_of
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.prepare import Job, job_of
 from tuner.job.unfitted import unfitted
+from tuner.objective.alternatives import alternatives_of
 from tuner.recordings import read_recordings
 from tuner.report import render
 from tuner.report.record import About, Recording
@@ -110,7 +111,7 @@ def examine_vehicle(
     make_folder(out)
     fitted = unfitted(job)
     on_message("simulating, and differentiating by every coefficient")
-    examination = examine(fitted)
+    examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
     knowledge = write_knowledge(out, job, examination, fitted)
     on_message("simulating what could be flown next")
     proposals = write_next_flight(out, job, examination, fitted, arena)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from tuner.uncertainty.information import FisherInformation
+from tuner.uncertainty.inverse import Inverse
+from tuner.uncertainty.stretches import Stretches, stretches_of
 
 Array = NDArray[np.float64]
 
 WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""
-ROUNDING = 1e-12
-"""Share of the largest eigenvalue, at unit diagonal, below which information is rounding error."""
 MAX_LEVERAGE = 0.95
 """Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
+FEWEST_FREEDOM = 2.0
+"""Degrees of freedom: fewer would be a distribution without a variance."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class Covariance:
     Attributes
     ----------
     matrix
-        (K, K), flights and priors together, inflated where residuals are correlated in time.
+        (K, K), flights and priors together, inflated where residuals are correlated in time. The
+        errors are those of normal distributions with the 95 % intervals that are meant.
     data_only
         (K, K), the same from the flights alone; huge where they carry no information.
     inflation
@@ -40,6 +44,17 @@ class Covariance:
     inflation: Array
     beyond_noise: Array
 
+    def widened(self, error: Array) -> Covariance:
+        """Return the covariance with larger standard errors (K,) and the same correlations."""
+        factor = error / self.error
+        wider = np.outer(factor, factor)
+        return replace(
+            self,
+            matrix=self.matrix * wider,
+            data_only=self.data_only * wider,
+            beyond_noise=self.beyond_noise * factor,
+        )
+
     @property
     def error(self) -> Array:
         """Standard errors (K,)."""
@@ -51,6 +66,12 @@ class Covariance:
         return np.asarray(np.sqrt(np.diag(self.data_only)))
 
     @property
+    def shape(self) -> Array:
+        """``data_only`` (K, K), but widened alike for all: what trades off exactly still does."""
+        own = np.outer(self.beyond_noise, self.beyond_noise)
+        return np.asarray(self.data_only / own * np.median(self.beyond_noise) ** 2)
+
+    @property
     def correlation(self) -> Array:
         """Correlation matrix (K, K)."""
         return np.asarray(self.matrix / np.outer(self.error, self.error))
@@ -60,30 +81,25 @@ def covariance_of(information: FisherInformation) -> Covariance:
     """Return the covariance of a fit.
 
     With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
-    residuals' mean square. Model error is no white noise: stretches of a few seconds are summed up
-    and their scores' spread takes the place of B (the sandwich estimate), each score corrected for
-    the stretch's own leverage on the fit as in Bell and McCaffrey, "Bias reduction in standard
-    errors for linear regression with multi-stage samples", 2002. Few stretches make that estimate
-    erratic: it may widen an interval but never narrow it, and one standard deviation of what chance
-    does to white noise is taken off first.
+    residuals' mean square. Gusts and model error are no white noise: stretches of time are summed
+    up and their scores' spread takes the place of B (the sandwich estimate), each score corrected
+    for the stretch's own leverage on the fit. Few stretches make that estimate erratic: Student's
+    t with the degrees of freedom that they amount to takes the place of the normal distribution,
+    and an interval is never narrower than that of independent residuals. Both after Bell and
+    McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples",
+    2002.
     """
     total = information.total
-    unit = 1.0 / np.sqrt(np.diag(total))
-    priors = information.prior + information.nuisance_prior
-    if information.ground is not None:  # its noise is as large as it says
-        priors = priors + information.ground
-    inverse = _Inverse.of(total, unit, priors)
+    inverse = Inverse.of(total, information.given)
     white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
-    independent = inverse.sandwiched(white, priors)
-    clustered = inverse.sandwiched(_score_products(information, unit), priors)
-    ratio = np.diag(clustered) / np.diag(independent) - np.sqrt(
-        2.0 / _effective_stretches(information, inverse.matrix)
-    )
-    inflation = np.sqrt(np.maximum(ratio, 1.0))
+    independent = inverse.sandwiched(white, information.given)
+    meat, freedom = _scatter(stretches_of(information), total)
+    nothing = np.zeros_like(total)
+    clustered = np.diag(inverse.sandwiched(meat, nothing)) * as_normal(freedom) ** 2
+    clustered = clustered + np.diag(inverse.sandwiched(nothing, information.given))
+    inflation = np.sqrt(np.maximum(clustered / np.diag(independent), 1.0))
     data = information.data + information.prior / WIDE**2
-    data_inverse = _Inverse.of(
-        data, 1.0 / np.sqrt(np.diag(data)), information.prior / WIDE**2
-    ).matrix
+    data_inverse = Inverse.of(data, information.prior / WIDE**2).matrix
     matrix = independent * np.outer(inflation, inflation)
     beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse.matrix))
     return Covariance(
@@ -94,80 +110,39 @@ def covariance_of(information: FisherInformation) -> Covariance:
     )
 
 
-def _effective_stretches(information: FisherInformation, inverse: Array) -> Array:
-    """Return the number (K,) of stretches with equal information that each parameter amounts to."""
-    along = inverse / np.diag(inverse)
-    by_stretch = np.einsum("pk,clbpq,qk->lbk", along, information.blocks, along, optimize=True)
-    by_stretch = by_stretch.reshape(-1, len(inverse))
-    squares = np.maximum((by_stretch**2).sum(axis=0), 1e-300)
-    return np.asarray(np.maximum(by_stretch.sum(axis=0) ** 2 / squares, 1.0))
+def as_normal(freedom: Array) -> Array:
+    """Return how much wider (K,) Student's t is than a normal distribution, at 95 %.
 
-
-@dataclass(frozen=True)
-class _Inverse:
-    """The inverse of a positive definite matrix whose diagonal spans many powers of ten.
-
-    Attributes
-    ----------
-    unit
-        (K,) that scales the matrix to a unit diagonal.
-    values, vectors
-        (K,) and (K, K) eigenvalues and eigenvectors of the scaled matrix.
-    rounded
-        (K,) along which of them the flights only leave rounding errors. However much they know of
-        the rest, the rounding errors of that are no knowledge: the prior alone counts there.
+    With so many degrees of freedom; a standard error times this says the same 95 % interval.
     """
-
-    unit: Array
-    values: Array
-    vectors: Array
-    rounded: NDArray[np.bool_]
-
-    @staticmethod
-    def of(matrix: Array, unit: Array, prior: Array) -> _Inverse:
-        """Return the inverse of information (K, K), of which ``prior`` is no sum over flights."""
-        scale = np.outer(unit, unit)
-        values, vectors = np.linalg.eigh(matrix * scale)
-        along = np.einsum("pk,pq,qk->k", vectors, prior * scale, vectors, optimize=True)
-        rounded = values < ROUNDING * values.max()
-        values = np.where(rounded, np.maximum(along, 1e-30 * values.max()), values)
-        return _Inverse(unit, values, vectors, rounded)
-
-    @property
-    def matrix(self) -> Array:
-        """The inverse (K, K)."""
-        scale = np.outer(self.unit, self.unit)
-        return np.asarray((self.vectors / self.values) @ self.vectors.T * scale)
-
-    def sandwiched(self, meat: Array, priors: Array) -> Array:
-        """Return H⁻¹ (meat + priors) H⁻¹, the flights' meat without rounding errors."""
-        scale = np.outer(self.unit, self.unit)
-        from_flights = self.vectors.T @ (meat * scale) @ self.vectors
-        from_flights[self.rounded] = 0.0
-        from_flights[:, self.rounded] = 0.0
-        inside = from_flights + self.vectors.T @ (priors * scale) @ self.vectors
-        divided = inside / np.outer(self.values, self.values)
-        return np.asarray(self.vectors @ divided @ self.vectors.T * scale)
+    wide = stats.t.ppf(0.975, np.maximum(freedom, FEWEST_FREEDOM))
+    return np.asarray(wide / stats.norm.ppf(0.975))
 
 
-def _score_products(information: FisherInformation, unit: Array) -> Array:
-    """Return the sum (K, K) over stretches of the corrected scores' outer products, the "meat"."""
-    total = information.total * np.outer(unit, unit)
-    factor = np.linalg.cholesky(total + 1e-13 * np.eye(len(total)))
-    blocks = information.blocks.sum(axis=0) * np.outer(unit, unit)
-    score = information.score.sum(axis=0) * unit
-    products = np.zeros_like(total)
-    for segment in range(score.shape[0]):
-        for block in range(score.shape[1]):
-            if not np.any(blocks[segment, block]):
-                continue
-            leverage = np.linalg.solve(factor, blocks[segment, block])
-            leverage = np.linalg.solve(factor, leverage.T)
-            values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.T))
-            remaining = np.sqrt(1.0 - np.clip(values, 0.0, MAX_LEVERAGE))
-            whitened = vectors @ (
-                (vectors.T @ np.linalg.solve(factor, score[segment, block])) / remaining
-            )
-            corrected = factor @ whitened
-            products += np.outer(corrected, corrected)
-    return np.asarray(products / np.outer(unit, unit))
+def _scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
+    """Return the sum (K, K) over stretches of the corrected scores' outer products, the "meat".
+
+    And the degrees of freedom (K,) of the variances that it gives: were the scores' covariances
+    the stretches' information, less what the fit takes out, those would be quadratic forms whose
+    first two moments are those of a χ² with so many.
+    """
+    unit = 1.0 / np.sqrt(np.diag(total))
+    scale = np.outer(unit, unit)
+    factor = np.linalg.cholesky(total * scale + 1e-13 * np.eye(len(total)))
+    white = np.linalg.inv(factor)
+    leverage = white @ (stretches.information * scale) @ white.T
+    values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.transpose(0, 2, 1)))
+    correct = (vectors / np.sqrt(1.0 - np.clip(values, 0.0, MAX_LEVERAGE))[:, None]) @ (
+        vectors.transpose(0, 2, 1)
+    )
+    corrected = np.einsum("nij,nj->ni", correct, (stretches.score * unit) @ white.T) @ factor.T
+    meat = corrected.T @ corrected / scale
+
+    weight = correct @ white  # how each variance weighs the scores
+    taken = leverage @ weight
+    own = np.einsum("nik,nik->nk", weight, taken)
+    squares = np.einsum("nik,nik->nk", taken, taken)
+    together = np.einsum("nik,njk->kij", taken, taken, optimize=True)
+    mean = own.sum(axis=0) - squares.sum(axis=0)
+    half_variance = (own**2 - 2.0 * own * squares).sum(axis=0) + (together**2).sum(axis=(1, 2))
+    return np.asarray(meat), np.asarray(mean**2 / np.maximum(half_variance, 1e-300))

@@ -15,7 +15,9 @@ from tuner.coefficients.space import Parameter, Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.directions import Direction, weakest
+from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.information import FisherInformation, information_at
+from tuner.uncertainty.parts import Spread, spread_of
 from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judge
 
 Array = NDArray[np.float64]
@@ -35,6 +37,8 @@ class Estimate:
         logarithmic ones) and inside the bounds.
     verdict, reason
         How well it is known and why.
+    parts
+        What the standard error is made of.
     """
 
     value: float
@@ -42,6 +46,7 @@ class Estimate:
     ci95: tuple[float, float]
     verdict: Verdict
     reason: Reason
+    parts: ErrorParts
 
     @property
     def identifiable(self) -> bool:
@@ -111,9 +116,11 @@ def uncertainty_at(
     """Return how well the coefficients are known, from the information at a search vector (K,)."""
     scaled = np.asarray(space.scaled(jnp.asarray(vector)))
     reference = references(space, vector)
-    covariance = covariance_of(information)
+    of_residuals = covariance_of(information)
+    spread = spread_of(information, of_residuals.error, _lags(space, scaled))
+    covariance = of_residuals.widened(spread.quoted)
     shares, prior_share = _shares(information, len(flights))
-    directions = weakest(covariance.data_only, reference, space.names)
+    directions = weakest(covariance.shape, reference, space.names)
     estimates: dict[str, Estimate] = {}
     for index, parameter in enumerate(space.parameters):
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
@@ -135,8 +142,8 @@ def uncertainty_at(
             bound=_bound(parameter, scaled[index]),
         )
         judgement = judge(precision, directions)
-        error = covariance.error[index]
-        estimates |= _estimates(space, index, scaled[index], error, judgement=judgement)
+        known = scaled[index], spread.quoted[index]
+        estimates |= _estimates(space, index, known, judgement=judgement, spread=spread)
     return Uncertainty(
         estimates=estimates,
         names=space.names,
@@ -151,10 +158,15 @@ def uncertainty_at(
 
 
 def _estimates(
-    space: Space, index: int, scaled: float, error: float, *, judgement: tuple[Verdict, Reason]
+    space: Space,
+    index: int,
+    known: tuple[float, float],
+    *,
+    judgement: tuple[Verdict, Reason],
+    spread: Spread,
 ) -> dict[str, Estimate]:
     """Return the estimates of one parameter's coefficients: the first and those tied to it."""
-    parameter, (verdict, reason) = space.parameters[index], judgement
+    parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, known
     low, high = (
         space.from_scaled(index, float(np.clip(scaled + side * error, *_limits(parameter))))
         for side in (-QUANTILE, QUANTILE)
@@ -169,9 +181,20 @@ def _estimates(
             ci95=(low * ratio, high * ratio),
             verdict=verdict if name == parameter.name else Verdict.TIED,
             reason=reason if name == parameter.name else tied,
+            parts=spread.of(index, slope * ratio),
         )
         for name, ratio in parameter.ratios.items()
     }
+
+
+def _lags(space: Space, scaled: Array) -> Array:
+    """Return how far each scaled coordinate (K,) moves for each s by which a rotor's lag is longer.
+
+    What the set-up delays it shifts in time, in no simulator's steps.
+    """
+    rows = [COEFFICIENTS[name] for name in space.names]
+    is_lag = np.array([row.unit == "s" and row.scope == "vehicle" for row in rows])
+    return np.asarray(is_lag / np.where(space.is_log, np.exp(np.where(is_lag, scaled, 0.0)), 1.0))
 
 
 def references(space: Space, vector: Array) -> Array:

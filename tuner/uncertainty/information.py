@@ -7,8 +7,9 @@ concerns the coefficients alone and can be added up over any part of the data.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,8 +45,14 @@ class FisherInformation:
         (K, K): what the priors of the coefficients contribute.
     crashed
         (F,) which simulated segments crashed.
+    begins
+        (F,) s since the flights' starts at which the segments begin.
+    scale
+        (C, F) factors on the standard deviations of the measurement noise that residuals have.
     ground
         (K, K): what ground measurements contribute, as data of their own; None without.
+    changes
+        What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
     """
 
     channels: tuple[str, ...]
@@ -56,7 +63,10 @@ class FisherInformation:
     nuisance_prior: Array
     prior: Array
     crashed: NDArray[np.bool_]
+    begins: Array
+    scale: Array
     ground: Array | None = None
+    changes: Mapping[str, Array] = field(default_factory=dict)
 
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
@@ -74,7 +84,13 @@ class FisherInformation:
             nuisance_prior=np.sum([part.nuisance_prior for part in parts], axis=0),
             prior=first.prior,
             crashed=np.concatenate([part.crashed for part in parts]),
+            begins=np.concatenate([part.begins for part in parts]),
+            scale=np.concatenate([part.scale for part in parts], axis=1),
             ground=first.ground,
+            changes={
+                name: np.concatenate([part.changes[name] for part in parts])
+                for name in first.changes
+            },
         )
 
     @property
@@ -87,6 +103,12 @@ class FisherInformation:
     def total(self) -> Array:
         """The information (K, K) of flights, ground measurements and priors."""
         return np.asarray(self.data + self.prior)
+
+    @property
+    def given(self) -> Array:
+        """The part (K, K) of the total that is no sum over flights: its noise is as it says."""
+        priors = self.prior + self.nuisance_prior
+        return np.asarray(priors if self.ground is None else priors + self.ground)
 
 
 def information_at(
@@ -121,9 +143,13 @@ def information_from_jacobian(
     jacobian: Jacobian,
     *,
     offsets_fitted: NDArray[np.bool_] | None = None,
+    otherwise: Mapping[str, Mapping[str, Array]] = MappingProxyType({}),
     block: float = BLOCK,
 ) -> FisherInformation:
-    """Return the information of a Jacobian; see `information_at`."""
+    """Return the information of a Jacobian; see `information_at`.
+
+    ``otherwise``: what might be simulated differently -> channel -> (n, k, F) residuals then.
+    """
     count, segments = len(objective.space), objective.segments.count
     channels = tuple(jacobian.residuals)
     blocks = _block_count(objective, criterion, block)
@@ -132,6 +158,7 @@ def information_from_jacobian(
     information = np.zeros((len(channels), segments, blocks, size, size))
     score = np.zeros((len(channels), segments, blocks, size))
     spread = np.ones((len(channels), segments))
+    changes = {name: np.zeros((segments, size)) for name in otherwise}
     for number, channel in enumerate(channels):
         columns = np.asarray(jacobian.columns[channel])
         residuals = np.asarray(jacobian.residuals[channel])
@@ -149,10 +176,15 @@ def information_from_jacobian(
                 weighted = columns_inside * robust[inside].ravel()
                 information[number, segment, index] = weighted @ columns_inside.T
                 score[number, segment, index] = weighted @ error[inside].ravel()
+            for name, others in otherwise.items():
+                change = others[channel][..., segment] / scale[segment] - error
+                changes[name][segment] += rows.reshape(size, -1) @ (robust * change).ravel()
             compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=0)
             if compared.any():
                 spread[number, segment] = np.mean((robust * error**2)[compared])
-    sums = _Sums(channels, information, score, spread)
+    flight = np.asarray(objective.segments.flight)
+    scales = np.stack([np.asarray(criterion.scale[channel])[flight] for channel in channels])
+    sums = _Sums(channels, information, score, spread, scales, changes)
     fitted = np.asarray(point.offsets) != 0.0 if offsets_fitted is None else offsets_fitted
     return _without_nuisances(
         objective,
@@ -172,6 +204,8 @@ class _Sums:
     blocks: Array
     score: Array
     spread: Array
+    scale: Array
+    changes: Mapping[str, Array]
 
 
 def _block_count(objective: Objective, criterion: Criterion, block: float) -> int:
@@ -221,6 +255,12 @@ def _without_nuisances(
         nuisance_prior=nuisance_prior,
         prior=np.diag(float(criterion.prior) ** 2 / space.prior_sd**2),
         crashed=crashed,
+        begins=objective.segments.begins,
+        scale=sums.scale,
+        changes={
+            name: np.einsum("lap,lp->la", eliminate, change * stretch)
+            for name, change in sums.changes.items()
+        },
         ground=None
         if space.joint_rows is None
         else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,

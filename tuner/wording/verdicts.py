@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from tuner.coefficients import scale_group
 from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
+from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.verdict import QUANTILE, Reason, ReasonCode, Verdict
 from tuner.wording.phrases import listed, percent, quantity
 
 
@@ -41,6 +42,25 @@ def reason_in_words(reason: Reason) -> str:
     if reason.given_held is not None:
         phrase += f"; fitted with {reason.given_held} held at its initial value"
     return phrase
+
+
+def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
+    """Return what half of a 95 % interval would be from each cause alone.
+
+    In ``unit``; in shares of ``value`` where that is None.
+    """
+    named = {
+        "noise alone": parts.noise,
+        "residuals": parts.residuals,
+        "left-out flights": parts.left_out,
+        "step": parts.step,
+    }
+    size = 1.0 if unit is not None else max(abs(value), 1e-300)
+    return ", ".join(
+        f"{cause} ±{quantity(QUANTILE * error / size, unit)}"
+        for cause, error in named.items()
+        if error
+    )
 
 
 def _main_clause(reason: Reason) -> str:

@@ -25,6 +25,8 @@ def regression(noise: np.ndarray, design: np.ndarray) -> tuple[FisherInformation
         nuisance_prior=np.zeros((COUNT, COUNT)),
         prior=1e-9 * np.eye(COUNT),
         crashed=np.zeros(1, bool),
+        begins=np.zeros(1),
+        scale=np.ones((1, 1)),
     )
     return information, fit
 
@@ -60,14 +62,14 @@ def test_the_standard_error_is_the_spread_of_repeated_fits(memory: float) -> Non
     assert np.median(errors, axis=0) == pytest.approx(spread, rel=0.2)
 
 
-def test_white_noise_widens_hardly_anything() -> None:
+def test_white_noise_widens_by_what_few_stretches_leave_open() -> None:
     generator = np.random.default_rng(5)
     design = smooth_design(2)
     covariances = [
         covariance_of(regression(generator.normal(size=BLOCKS * LENGTH), design)[0])
         for _ in range(50)
     ]
-    assert np.median([covariance.inflation for covariance in covariances]) < 1.05
+    assert np.median([covariance.inflation for covariance in covariances]) < 1.2
     assert min(covariance.inflation.min() for covariance in covariances) >= 1.0
 
 

@@ -5,8 +5,14 @@ from __future__ import annotations
 import pytest
 
 from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict
-from tuner.wording.verdicts import direction_in_words, judgement_in_words, reason_in_words
+from tuner.wording.verdicts import (
+    direction_in_words,
+    judgement_in_words,
+    parts_in_words,
+    reason_in_words,
+)
 
 COMMON_SCALE = Direction(
     moves={"mass": 1.0, "inertia_xx": 1.0, "motor_constant": 1.0},
@@ -32,6 +38,14 @@ def test_an_interval_with_everything_that_bears_on_it() -> None:
         "from estimate_latency (correlation +0.95); residuals are not white noise, which widens "
         "the interval 5.0 times; the fit ended at its lower bound"
     )
+
+
+def test_the_parts_of_an_interval() -> None:
+    parts = ErrorParts(noise=4e-6, residuals=3e-5, left_out=1.5e-5, step=None)
+    assert parts_in_words(parts, None, 0.02) == (
+        "noise alone ±0.039 %, residuals ±0.29 %, left-out flights ±0.15 %"
+    )
+    assert parts_in_words(parts, "s", 0.02).startswith("noise alone ±0.0078 ms")
 
 
 def test_an_interval_in_its_unit() -> None:

@@ -10,8 +10,13 @@ from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.result import CoefficientResult
-from tuner.uncertainty.verdict import Verdict
-from tuner.wording.verdicts import judgement_in_words, reason_in_words, verdict_in_words
+from tuner.uncertainty.verdict import ReasonCode, Verdict
+from tuner.wording.verdicts import (
+    judgement_in_words,
+    parts_in_words,
+    reason_in_words,
+    verdict_in_words,
+)
 
 #: Verdict -> class of its badge, sign before it and colour of its bar.
 VERDICTS = {
@@ -59,6 +64,9 @@ def coefficients(contents: Contents) -> Section | None:
 
 def _fitted(name: str, result: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
     reason = reason_in_words(result.reason)
+    if result.reason.code is ReasonCode.INTERVAL and result.std_error_parts is not None:
+        words = parts_in_words(result.std_error_parts, result.reason.unit, result.best)
+        reason = f"{reason}; {words}"
     if not result.fitted and known is not None:
         judgement = judgement_in_words(known.verdict, known.reason)
         reason = f"were it fitted with the others: {judgement}"

@@ -1,0 +1,31 @@
+"""What the standard error of a coefficient is made of, as data."""
+
+from __future__ import annotations
+
+from tuner.files import FiniteOrNone, Part
+
+
+class ErrorParts(Part):
+    """Standard errors of one coefficient, in its unit; the quoted one holds all of them.
+
+    Each is that of a normal distribution with the 95 % interval that is meant, which Student's t
+    widens where few stretches of time or few flights speak.
+
+    Attributes
+    ----------
+    noise
+        Were measurement noise alone in the residuals.
+    residuals
+        With all that is in them: disturbances and what the model lacks.
+    left_out
+        As the estimate moves when flights are left out in turn (parts of them where they are few);
+        None where there is one alone.
+    step
+        Its move when the physics step is halved, and for a rotor's lag half of the finest step in
+        which simulators take it; None where that was not asked.
+    """
+
+    noise: FiniteOrNone
+    residuals: FiniteOrNone
+    left_out: FiniteOrNone = None
+    step: FiniteOrNone = None

@@ -1,0 +1,119 @@
+"""What a standard error is made of: noise, residuals, flights that disagree, physics steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.objective.alternatives import STEP
+from tuner.uncertainty.covariance import as_normal
+from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.information import FisherInformation
+from tuner.uncertainty.inverse import Inverse
+from tuner.uncertainty.stretches import parts_of
+
+Array = NDArray[np.float64]
+
+SIMULATORS_STEP = 1.0 / 4000.0
+"""s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
+step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order."""
+TELLS = 1e-3
+"""Share of a variance by which it must grow without a flight that tells of the coefficient."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The parts of K standard errors in the scaled coordinates, each (K,); None where unknown."""
+
+    noise: Array
+    residuals: Array
+    left_out: Array | None
+    step: Array | None
+
+    @property
+    def quoted(self) -> Array:
+        """The honest standard error (K,).
+
+        Noise, residuals and left-out flights show the same errors in three ways, of which the
+        largest counts; what steps do comes on top.
+        """
+        error = np.maximum(self.noise, self.residuals)
+        if self.left_out is not None:
+            error = np.maximum(error, self.left_out)
+        return error if self.step is None else np.hypot(error, self.step)
+
+    def of(self, index: int, slope: float) -> ErrorParts:
+        """Return the parts of one parameter's coefficient, which changes by a slope with it."""
+        parts = {
+            name: None if part is None else float(abs(slope) * part[index])
+            for name, part in vars(self).items()
+        }
+        return ErrorParts(**parts)
+
+
+def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> Spread:
+    """Return the parts of the errors.
+
+    Parameters
+    ----------
+    information
+        Of the fit.
+    residuals
+        (K,) standard errors with all that is in the residuals.
+    lags
+        (K,) how far a parameter moves for each s by which a lag is longer; zero for what is none.
+    """
+    inverse = Inverse.of(information.total, information.given)
+    moved = {
+        name: np.abs(inverse.matrix @ change.sum(axis=0))
+        for name, change in information.changes.items()
+    }
+    if STEP in moved:
+        moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0)
+    return Spread(
+        noise=noise_alone(information),
+        residuals=residuals,
+        left_out=left_out(information),
+        step=moved.get(STEP),
+    )
+
+
+def noise_alone(information: FisherInformation) -> Array:
+    """Return the standard errors (K,) were the residuals measurement noise alone."""
+    flights = np.einsum("cf,cfbpq->pq", information.scale**2, information.blocks)
+    noisy = Inverse.of(flights + information.given, information.given).matrix
+    return np.asarray(np.sqrt(np.diag(noisy)))
+
+
+def left_out(information: FisherInformation) -> Array | None:
+    """Return the standard errors (K,) that leaving flights out in turn speaks for.
+
+    Without a flight the estimate moves by δ = (H - H_i)⁻¹ g_i, one Gauss-Newton step; if H were
+    right, the covariance of δ would be (H - H_i)⁻¹ - H⁻¹. The mean of the ratio of their squares
+    scales the errors that H speaks for; a flight counts by how much it tells of the coefficient.
+    (The plain jackknife takes all flights for alike, and one that alone tells of a coefficient for
+    one that contradicts the others.) Errors that last for a whole flight show here alone; Student's
+    t allows for how few the flights are.
+    """
+    parts = parts_of(information)
+    if parts.count == 1:
+        return None
+    total = information.total
+    inverse = Inverse.of(total, information.given)
+    known = np.diag(inverse.matrix)
+    weights, squares = np.zeros_like(parts.score), np.zeros_like(parts.score)
+    for number in range(parts.count):
+        without = Inverse.of(total - parts.information[number], information.given).matrix
+        expected = np.maximum(np.diag(without) - known, 0.0)
+        tells = expected > TELLS * known
+        moved = (without @ parts.score[number]) ** 2
+        weights[number] = np.where(tells, expected / (expected + known), 0.0)
+        squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
+    of_all = np.maximum(weights.sum(axis=0), 1e-300)
+    beyond = (weights * squares).sum(axis=0) / of_all
+    freedom = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
+    given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
+    from_flights = np.maximum(known - given, 0.0) * beyond * as_normal(freedom) ** 2
+    return np.asarray(np.sqrt(from_flights + given))
