@@ -15,6 +15,7 @@ from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import PyTree
 from numpy.typing import NDArray
 
+from tuner.kept_programs import kept
 from tuner.padding import FINE, padded_size
 
 _AXIS = "batch"
@@ -46,7 +47,7 @@ def _padded(tree: PyTree[Array], missing: int) -> PyTree[Array]:
 
 
 def over_devices(
-    function: Callable[..., PyTree[Array]], *, devices: int | None = None
+    function: Callable[..., PyTree[Array]], *, devices: int | None = None, name: object = None
 ) -> Callable[..., PyTree[Array]]:
     """Return a function of a batch compiled for all devices, each of which takes its share.
 
@@ -63,13 +64,16 @@ def over_devices(
         Members of the batch must not depend on each other. It may itself be a Jacobian.
     devices
         How many devices to use; all of the default backend by default.
+    name
+        All that the function depends on beside its arguments and its source, as texts, numbers and
+        data classes: what is traced is then kept on disk, see `tuner.kept_programs`.
 
     Returns
     -------
     callable
         The same function, not to be used under jax's transformations; its leaves are numpy arrays.
     """
-    compiled = lru_cache(maxsize=8)(lambda count: jax.jit(shared_among(function, count)))
+    compiled = lru_cache(maxsize=8)(lambda count: jax.jit(shared_among(function, count, name)))
 
     @wraps(function)
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
@@ -83,14 +87,14 @@ def over_devices(
 
 
 def shared_among(
-    function: Callable[..., PyTree[Array]], count: int
+    function: Callable[..., PyTree[Array]], count: int, name: object = None
 ) -> Callable[..., PyTree[Array]]:
     """Return a function of a batch, to be compiled, that so many devices share equally.
 
-    What it returns stays with the devices. ``function`` is as for `over_devices`; the size of the
-    batch must be a multiple of ``count``.
+    What it returns stays with the devices. ``function`` and ``name`` are as for `over_devices`; the
+    size of the batch must be a multiple of ``count``.
     """
-    if count == 1:
+    if count == 1 and name is None:
         return function
 
     def over_all(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
@@ -100,7 +104,12 @@ def shared_among(
             ),
             batch,
         )
-        traced, shapes = _traced(function, share, *whole)
+        arguments = (share, *whole)
+        traced, shapes = (None if name is None else kept(function, name, arguments)) or _traced(
+            function, *arguments
+        )
+        if count == 1:
+            return traced(batch, *whole)
         return jax.shard_map(
             traced,
             mesh=Mesh(np.array(jax.devices()[:count]), (_AXIS,)),

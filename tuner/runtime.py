@@ -123,6 +123,14 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
     logger.debug("%s", describe())
 
 
+def keeps_compiled() -> bool:
+    """Return whether compiled code is kept in this program's own folder."""
+    import jax  # noqa: PLC0415 (slow to import)
+
+    kept: str | None = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    return kept == str(cache_folder() / "compiled")
+
+
 def describe() -> str:
     """Return one line on the settings in force, to stand beside every measured figure."""
     import jax  # noqa: PLC0415 (slow to import)

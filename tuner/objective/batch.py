@@ -103,4 +103,5 @@ def _shared(simulator: Simulator) -> Callable[..., Batch]:
         batch: Batch = jax.vmap(at)(vectors)
         return batch
 
-    return over_devices(in_pieces(segmentwise, max(1, piece_that_fits(8) // CHUNK)))
+    pieces = in_pieces(segmentwise, max(1, piece_that_fits(8) // CHUNK))
+    return over_devices(pieces, name=("many points", simulator))

@@ -196,7 +196,7 @@ def _shared_jacobian(simulator: Simulator) -> Callable[..., Jacobian]:
         jacobian: Jacobian = pieces(data, *rest)
         return jacobian
 
-    return over_devices(segmentwise)
+    return over_devices(segmentwise, name=("jacobian", simulator))
 
 
 @lru_cache(maxsize=16)
@@ -219,4 +219,4 @@ def _shared_sums(simulator: Simulator, derivatives: bool) -> Callable[..., Segme
         sums: SegmentSums = pieces(data, *rest)
         return sums
 
-    return over_devices(segmentwise)
+    return over_devices(segmentwise, name=("sums", simulator, derivatives))
