@@ -9,7 +9,7 @@ by a fit to the others, is then met better by more than the scatter.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -38,7 +38,7 @@ from tuner.selection.candidates import (
     with_terms,
 )
 from tuner.selection.linear import Linear, linear_at
-from tuner.selection.prediction import offsets_fitted, predicted_losses
+from tuner.selection.prediction import offsets_fitted, predicted_losses, vector_after
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.spans import span
@@ -223,13 +223,18 @@ class _Selection:
 
         Where something is missing the base fit lies anywhere, and what little it shows of the
         missing terms picks those that stand in for them. So the search begins again where it
-        began, with every candidate in the model.
+        began, with every candidate in the model but those that describe as a whole what others do
+        one by one: beside them nothing else would seem needed, and noise would choose. They are
+        added if something is left to explain.
         """
+        groups = {
+            group: names for group, names in self.candidates.items() if not is_stand_in(group)
+        }
         self.on_message(
             f"The flights call for more than the base model: searching again with all "
-            f"{len(self.candidates)} groups of terms, to see which can go."
+            f"{len(groups)} groups of terms, to see which can go."
         )
-        rough = self._refitted(base, self.candidates, anew=True)
+        rough = self._refitted(base, groups, anew=True)
         trial = self._pruned(rough)
         if trial is rough:
             trial = self._refitted(rough, rough.added)
@@ -265,7 +270,28 @@ class _Selection:
         if not taken or not kept:
             return state if kept else replace(state, added={})
         self.on_message(f"Fitting again without {listed(tuple(taken))}.")
-        return self._pruned(self._refitted(state, {name: self.candidates[name] for name in kept}))
+        groups = {name: self.candidates[name] for name in kept}
+        return self._pruned(self._refitted(self._without(state, taken), groups))
+
+    def _without(self, state: _State, taken: Collection[str]) -> _State:
+        """Return a fit moved to where, to first order, the others end without some groups.
+
+        They have to make up for what is taken away: from where they are, whole flights would lead
+        them astray.
+        """
+        space, linear = state.fitted.objective.space, state.linear
+        gone = self._columns(_names({name: self.candidates[name] for name in taken}))
+        kept = {name: names for name, names in state.added.items() if name not in taken}
+        away = np.zeros(len(linear.scaled))
+        away[gone] = (self._neutral - linear.scaled)[gone]
+        free = self._columns([*self.job.space.names, *_names(kept)])
+        everything = np.ones(len(linear.flight), bool)
+        change = linear.step(free, inside=everything, from_=away)[self._columns(space.names)]
+        point = Point(
+            jnp.asarray(vector_after(space, state.fitted.point.coefficients, change)),
+            state.fitted.point.offsets,
+        )
+        return replace(state, fitted=replace(state.fitted, point=point))
 
     def _refitted(self, state: _State, groups: Groups, *, anew: bool = False) -> _State:
         """Return the fit with exactly these groups, from where the last one ended or anew."""

@@ -11,13 +11,14 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
+from tuner.coefficients.space import Space
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.search.fitted import Fitted
 from tuner.selection.linear import Columns, Linear
 
 LONGEST_STEP = 1.0
-"""Standard deviations of a prior that a coefficient may move when a flight is left out."""
+"""Standard deviations of a prior that a coefficient may move in one linear step."""
 
 
 def predicted_losses(
@@ -42,9 +43,7 @@ def predicted_losses(
     movable, vectors = offsets_fitted(fitted), []
     for number in range(objective.flights):
         change = linear.step(model, inside=linear.flight != number)[own]
-        far = LONGEST_STEP * space.prior_sd
-        scaled = linear.scaled[own] + np.clip(change, -far, far)
-        vectors.append(space.at_share((scaled - space.lower) / space.width))
+        vectors.append(vector_after(space, fitted.point.coefficients, change))
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
     points = Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets))
     of_each, losses = sums_at(objective, points, criterion), []
@@ -54,6 +53,13 @@ def predicted_losses(
         loss = float(np.asarray(sums.loss)[inside].sum())
         losses.append(loss - _gain_of_offsets(sums, inside, len(space), movable[:, number]))
     return np.array(losses)
+
+
+def vector_after(space: Space, vector: Array, change: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the search vector (K,) after a change of the scaled coordinates, inside the bounds."""
+    far = LONGEST_STEP * space.prior_sd
+    scaled = np.asarray(space.scaled(jnp.asarray(vector))) + np.clip(change, -far, far)
+    return np.asarray(space.at_share((scaled - space.lower) / space.width))
 
 
 def offsets_fitted(fitted: Fitted) -> NDArray[np.bool_]:
