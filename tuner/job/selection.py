@@ -8,10 +8,8 @@ by a fit to the others, is then met better by more than the scatter.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,11 +17,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.findings import Finding
 from tuner.job.extension import extended
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
-from tuner.job.search import OnProgress, free_offsets, search
+from tuner.job.search import OnProgress, free_offsets
 from tuner.model import with_coefficients
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
@@ -32,7 +29,6 @@ from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
 from tuner.selection.candidates import (
     Groups,
-    candidate_groups,
     is_stand_in,
     start_of,
     with_terms,
@@ -41,7 +37,6 @@ from tuner.selection.linear import Linear, linear_at
 from tuner.selection.prediction import offsets_fitted, predicted_losses, vector_after
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
-from tuner.spans import span
 from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 4
@@ -62,82 +57,6 @@ class Selected:
     job: Job
     fitted: Fitted
     rows: tuple[SelectionRow, ...] = ()
-
-
-def search_with_terms(
-    job: Job,
-    folder: Path,
-    *,
-    resume: bool,
-    on_progress: OnProgress,
-    on_message: Callable[[str], None],
-    findings: tuple[Finding, ...] = (),
-) -> Selected:
-    """Look for the best coefficients of a job, and for the terms that its flights call for.
-
-    Where most flights are far off, terms are tried before the base model is polished, and before
-    CMA-ES looks for another beginning. Arguments and errors are those of `search`.
-    """
-
-    def searched(*, resume: bool, provisional: bool) -> Selected:
-        with span("search"):
-            fitted = search(
-                job,
-                folder,
-                resume=resume,
-                on_progress=on_progress,
-                findings=findings,
-                provisional=provisional,
-            )
-        with span("selection of terms"):
-            return with_terms_selected(job, fitted, on_progress, on_message)
-
-    selected = searched(resume=resume, provisional=bool(candidates_of(job)))
-    if selected.fitted.polished:
-        return selected
-    return searched(resume=True, provisional=False)
-
-
-def with_terms_selected(
-    job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
-) -> Selected:
-    """Return the fit with the terms that the job names, or that the flights speak for.
-
-    A job that says exactly what is free names no others, unless its ``terms`` do.
-    """
-    clock = time.perf_counter()
-    selected = _selected(job, fitted, on_progress, on_message)
-    spent = time.perf_counter() - clock
-    return replace(selected, fitted=replace(selected.fitted, wall_time=fitted.wall_time + spent))
-
-
-def _selected(
-    job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
-) -> Selected:
-    if not isinstance(job.settings.job.terms, str):
-        return Selected(job, fitted, _first_rows(job, SelectionCode.ASKED_FOR))
-    candidates = candidates_of(job)
-    if not candidates:
-        return Selected(job, fitted)
-    selected = _Selection(job, fitted, candidates, on_progress, on_message).run()
-    first = _first_rows(job, SelectionCode.HOVERS_TILTED)
-    return replace(selected, rows=(*first, *selected.rows))
-
-
-def candidates_of(job: Job) -> Groups:
-    """Return the groups among which a job's flights choose: none where it says what is free."""
-    settings = job.settings.job
-    if settings.terms != "auto" or settings.free is not None:
-        return {}
-    return candidate_groups(job.settings.vehicle, job.space, settings)
-
-
-def _first_rows(job: Job, reason: SelectionCode) -> tuple[SelectionRow, ...]:
-    """Return the rows of the terms that the search began with."""
-    return tuple(
-        SelectionRow(group=group, names=names, kept=True, reason=reason)
-        for group, names in job.first_terms.items()
-    )
 
 
 @dataclass(frozen=True)
@@ -166,8 +85,8 @@ class _State:
 
 
 @dataclass(frozen=True)
-class _Selection:
-    """A forward selection over some groups, each round pruned backwards.
+class Selection:
+    """A selection among some groups, each round pruned backwards.
 
     Base model and all candidates make up one space, and all terms are computed whichever are in
     the model: fits with different terms then share their compiled programs.

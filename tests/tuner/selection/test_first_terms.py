@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.selection.making import BASE, hovering, job_with
 from tuner.config import JobFile
 from tuner.job.first_terms import hover_tilt, with_first_terms
-from tuner.job.selection import with_terms_selected
+from tuner.job.terms import with_terms_selected
 from tuner.selection.table import SelectionCode
 
 MARKERS = {f"marker_{kind}_{axis}" for kind in ("offset", "tilt") for axis in "xyz"}

@@ -5,7 +5,7 @@ import pytest
 from tests.tuner.selection.making import BASE, job_with
 from tuner.config import JobFile
 from tuner.job import selection
-from tuner.job.selection import with_terms_selected
+from tuner.job.terms import with_terms_selected
 from tuner.selection.table import SelectionCode
 from tuner.uncertainty.estimates import uncertainty_of
 
@@ -47,7 +47,7 @@ def test_no_term_is_added_to_flights_that_lack_none():
 
 @pytest.mark.slow
 def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(monkeypatch):
-    monkeypatch.setattr(selection._Selection, "_predicts_better", lambda *_, **__: False)
+    monkeypatch.setattr(selection.Selection, "_predicts_better", lambda *_, **__: False)
     result, _ = selected(DRAG)
     assert not any(row.kept for row in result.rows)
     reasons = {row.group: row.reason for row in result.rows}
