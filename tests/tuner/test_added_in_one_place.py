@@ -165,11 +165,14 @@ def test_a_coefficient_and_its_term_are_fitted_judged_reported_and_exported(upda
     (inspection,), _ = inspect_recordings([bag])
     assert any(informed.coefficient == NAME for informed in inspection.coefficients)
 
+    job = tmp_path / "job.yaml"
+    job.write_text("terms: none\n")
     run = tuner.fit(
         [bag],
         vehicle=updated,
         controller=ControllerFile(),
         free=[NAME, "rotor_drag_coefficient"],
+        config=job,
         out=tmp_path / "run",
     )
     result = run.result.coefficients[NAME]

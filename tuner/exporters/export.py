@@ -92,7 +92,7 @@ def export(
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
     physical, run = run, in_simulator(run, target)
     vehicle, decided = exported_vehicle(run, today)
-    check_every_coefficient(vehicle, target)
+    check_every_coefficient(physical.vehicle, target)
     line, effective = provenance(run, today, accept), physical.result.effective
     if run is not physical and effective is not None:
         line = f"{what_is_exported(effective)}; {line}"
