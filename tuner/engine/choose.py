@@ -81,6 +81,4 @@ def _quiet_dask() -> None:
     """Have Dask log nothing, unless the user has set that otherwise: what fails is raised."""
     import dask.config  # noqa: PLC0415 (an extra)
 
-    nothing = {"logging": {"distributed": logging.CRITICAL + 1}}
-    with_users_on_top = dask.config.merge(nothing, dask.config.collect())
-    dask.config.update_defaults(with_users_on_top)
+    dask.config.update_defaults({"logging": {"distributed": logging.CRITICAL + 1}})

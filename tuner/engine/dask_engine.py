@@ -109,9 +109,10 @@ class OnDask(Engine):
         try:
             yield
         except KilledWorker as error:
+            ends = error.allowed_failures + 1
             raise EngineError(
                 "workers",
-                f"ended {error.allowed_failures + 1} times over the same task",
+                f"ended {'once' if ends == 1 else f'{ends} times'} over the same task",
                 "give each more memory, as memory: 4GiB in the cluster file, or use fewer",
             ) from None
         except (CancelledError, CommClosedError, TimeoutError, OSError, RuntimeError) as error:

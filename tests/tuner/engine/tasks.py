@@ -49,6 +49,15 @@ def until_stopped(file, report):
         Path(file).touch()
 
 
+def takes_ever_more(_, report):
+    """Take memory until somebody objects, or 4 GiB."""
+    taken = []
+    for number in range(256):
+        taken.append(bytearray(os.urandom(2**12) * 2**12))
+        report(number)
+        time.sleep(0.02)
+
+
 def dies_at_first(file, report):
     """End the process that computes this for the first time."""
     del report

@@ -74,6 +74,39 @@ def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path):
     assert user.returncode == 0
 
 
+GREEDY = """
+import sys
+from tests.tuner.engine import tasks
+from tuner.engine import engine_for
+from tuner.errors import EngineError
+
+if __name__ == "__main__":
+    with engine_for(cluster=sys.argv[1]) as engine:
+        try:
+            engine.map(tasks.takes_ever_more, [None])
+        except EngineError as error:
+            print(error)
+"""
+
+
+@pytest.mark.slow
+def test_a_worker_beyond_its_memory_is_one_line(tmp_path):
+    script, file = tmp_path / "greedy.py", tmp_path / "cluster.yaml"
+    script.write_text(GREEDY)
+    file.write_text("workers: 1\nmemory: 1GiB\n")
+    said = subprocess.run(
+        [sys.executable, str(script), str(file)],
+        env=ENVIRONMENT | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "0"},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    remedy = "give each more memory, as memory: 4GiB in the cluster file, or use fewer"
+    assert said.stdout == f"workers: ended once over the same task; {remedy}\n"
+    assert said.stderr == ""
+
+
 IMPATIENT = """
 import signal
 import sys
