@@ -1,4 +1,7 @@
-"""A server as a process of its own, whose workers fit nothing: ``python -m ... DATA PORT URL``."""
+"""A server as a process of its own: ``python -m ... DATA PORT URL [real]``.
+
+Its workers fit nothing, unless they are to be real ones.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,9 @@ from tuner.service.settings import Limits, ServiceSettings
 
 
 def main() -> None:
-    data, port, database = sys.argv[1:]
-    attempt.WORKER = [sys.executable, str(Path(__file__).with_name("fake_worker.py"))]
+    data, port, database, *real = sys.argv[1:]
+    if not real:
+        attempt.WORKER = [sys.executable, str(Path(__file__).with_name("fake_worker.py"))]
     settings = ServiceSettings(
         Path(data), database=database, limits=Limits(free_bytes=0), lease_seconds=3.0
     )

@@ -41,10 +41,21 @@ def free_port() -> int:
 
 
 @contextmanager
-def server(data: Path, port: int, database: str = "") -> Iterator[subprocess.Popen]:
-    """Start a server, and wait until it answers."""
+def server(
+    data: Path, port: int, database: str = "", *, real: bool = False
+) -> Iterator[subprocess.Popen]:
+    """Start a server, and wait until it answers; its workers fit nothing unless they are real."""
+    worker = ["real"] if real else []
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.tuner.service.serving", str(data), str(port), database],
+        [
+            sys.executable,
+            "-m",
+            "tests.tuner.service.serving",
+            str(data),
+            str(port),
+            database,
+            *worker,
+        ],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
     )
