@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
@@ -18,7 +19,9 @@ from tuner.service.settings import ServiceSettings
 
 EXAMPLES = 25
 """Requests for each operation, and as many that break its description."""
+MANY = 400
 load_all_checks()
+logger = logging.getLogger(__name__)
 NAMES = (
     "not_a_server_error",
     "status_code_conformance",
@@ -39,7 +42,10 @@ def served(tmp_path, table):
     service.close()
 
 
-def test_no_answer_is_a_fault_or_undocumented(served):
+@pytest.mark.parametrize(
+    "examples", [EXAMPLES, pytest.param(MANY, marks=(pytest.mark.slow, pytest.mark.long))]
+)
+def test_no_answer_is_a_fault_or_undocumented(served, examples):
     client, job = served
     schema = schemathesis.openapi.from_url(f"{client.base_url}/api/v1/openapi.json")
     checks = [CHECKS.get_one(name) for name in NAMES]
@@ -57,7 +63,7 @@ def test_no_answer_is_a_fault_or_undocumented(served):
         for mode in (schemathesis.GenerationMode.POSITIVE, schemathesis.GenerationMode.NEGATIVE):
             strategy = operation.as_strategy(generation_mode=mode)
             run = settings(
-                max_examples=EXAMPLES,
+                max_examples=examples,
                 phases=[Phase.generate],
                 suppress_health_check=list(HealthCheck),
                 deadline=None,
@@ -66,6 +72,7 @@ def test_no_answer_is_a_fault_or_undocumented(served):
             # what has no parameters cannot be asked wrongly
             with suppress(Unsatisfiable):
                 run(given(strategy)(ask))()
+    logger.info("%d requests, by status %s", sum(statuses.values()), dict(sorted(statuses.items())))
     assert sum(statuses.values()) > 300
     assert max(statuses) < 500
     assert {200, 404, 422} <= set(statuses)
