@@ -14,18 +14,17 @@ from tuner.cli import main
 
 pytestmark = pytest.mark.slow
 
-#: Commands that are not run, and why; `tests.docs.test_pages` holds that they are understood.
-NOT_RUN = {
-    "tune --flights lab/*.bag --bench runs/bench": "a lab's own flights",
-    "tune sensitivity --flights reference_flights/circle_3mps.bag": "a minute of simulated "
-    "candidates; the tests of the examination make shorter ones",
-    "tune --flights reference_flights/*.bag --cross-validate": "four fits; the engine's tests make "
-    "shorter ones",
-    "tune --flights fleet/": "a fleet",
-    "tune --flights nanobench/*.csv": "public flights that do not ship with the project",
-    "tune --flights reference_flights/*.bag --config runs/quad.job.yaml": "another fit as long as "
-    "the shared one; what its files hold is read instead",
-}
+#: Beginnings of commands that take minutes; they are run with the tests that do.
+LONG = (
+    "tune --flights lab/*.bag --bench runs/bench",
+    "tune sensitivity --flights reference_flights/circle_3mps.bag",
+    "tune --flights reference_flights/*.bag --cross-validate",
+    "tune --flights fleet/",
+    "tune --flights reference_flights/*.bag --config runs/quad.job.yaml",
+)
+#: One that needs flights which do not ship with the project; `tests.tuner.job.test_real_flights`
+#: runs it where they are.
+ELSEWHERE = "tune --flights nanobench/*.csv"
 LENGTHY = ("missing-terms",)
 """Tutorials with a search of their own that takes minutes."""
 FOLLOWED = [
@@ -64,7 +63,7 @@ def test_its_commands_run_and_print_what_it_shows(
     for line in commands(page):
         if line == SHARED:
             shutil.copytree(request.getfixturevalue("demo")[0], place / "runs" / "first")
-        elif not any(line.startswith(start) for start in NOT_RUN):
+        elif not line.startswith((*LONG, ELSEWHERE)):
             assert main(words_of(line)) == 0, line
     printed = capsys.readouterr().out
     for block in blocks(page, "text"):
@@ -97,8 +96,24 @@ def test_the_python_of_the_reference_runs(place: Path, request: pytest.FixtureRe
     exec(compile(block, "python.md", "exec"), {})
 
 
-def test_what_is_not_run_is_still_there() -> None:
+@pytest.mark.long
+@pytest.mark.parametrize("start", LONG, ids=lambda start: start.split()[2])
+def test_a_command_that_takes_minutes_runs(start: str, place: Path) -> None:
+    ((page, line),) = [
+        (page, line) for page in TUTORIALS for line in commands(page) if line.startswith(start)
+    ]
+    for folder in (place / "lab", place / "fleet" / "quad_0001"):
+        folder.mkdir(parents=True)
+        flown = ["--trajectory", "circle", "--speed", "3", "--duration", "12", "--quiet"]
+        assert main(["simulate", *flown, "--out", str(folder / "circle.bag")]) == 0
+    before = commands(page)[: commands(page).index(line)]
+    for needed in (words for words in before if not words.startswith((*LONG, SHARED))):
+        assert main(words_of(needed)) == 0, needed
+    assert main(words_of(line)) == 0
+
+
+def test_what_is_not_followed_is_still_there() -> None:
     every = [line for page in TUTORIALS for line in commands(page)]
-    for start in NOT_RUN:
+    for start in (*LONG, ELSEWHERE):
         assert any(line.startswith(start) for line in every), start
     assert SHARED in every
