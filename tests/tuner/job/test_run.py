@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shutil
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
@@ -207,7 +208,7 @@ def test_a_spin_alone_has_no_position_error(salvaged):
 
 
 @pytest.mark.slow
-def test_an_interrupted_run_goes_on_to_the_same_numbers(broken, salvaged, tmp_path):
+def test_an_interrupted_run_goes_on_elsewhere_to_the_same_numbers(broken, salvaged, tmp_path):
     whole = salvaged[2].result
     iterations = []
 
@@ -221,7 +222,11 @@ def test_an_interrupted_run_goes_on_to_the_same_numbers(broken, salvaged, tmp_pa
         run(job, out=tmp_path / "cut", listener=Listener(on_iteration=interrupt))
     assert (tmp_path / "cut" / "best_fit.yaml").exists()
     assert not (tmp_path / "cut" / "result.json").exists()
-    _, resumed = run(job, out=tmp_path / "cut", resume=True)
+    elsewhere = tmp_path / "another machine"
+    elsewhere.mkdir()
+    shutil.move(tmp_path / "cut", elsewhere)
+    job = Options([str(shutil.copy(broken, elsewhere))], **SHORT)
+    _, resumed = run(job, out=elsewhere / "cut", resume=True)
     for name, coefficient in whole.coefficients.items():
         assert resumed.coefficients[name].best == coefficient.best
     assert resumed.search.evaluations == whole.search.evaluations
