@@ -6,17 +6,38 @@ import json
 import re
 import shlex
 from collections import Counter
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
+from benchmarks.__main__ import PARTS
 from docs.generate.messages import known_messages, sites
 from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
-from tests.docs.pages import PAGES, ROOT, anchors, commands, links, name_of
+from tests.docs.pages import PAGES, ROOT, anchors, blocks, commands, links, name_of
+from tuner.bench.plan import read_bench
 from tuner.cli.app import COMMANDS, app
+from tuner.config import read_controller, read_job, read_vehicle
+from tuner.engine.cluster_file import read_cluster
 from tuner.findings import Code
+from tuner.flights.sidecar import read_sidecar
+from tuner.flights.topics import load_topic_map
 from tuner.result import RunResult
+
+READERS = {
+    "bench-file.md": (read_bench,),
+    "cluster-file.md": (lambda path: read_cluster(str(path)),),
+    "controller-file.md": (read_controller,),
+    "job-file.md": (read_job,),
+    "topic-maps.md": (load_topic_map, read_sidecar),
+    "vehicle-file.md": (read_vehicle,),
+}
+"""Page -> what reads its YAML, in the order in which it stands there."""
+PROGRAM = re.compile(
+    r"`(?:python -m ((?:benchmarks|docs|tests|tuner)[\w.]*)|python (examples/\w+\.py)"
+    r"|pytest (tests/[\w/.]+))([^`]*)`"
+)
 
 EVERY_COMMAND = [(page, line) for page in PAGES for line in commands(page)]
 
@@ -60,6 +81,32 @@ def test_files_that_are_named_exist(page: Path):
         page.read_text(encoding="utf-8"),
     )
     assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "yaml")], ids=name_of)
+def test_yaml_that_is_shown_is_read(page: Path, tmp_path: Path):
+    readers = READERS.get(page.name, ())
+    for text, read in zip(blocks(page, "yaml"), readers, strict=True):
+        shown = tmp_path / "shown.yaml"
+        shown.write_text(text, encoding="utf-8")
+        read(shown)
+
+
+def test_programs_that_are_named_exist():
+    named = [found for page in PAGES for found in PROGRAM.findall(page.read_text("utf-8"))]
+    assert len(named) > 10
+    for module, example, test, arguments in named:
+        if module:
+            assert find_spec(module), module
+            assert module != "benchmarks" or set(arguments.split()) <= set(PARTS), arguments
+        else:
+            assert (ROOT / (example or test)).exists(), example or test
+
+
+def test_the_house_has_every_room():
+    house = (ROOT / "docs/project/house.md").read_text(encoding="utf-8")
+    rooms = {path.parent.name for path in (ROOT / "tuner").glob("*/__init__.py")}
+    assert {room for room in rooms if f"{room}/`" not in house} == set()
 
 
 def test_every_error_line_has_one_anchor():
