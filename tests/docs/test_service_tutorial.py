@@ -19,6 +19,7 @@ import httpx
 
 from tests.docs.pages import DOCS, ROOT, commands
 from tests.tuner.service.conftest import FAKE_WORKER, LIMITS, listening
+from tuner.cli import main
 from tuner.service import attempt
 from tuner.service.service import Service
 from tuner.service.settings import ServiceSettings
@@ -62,19 +63,23 @@ def address_said_by(process: subprocess.Popen[str]) -> str:
     raise AssertionError("it ended before it served")
 
 
+def called(line: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Call a command as typed, and return what it prints."""
+    assert main(shlex.split(line)[1:]) == 0, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("place")
-def test_a_server_starts_for_this_machine_and_with_a_token_for_others() -> None:
+def test_a_server_starts_for_this_machine_and_with_a_token_for_others(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     alone, for_others, _ = RUN_FOREVER
     with running(alone, "--port", "0") as process:
         assert httpx.get(f"{address_said_by(process)}/api/v1/jobs").json()["jobs"] == []
-    refused = subprocess.run(
-        [*TUNE, *shlex.split(for_others)[1:]], check=False, capture_output=True
-    )
-    assert refused.returncode == 2
+    assert main(shlex.split(for_others)[1:]) == 2
     (line,) = [line for line in commands(PAGE) if line.startswith("tune serve token add")]
-    told = subprocess.run([*TUNE, *line.split()[1:]], check=True, capture_output=True, text=True)
-    (token,) = re.findall(r"tune_[\w-]{20,}", told.stdout)
+    (token,) = re.findall(r"tune_[\w-]{20,}", called(line, capsys))
     with running(for_others, "--port", "0") as process:
         jobs = f"{address_said_by(process)}/api/v1/jobs"
         assert httpx.get(jobs).status_code == 401
@@ -104,17 +109,16 @@ def test_what_runs_for_ever_is_in_the_tutorial() -> None:
 
 
 @pytest.mark.slow
-def test_its_commands_talk_to_a_server(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_commands_talk_to_a_server(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(attempt, "WORKER", FAKE_WORKER)
     service = Service.open(ServiceSettings(place / "data", workers=2, limits=LIMITS))
     job = ""
     with listening(service) as client:
         monkeypatch.setenv("TUNE_SERVER", str(client.base_url))
         for line in commands(PAGE):
-            if line in RUN_FOREVER:
-                continue
-            words = shlex.split(line.replace("JOB", job))[1:]
-            called = subprocess.run([*TUNE, *words], check=False, capture_output=True, text=True)
-            assert called.returncode == 0, (line, called.stderr)
-            job = next(iter(re.findall(r"job ([0-9a-f]{16})", called.stdout)), job)
+            if line not in RUN_FOREVER:
+                said = called(line.replace("JOB", job), capsys)
+                job = next(iter(re.findall(r"job ([0-9a-f]{16})", said)), job)
     assert (place / "runs" / "from_server" / "result.json").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -17,13 +16,14 @@ pytest.importorskip("fastapi", reason="needs the extra 'service'")
 import httpx
 import uvicorn
 
+from tests.tuner.service import serving
+from tests.tuner.service.serving import FAKE_WORKER
 from tuner.service import attempt, recordings
 from tuner.service.app import create_app
 from tuner.service.service import Service
 from tuner.service.settings import Limits, ServiceSettings
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
-FAKE_WORKER = [sys.executable, str(Path(__file__).with_name("fake_worker.py"))]
 LIMITS = Limits(free_bytes=0)
 
 
@@ -36,17 +36,7 @@ def _quick_worker(monkeypatch, request):
 @pytest.fixture(autouse=True)
 def _quick_inspection(monkeypatch, request):
     if "real_inspection" not in request.fixturenames:
-        found = {
-            "started": None,
-            "duration": 3.0,
-            "problem": None,
-            "topic_map": "table",
-            "topics": [],
-            "missions": [],
-            "coefficients": [],
-            "notes": [],
-        }
-        monkeypatch.setattr(recordings, "inspect", lambda *_: dict(found))
+        monkeypatch.setattr(recordings, "inspect", serving.found_in_a_table)
 
 
 @pytest.fixture

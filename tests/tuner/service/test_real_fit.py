@@ -65,7 +65,7 @@ def test_a_fit_that_was_killed_half_way_ends_as_one_that_was_not(tmp_path, bag):
         job = submit(client, recording, **JOB)
         half_way(client, job)
         process.kill()
-        process.wait()
+        process.join()
     with server(data, port, real=True), httpx.Client(**visiting) as client:
         orphaned = ended(client, job, WITHIN)
         assert any("has gone; it goes on" in line for line in orphaned["log"])

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import random
-import signal
 import socket
 import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
 import httpx
 import pytest
 
+from tests.tuner.service import serving
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.errors import InputError
 from tuner.service import database as database_module
@@ -30,8 +30,10 @@ from tuner.service.service import Service
 from tuner.service.states import State
 from tuner.service.tables import Base, RecordingRow
 
-ROOT = Path(__file__).parents[3]
 KILLS = 20
+STARTING = multiprocessing.get_context("forkserver")
+"""Starts processes that have imported a server already: most of what it takes to start one."""
+STARTING.set_forkserver_preload([serving.__name__])
 
 
 def free_port() -> int:
@@ -43,22 +45,11 @@ def free_port() -> int:
 @contextmanager
 def server(
     data: Path, port: int, database: str = "", *, real: bool = False
-) -> Iterator[subprocess.Popen]:
+) -> Iterator[BaseProcess]:
     """Start a server, and wait until it answers; its workers fit nothing unless they are real."""
-    worker = ["real"] if real else []
-    process = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "tests.tuner.service.serving",
-            str(data),
-            str(port),
-            database,
-            *worker,
-        ],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-    )
+    told = {"data": data, "database": database, "real": real}
+    process = STARTING.Process(target=serving.serve_at, args=(port,), kwargs=told)
+    process.start()
     try:
         until = time.monotonic() + 60
         while True:
@@ -66,13 +57,13 @@ def server(
                 if httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200:
                     break
             except httpx.TransportError:
-                assert process.poll() is None
+                assert process.is_alive()
                 assert time.monotonic() < until
                 time.sleep(0.05)
         yield process
     finally:
         process.kill()
-        process.wait()
+        process.join()
 
 
 def killed_again_and_again(data: Path, table: Path, kills: int, database: str = "") -> list[dict]:
@@ -88,8 +79,8 @@ def killed_again_and_again(data: Path, table: Path, kills: int, database: str = 
                 ):
                     time.sleep(0.02)
                 time.sleep(chance.uniform(0.0, 1.5))
-            process.send_signal(signal.SIGKILL)
-            process.wait()
+            process.kill()
+            process.join()
     with (
         server(data, port, database),
         httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as client,
@@ -138,8 +129,8 @@ def test_workers_end_with_their_server_and_a_stopped_server_leaves_its_jobs(tmp_
         while not client.get(f"/api/v1/jobs/{job}").json()["iteration"]:
             time.sleep(0.05)
         began = time.monotonic()
-        process.send_signal(signal.SIGTERM)
-        process.wait(timeout=15)
+        process.terminate()
+        process.join(timeout=15)
         assert time.monotonic() - began < 10
     with sqlite3.connect(data / "tune.sqlite") as rows:
         assert rows.execute("SELECT state, deaths, claim FROM jobs").fetchall() == [
