@@ -8,13 +8,20 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.job.prepare import Job
+from tuner.objective.normal import with_conditions
 from tuner.search.fitted import Fitted
 from tuner.selection.candidates import with_terms
 
 
-def extended(job: Job, fitted: Fitted, names: Sequence[str]) -> tuple[Job, Fitted]:
-    """Return job and fit with some coefficients free, at their neutral values."""
+def extended(
+    job: Job, fitted: Fitted, names: Sequence[str], *, around: Sequence[str] = ()
+) -> tuple[Job, Fitted]:
+    """Return job and fit with some coefficients free, at their neutral values.
+
+    ``around`` is what surrounds each flight and is estimated from now on; it begins as nothing.
+    """
     objective, point = with_terms(fitted.objective, fitted.point, names, job.settings.job)
+    objective, point = with_conditions(objective, point, around)
     added = np.asarray(point.coefficients)[len(job.space) :]
     outcomes = tuple(
         replace(
@@ -26,7 +33,11 @@ def extended(job: Job, fitted: Fitted, names: Sequence[str]) -> tuple[Job, Fitte
     )
     return (
         replace(
-            job, space=objective.space, objective=replace(job.objective, space=objective.space)
+            job,
+            space=objective.space,
+            objective=replace(
+                job.objective, space=objective.space, conditions=objective.conditions
+            ),
         ),
         replace(fitted, objective=objective, point=point, outcomes=outcomes),
     )

@@ -4,6 +4,10 @@ One Jacobian scores all candidate groups at the fitted point. If one of them pre
 out of the fit, all that gain by more than chance are fitted together; backward elimination takes
 away those that do not hold their places beside the others. The rest stays if each flight, predicted
 by a fit to the others, is then met better by more than the scatter.
+
+What surrounds each flight (its wind, the decline of its battery) has a column for each flight.
+Other flights cannot predict it, sections of its own can; a flight that is left out keeps it, as it
+keeps its clocks.
 """
 
 from __future__ import annotations
@@ -22,19 +26,21 @@ from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
 from tuner.model import with_coefficients
-from tuner.objective.criterion import Point
-from tuner.objective.normal import Objective
+from tuner.objective.criterion import Point, units_of
+from tuner.objective.normal import Objective, with_conditions
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
 from tuner.selection.candidates import (
     Groups,
+    coefficients_in,
+    conditions_in,
     is_stand_in,
     start_of,
     with_terms,
 )
 from tuner.selection.linear import Linear, linear_at
-from tuner.selection.prediction import offsets_fitted, predicted_losses, vector_after
+from tuner.selection.prediction import predicted_losses, vector_after
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.wording.phrases import listed
@@ -89,7 +95,8 @@ class Selection:
     """A selection among some groups, each round pruned backwards.
 
     Base model and all candidates make up one space, and all terms are computed whichever are in
-    the model: fits with different terms then share their compiled programs.
+    the model, and all that may surround the flights: fits with different terms then share their
+    compiled programs.
     """
 
     job: Job
@@ -114,13 +121,18 @@ class Selection:
             if set(grown.added) <= set(state.added):
                 break
             state = grown
-        job, fitted = extended(self.job, self.fitted, _names(state.added))
+        job, fitted = extended(
+            self.job,
+            self.fitted,
+            coefficients_in(state.added),
+            around=conditions_in(state.added),
+        )
         vector = [state.vector[name] for name in job.space.names]
         fitted = replace(
             state.fitted,
             objective=fitted.objective,
             outcomes=fitted.outcomes,
-            point=Point(jnp.asarray(vector), state.fitted.point.offsets),
+            point=Point(jnp.asarray(vector), _offsets(state.fitted, fitted.objective)),
         )
         return Selected(job, fitted if state.added else self.fitted, self._rows(state, dropped))
 
@@ -205,22 +217,28 @@ class Selection:
         away[gone] = (self._neutral - linear.scaled)[gone]
         free = self._columns([*self.job.space.names, *_names(kept)])
         everything = np.ones(len(linear.flight), bool)
-        change = linear.step(free, inside=everything, from_=away)[self._columns(space.names)]
-        point = Point(
-            jnp.asarray(vector_after(space, state.fitted.point.coefficients, change)),
-            state.fitted.point.offsets,
+        change = linear.step(free, inside=everything, from_=away)
+        of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
+        for name, unit in zip(of_flight, units_of(of_flight), strict=True):
+            if name in conditions_in(kept):
+                offsets[of_flight.index(name)] += change[self._columns([name])] / unit
+        moved = vector_after(
+            space, state.fitted.point.coefficients, change[self._columns(space.names)]
         )
+        point = Point(jnp.asarray(moved), jnp.asarray(offsets))
         return replace(state, fitted=replace(state.fitted, point=point))
 
     def _refitted(self, state: _State, groups: Groups, *, anew: bool = False) -> _State:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
-        wanted = _names(groups)
-        spare = [name for name in _names(self.candidates) if name not in wanted]
+        wanted, around = coefficients_in(groups), conditions_in(self.candidates)
+        idle = tuple(name for name in around if name not in conditions_in(groups))
+        spare = [name for name in coefficients_in(self.candidates) if name not in wanted]
         free = [*self.job.space.names, *wanted]
         filled = [*wanted, *spare[: -len(free) % FILLED_UP_TO]]
         objective, point = with_terms(
             self._objective, self.fitted.point, filled, self.job.settings.job
         )
+        objective, _ = with_conditions(objective, point, around)
         start, names = np.array(point.coefficients), objective.space.names
         vector = [
             state.vector.get(name, start[i]) if name in free else start[i]
@@ -230,9 +248,14 @@ class Selection:
         from_here = replace(
             state.fitted,
             objective=objective,
-            point=Point(jnp.asarray(vector), state.fitted.point.offsets),
+            point=Point(jnp.asarray(vector), _offsets(state.fitted, objective, gone=idle)),
         )
-        free_ones = Free(np.array([name in free for name in names]), free_offsets(self.job))
+        offsets = free_offsets(self.job)
+        moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
+        free_ones = Free(
+            np.array([name in free for name in names]),
+            np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
+        )
         title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
 
         def on_progress(progress: Progress) -> None:
@@ -252,46 +275,70 @@ class Selection:
     def _seen(self, fitted: Fitted, added: Groups) -> _State:
         """Return a fit as all candidates see it."""
         objective, point = with_terms(
-            self._objective, self.fitted.point, _names(self.candidates), self.job.settings.job
+            self._objective,
+            self.fitted.point,
+            coefficients_in(self.candidates),
+            self.job.settings.job,
         )
+        around = conditions_in(self.candidates)
+        objective, _ = with_conditions(objective, point, around)
         own = dict(
             zip(fitted.objective.space.names, np.asarray(fitted.point.coefficients), strict=True)
         )
         start = np.asarray(point.coefficients)
         vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
-        at = Point(jnp.asarray(vector), fitted.point.offsets)
-        return _State(
-            fitted,
-            added,
-            linear_at(objective, at, fitted.criterion, offsets_fitted=offsets_fitted(fitted)),
+        at = Point(jnp.asarray(vector), _offsets(fitted, objective))
+        linear = linear_at(
+            objective,
+            at,
+            fitted.criterion,
+            offsets_fitted=np.asarray(at.offsets) != 0.0,
+            around=around,
         )
+        return _State(fitted, added, linear)
 
     @property
     def _objective(self) -> Objective:
         """The base problem with all candidates in the model, at their neutral values."""
         objective = self.fitted.objective
-        neutral = start_of(_names(self.candidates))
+        neutral = start_of(coefficients_in(self.candidates))
         values = {name: jnp.asarray(value) for name, value in neutral.items()}
         return replace(objective, model=with_coefficients(objective.model, values))
 
     @property
     def _space(self) -> tuple[str, ...]:
-        """The coefficients of every `Linear`."""
-        return (*self.job.space.names, *_names(self.candidates))
+        """The coefficients of every `Linear`, one for each flight of what surrounds it."""
+        around = conditions_in(self.candidates)
+        return (
+            *self.job.space.names,
+            *coefficients_in(self.candidates),
+            *(f"{name} {flight}" for name in around for flight in self._flights),
+        )
+
+    @property
+    def _flights(self) -> range:
+        return range(self.fitted.objective.flights)
 
     @property
     def _neutral(self) -> NDArray[np.float64]:
-        """Scaled neutral values (K,) of the candidates; zero for the base model's coefficients."""
-        neutral = start_of(_names(self.candidates))
+        """Scaled neutral values (P,) of the candidates; zero for the base model's coefficients."""
+        neutral = start_of(coefficients_in(self.candidates))
         scales = [COEFFICIENTS[name].scale for name in neutral]
         scaled = [
             np.log(value) if scale == "log" else value
             for value, scale in zip(neutral.values(), scales, strict=True)
         ]
-        return np.array([0.0] * len(self.job.space) + scaled)
+        around = len(conditions_in(self.candidates)) * len(self._flights)
+        return np.array([0.0] * len(self.job.space) + scaled + [0.0] * around)
 
     def _columns(self, names: Sequence[str]) -> NDArray[np.intp]:
-        return np.array([self._space.index(name) for name in names], np.intp)
+        around = conditions_in(self.candidates)
+        wanted = [
+            f"{name} {flight}" if name in around else name
+            for name in names
+            for flight in (self._flights if name in around else range(1))
+        ]
+        return np.array([self._space.index(name) for name in wanted], np.intp)
 
     def _scores_outside(self, state: _State) -> dict[str, Score]:
         """Return what each group that is not in the model is worth beside it."""
@@ -354,6 +401,15 @@ class Selection:
         model = self._columns([*self.job.space.names, *_names(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
+
+
+def _offsets(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
+    """Return a fit's offsets, without some, as the rows of another problem of the same flights."""
+    rows = np.asarray(fitted.point.offsets)
+    known = dict(zip(fitted.objective.of_flight, rows, strict=True))
+    known = {name: row for name, row in known.items() if name not in gone}
+    nothing = np.zeros(rows.shape[1])
+    return jnp.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))
 
 
 def _names(groups: Groups) -> tuple[str, ...]:

@@ -11,8 +11,9 @@ from tuner.findings import Finding
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, search
 from tuner.job.selection import Selected, Selection
+from tuner.objective.inlets import INLETS
 from tuner.search.fitted import Fitted
-from tuner.selection.candidates import Groups, candidate_groups
+from tuner.selection.candidates import Groups, candidate_groups, groups_around
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.spans import span
 
@@ -82,7 +83,11 @@ def candidates_of(job: Job) -> Groups:
     settings = job.settings.job
     if settings.terms != "auto" or settings.free is not None:
         return {}
-    return candidate_groups(job.settings.vehicle, job.space, settings)
+    closed = all(INLETS[inlet].closed_loop for inlet in job.inlets)
+    return {
+        **candidate_groups(job.settings.vehicle, job.space, settings),
+        **groups_around(job.objective, closed_loop=closed),
+    }
 
 
 def _first_rows(job: Job, reason: SelectionCode) -> tuple[SelectionRow, ...]:

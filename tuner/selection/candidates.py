@@ -29,6 +29,35 @@ def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups
     }
 
 
+def groups_around(objective: Objective, *, closed_loop: bool) -> Groups:
+    """Return the groups of what may surround each flight, that a fit may add.
+
+    They are nuisances with a value for each flight: the wind of flights that are flown whole in
+    their closed loop (over a window, the start explains as much), and there the decline of a
+    battery where no voltage was recorded.
+    """
+    if not closed_loop:
+        return {}
+    groups: dict[str, tuple[str, ...]] = {"wind": ("wind_x", "wind_y")}
+    if objective.segments.log_voltage is None:
+        groups["battery_decline"] = ("battery_decline",)
+    return {
+        group: names
+        for group, names in groups.items()
+        if not set(names).intersection(objective.conditions)
+    }
+
+
+def coefficients_in(groups: Groups) -> tuple[str, ...]:
+    """Return the coefficients of some groups."""
+    return tuple(n for names in groups.values() for n in names if n not in conditions())
+
+
+def conditions_in(groups: Groups) -> tuple[str, ...]:
+    """Return what of some groups surrounds each flight."""
+    return tuple(n for names in groups.values() for n in names if n in conditions())
+
+
 def groups_named(terms: Sequence[str], space: Space) -> Groups:
     """Return the groups, or coefficients, that a job file names and that are not free yet.
 
@@ -48,7 +77,7 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
 
 def is_stand_in(group: str) -> bool:
     """Return whether a group describes as a whole what other terms do one by one."""
-    return any(COEFFICIENTS[name].stands_in for name in term_groups()[group])
+    return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
 
 
 def start_of(names: Sequence[str]) -> dict[str, float]:

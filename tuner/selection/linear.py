@@ -3,19 +3,22 @@
 The loss of each stretch of time is a quadratic in the coefficients, from one Jacobian:
 ``L(x + δ) = L(x) + sᵀδ + ½ δᵀHδ`` in the scaled coordinates, each segment's start and each flight's
 offsets eliminated. A group of coefficients is added by letting its δ move; one in the model is
-taken away by the δ that leads back to its neutral value.
+taken away by the δ that leads back to its neutral value. What surrounds each flight, as its wind
+does, has a column for each flight, which no other flight sees.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.objective.criterion import Criterion, Jacobian, Point
+from tuner.coefficients import REGISTRY
+from tuner.coefficients.space import Parameter, Space
+from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
 from tuner.uncertainty.information import FisherInformation, information_from_jacobian
@@ -33,20 +36,22 @@ RIDGE = 1e-12
 
 @dataclass(frozen=True)
 class Linear:
-    """The loss about a point, stretch by stretch; K coefficients, S stretches.
+    """The loss about a point, stretch by stretch; P columns, S stretches that see L of them each.
 
     Attributes
     ----------
     scaled
-        (K,) the point.
+        (P,) the point.
     hessian, score
-        (S, K, K) and (S, K).
+        (S, L, L) and (S, L).
     prior, pull
-        (K, K) information of all priors, and (K,) gradient of those of the coefficients.
+        (P, P) information of all priors, and (P,) gradient of those of the coefficients.
     flight, section
         (S,) where each stretch belongs.
     loss
         Half the robust sum of squares of all flights.
+    seen
+        (S, L) which columns each stretch sees; None where all see all.
     """
 
     scaled: Array
@@ -57,11 +62,49 @@ class Linear:
     flight: NDArray[np.intp]
     section: NDArray[np.intp]
     loss: float
+    seen: NDArray[np.intp] | None = None
+
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Which columns (S, L) each stretch sees."""
+        if self.seen is not None:
+            return self.seen
+        return np.broadcast_to(np.arange(len(self.scaled)), self.score.shape)
+
+    def sees_alike(self, group: Columns) -> bool:
+        """Return whether every stretch sees all columns of a group."""
+        return self.seen is None or bool(np.isin(group, np.intersect1d(*self.seen[[0, -1]])).all())
+
+    def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
+        """Return the information (P, P) of some stretches (S,), of all by default."""
+        total = np.zeros((len(self.scaled), len(self.scaled)))
+        inside = np.ones(len(self.flight), bool) if inside is None else inside
+        for number in np.unique(self.flight[inside]):
+            of_flight = inside & (self.flight == number)
+            seen = self.columns[np.argmax(of_flight)]
+            total[np.ix_(seen, seen)] += self.hessian[of_flight].sum(axis=0)
+        return total
+
+    def slopes(self, change: Array) -> Array:
+        """Return the gradient (S, P) of each stretch's loss after a change (P,)."""
+        local = self.score + np.einsum("spq,sq->sp", self.hessian, change[self.columns])
+        return self._spread(local)
+
+    @property
+    def diagonals(self) -> Array:
+        """The information (S, P) of each stretch about each column by itself."""
+        return self._spread(np.einsum("spp->sp", self.hessian))
+
+    def _spread(self, local: Array) -> Array:
+        """Return rows (S, L) of what stretches see as rows (S, P), zero where they see nothing."""
+        rows = np.zeros((len(local), len(self.scaled)))
+        np.put_along_axis(rows, self.columns, local, axis=1)
+        return rows
 
     def step(
         self, free: Columns, *, inside: NDArray[np.bool_], from_: Array | None = None
     ) -> Array:
-        """Return the change (K,) that minimises the loss of some stretches.
+        """Return the change (P,) that minimises the loss of some stretches.
 
         Parameters
         ----------
@@ -70,11 +113,12 @@ class Linear:
         inside
             (S,) which stretches are fitted.
         from_
-            (K,) change that is made anyway; none by default.
+            (P,) change that is made anyway; none by default.
         """
         change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
-        hessian = self.hessian[inside].sum(axis=0) + self.prior
-        slope = self.score[inside].sum(axis=0) + self.pull + hessian @ change
+        hessian = self.information(inside) + self.prior
+        score = self._spread(self.score)[inside].sum(axis=0)
+        slope = score + self.pull + hessian @ change
         square = hessian[np.ix_(free, free)]
         unit = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
         scaled = square * np.outer(unit, unit) + RIDGE * np.eye(len(free))
@@ -83,8 +127,9 @@ class Linear:
 
     def change_of_loss(self, change: Array) -> Array:
         """Return by how much each stretch's loss (S,) changes."""
-        quadratic = np.einsum("p,spq,q->s", change, self.hessian, change, optimize=True)
-        return np.asarray(self.score @ change + 0.5 * quadratic)
+        local = change[self.columns]
+        quadratic = np.einsum("sp,spq,sq->s", local, self.hessian, local, optimize=True)
+        return np.asarray((self.score * local).sum(axis=1) + 0.5 * quadratic)
 
     def folds(self, by: NDArray[np.intp]) -> Iterator[NDArray[np.bool_]]:
         """Return which stretches (S,) each fold leaves out."""
@@ -98,40 +143,144 @@ def linear_at(
     criterion: Criterion,
     *,
     offsets_fitted: NDArray[np.bool_],
+    around: Sequence[str] = (),
 ) -> Linear:
     """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
 
     Flights whose Jacobian would not fit the objective's memory take turns.
+
+    Parameters
+    ----------
+    objective, point, criterion
+        The fit. Its last conditions are those of ``around``.
+    offsets_fitted
+        (offsets, N) which offsets move with the others.
+    around
+        Conditions to have columns for, behind those of the coefficients: N for each of them.
     """
     parts, loss = [], 0.0
     for flights in portions(objective, point, criterion):
         batch = portion(objective, point, criterion, flights)
         jacobian = batch[0].jacobian(*batch[1:], columns=COLUMNS)
+        fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
         parts.append(
-            information_from_jacobian(*batch, jacobian, offsets_fitted=offsets_fitted[:, flights])
+            information_from_jacobian(
+                *_with_coefficients_around(*batch, jacobian, around), offsets_fitted=fitted
+            )
         )
         loss += _loss_of(batch[0], batch[2], jacobian)
     information = FisherInformation.joined(parts)
-    scaled = np.asarray(objective.space.scaled(jnp.asarray(point.coefficients)))
-    return linear_of(information, scaled, objective.space.prior_mean, loss)
+    rows = np.asarray(point.offsets)[len(point.offsets) - len(around) :]
+    scaled = np.concatenate(
+        [
+            np.asarray(objective.space.scaled(jnp.asarray(point.coefficients))),
+            (rows * units_of(around)[:, None]).ravel(),
+        ]
+    )
+    mean = np.concatenate([objective.space.prior_mean, np.zeros(rows.size)])
+    return linear_of(information, scaled, mean, loss, around=len(around))
 
 
-def linear_of(information: FisherInformation, scaled: Array, mean: Array, loss: float) -> Linear:
-    """Return the linear approximation from the information at a point and its loss."""
-    segments, blocks = information.blocks.shape[1:3]
-    count = len(scaled)
+def _with_coefficients_around(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    jacobian: Jacobian,
+    around: Sequence[str],
+) -> tuple[Objective, Point, Criterion, Jacobian]:
+    """Return a problem in which some conditions count as coefficients, and its Jacobian.
+
+    Only the columns' order and scale are that of such a problem: it is not to be simulated.
+    """
+    if not around:
+        return objective, point, criterion, jacobian
+    count, offsets = len(objective.space), len(point.offsets)
+    left = offsets - len(around)
+    some = next(iter(jacobian.columns.values()))
+    order = np.concatenate(
+        [
+            np.arange(count),
+            np.arange(count + left, count + offsets),
+            np.arange(count, count + left),
+            np.arange(count + offsets, len(some)),
+        ]
+    )
+    beside = [_condition(name, unit) for name, unit in zip(around, units_of(around), strict=True)]
+    space = Space((*objective.space.parameters, *beside), objective.space.fixed)
+    return (
+        replace(objective, space=space, conditions=objective.conditions[: -len(around)]),
+        Point(
+            jnp.concatenate([jnp.asarray(point.coefficients), jnp.zeros(len(around))]),
+            point.offsets[:left],
+        ),
+        criterion,
+        replace(
+            jacobian,
+            columns={name: np.asarray(c)[order] for name, c in jacobian.columns.items()},
+        ),
+    )
+
+
+def _condition(name: str, unit: float) -> Parameter:
+    """Return a condition as a parameter that moves by a unit, its number in a point's rows."""
+    row = REGISTRY[name]
+    return Parameter(
+        name=name,
+        ratios={name: 1.0},
+        initial=0.0,
+        lower=-row.prior_sd,
+        upper=row.prior_sd,
+        scale="linear",
+        prior_mean=0.0,
+        prior_sd=row.prior_sd,
+        prior_given=False,
+        unit_step=unit,
+    )
+
+
+def linear_of(
+    information: FisherInformation, scaled: Array, mean: Array, loss: float, *, around: int = 0
+) -> Linear:
+    """Return the linear approximation from the information at a point and its loss.
+
+    Parameters
+    ----------
+    information
+        The last ``around`` of its coefficients are conditions.
+    scaled, mean
+        (P,) the point, and the mean of the priors: of K coefficients, then of each condition for
+        each flight.
+    loss
+        Half the robust sum of squares.
+    around
+        How many conditions.
+    """
+    segments, blocks, size = information.blocks.shape[1:4]
+    count, flights = size - around, int(information.flight.max()) + 1
     section = np.minimum(np.arange(blocks) * SECTIONS // blocks, SECTIONS - 1)
-    hessian = information.blocks.sum(axis=0).reshape(-1, count, count)
+    hessian = information.blocks.sum(axis=0).reshape(-1, size, size)
     flown = np.einsum("spp->s", hessian) > 0
+    flight = np.repeat(information.flight, blocks)[flown]
+    of_prior = np.diag(information.prior)
+    own = np.concatenate([of_prior[:count], np.repeat(of_prior[count:], flights)])
+    prior = np.diag(own)
+    prior[:count, :count] += information.nuisance_prior[:count, :count]
+    seen = np.hstack(
+        [
+            np.tile(np.arange(count), (len(flight), 1)),
+            count + flights * np.arange(around) + flight[:, None],
+        ]
+    )
     return Linear(
         scaled=scaled,
         hessian=hessian[flown],
-        score=information.score.sum(axis=0).reshape(-1, count)[flown],
-        prior=information.prior + information.nuisance_prior,
-        pull=np.diag(information.prior) * (scaled - mean),
-        flight=np.repeat(information.flight, blocks)[flown],
+        score=information.score.sum(axis=0).reshape(-1, size)[flown],
+        prior=prior,
+        pull=own * (scaled - mean),
+        flight=flight,
         section=np.tile(section, segments)[flown],
         loss=loss,
+        seen=seen if around else None,
     )
 
 

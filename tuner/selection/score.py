@@ -16,6 +16,8 @@ SIGNIFICANCE = 0.01
 """Probability with which chance alone would add any term at all, over all candidates together."""
 MATERIAL = 0.01
 """Share of the loss below which a gain is no evidence: two simulators of a vehicle differ, too."""
+SMALLEST = 1e-6
+"""Share of the loss that a flight has at least, where flights count alike."""
 SURE = 2.0
 """Standard deviations by which what was left out must be predicted better."""
 DETERMINED = 1e-8
@@ -63,6 +65,9 @@ def score(
 ) -> Score:
     """Return what a group is worth beside a model.
 
+    A group with columns for each flight is nothing that other flights could predict: sections of
+    the flight's own do, and flights count alike however strongly each shows it.
+
     Parameters
     ----------
     linear
@@ -89,9 +94,14 @@ def score(
     everything = np.ones(len(linear.flight), bool)
     alone, with_group = _steps(linear, columns, (without, begin), everything)
     fit = _Gain.of(linear, alone, with_group, everything)
-    held_out = _held_out(linear, columns, (without, begin), linear.flight)
+    by_flight = linear.sees_alike(group)
+    folds = linear.flight if by_flight else linear.section
+    held_out = _held_out(linear, columns, (without, begin), folds)
     reason = SelectionCode.PREDICTS_FLIGHTS
-    if not held_out.is_sure and held_out.share > -held_out.scatter:  # no flight contradicts it
+    if not by_flight:
+        held_out = held_out.with_flights_alike(linear.flight)
+        reason = SelectionCode.PREDICTS_SECTIONS
+    elif not held_out.is_sure and held_out.share > -held_out.scatter:  # no flight contradicts it
         by_section = _held_out(linear, columns, (without, begin), linear.section)
         if by_section.is_sure:
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
@@ -156,10 +166,10 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 @dataclass(frozen=True)
 class _Gain:
-    """By how much each stretch's loss (S,) is lower with a group, and the loss without it."""
+    """By how much each stretch's loss (S,) is lower with a group, and its loss (S,) without it."""
 
     of_stretch: NDArray[np.float64]
-    loss_without: float
+    without: NDArray[np.float64]
 
     @staticmethod
     def of(
@@ -169,9 +179,21 @@ class _Gain:
         inside: NDArray[np.bool_],
     ) -> _Gain:
         """Return the gain of one change (K,) over another in some stretches, none elsewhere."""
-        without = np.where(inside, linear.change_of_loss(alone), 0.0)
-        gain = without - np.where(inside, linear.change_of_loss(with_group), 0.0)
-        return _Gain(gain, linear.loss * inside.mean() + without.sum())
+        without = linear.change_of_loss(alone)
+        gain = np.where(inside, without - linear.change_of_loss(with_group), 0.0)
+        return _Gain(gain, np.where(inside, linear.loss / len(inside) + without, 0.0))
+
+    def with_flights_alike(self, flight: NDArray[np.intp]) -> _Gain:
+        """Return the gain as a mean over flights (S,) of shares of their own losses."""
+        of_flight = np.bincount(flight, self.without)
+        least = SMALLEST * self.loss_without
+        weight = 1.0 / np.maximum(of_flight, least)[flight] / len(of_flight)
+        return _Gain(self.of_stretch * weight, self.without * weight)
+
+    @property
+    def loss_without(self) -> float:
+        """The loss of all stretches without the group."""
+        return float(self.without.sum())
 
     @property
     def share(self) -> float:
@@ -214,19 +236,19 @@ def _held_out(
 ) -> _Gain:
     """Return the gain in each fold's stretches of linear fits to the other folds' stretches."""
     if len(np.unique(by)) < 2:
-        return _Gain(np.zeros(len(by)), linear.loss)
+        return _Gain(np.zeros(len(by)), np.full(len(by), linear.loss / len(by)))
     folds = [
         _Gain.of(linear, *_steps(linear, columns, begin, ~out), out) for out in linear.folds(by)
     ]
     return _Gain(
         np.sum([fold.of_stretch for fold in folds], axis=0),
-        float(sum(fold.loss_without for fold in folds)),
+        np.sum([fold.without for fold in folds], axis=0),
     )
 
 
 def _is_determined(linear: Linear, model: Columns, group: Columns) -> bool:
     """Return whether all of a group's directions differ from what the model's coefficients do."""
-    information = linear.hessian.sum(axis=0)
+    information = linear.information()
     if not np.all(np.diag(information)[group] > 0.0):
         return False
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
@@ -254,13 +276,12 @@ def _chance(
         group's coefficients, the model's following them, is that of the first; how much it scatters
         from stretch to stretch is seen at the second, where only what is no such term is left.
     """
-    total = linear.hessian.sum(axis=0) + linear.prior
+    total = linear.information() + linear.prior
     follow = np.linalg.solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
     without, with_group = (
-        (at := linear.score + linear.hessian @ change)[:, group] - at[:, model] @ follow
-        for change in minima
+        (at := linear.slopes(change))[:, group] - at[:, model] @ follow for change in minima
     )
-    seen = np.any(linear.hessian[:, group, group] > 0.0, axis=1)
+    seen = np.any(linear.diagonals[:, group] > 0.0, axis=1)
     count, size = int(seen.sum()), len(group)
     if count <= size + 1:
         return 1.0

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -23,6 +25,8 @@ from tuner.flights.flight import InitialState
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
+from tuner.objective.criterion import Point, units_of
+from tuner.objective.normal import with_conditions
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 
@@ -30,18 +34,29 @@ BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
 
 def job_with(
-    drag: float, *, seed: int, job: JobFile | None = None, tilt: tuple[float, float] = (0.0, 0.0)
+    drag: float,
+    *,
+    seed: int,
+    job: JobFile | None = None,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    around: Mapping[str, Sequence[float]] | None = None,
 ) -> tuple[Job, Fitted]:
     """Return a job whose flights were flown with some drag of the body, and its base fit.
 
-    Its recordings show a hover that is tilted, in rad about x and y.
+    Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
+    each of them.
     """
     truth = problem((*BASE, "fuselage_drag"))
     vector = truth.space.vector_of(
         dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
         | {"fuselage_drag": drag}
     )
-    truth = with_data(truth, truth.start(vector), noise=np.random.default_rng(seed))
+    names = tuple(around or ())
+    flown, point = with_conditions(truth, truth.start(vector), names)
+    rows = [around[name] / unit for name, unit in zip(names, units_of(names), strict=True)]
+    offsets = jnp.asarray(np.vstack([np.zeros((len(truth.of_flight), len(FLIGHTS))), *rows]))
+    flown = with_data(flown, Point(point.coefficients, offsets), noise=np.random.default_rng(seed))
+    truth = replace(truth, segments=flown.segments)
     file = JobFile(free=BASE)
     space = space_of(vehicle_file(), controller_file(), file)
     objective = replace(truth, space=space)

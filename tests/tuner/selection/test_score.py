@@ -136,3 +136,60 @@ def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     assert inside.gain_fit == pytest.approx(added.gain_fit, rel=1e-6)
     assert inside.gain_holdout == pytest.approx(added.gain_holdout, rel=1e-6)
     assert inside.earns_place
+
+
+def by_flight(linear, column):
+    """Return the same loss seen by a column of its own for each flight in the place of one."""
+    others = np.delete(np.arange(4), column)
+    order = np.append(others, column)
+    wide = len(others) + FLIGHTS
+    return replace(
+        linear,
+        scaled=np.zeros(wide),
+        hessian=linear.hessian[:, order][:, :, order],
+        score=linear.score[:, order],
+        prior=np.eye(wide) * 1e-6,
+        pull=np.zeros(wide),
+        seen=np.column_stack(
+            [np.tile(np.arange(len(others)), (len(linear.flight), 1)), 3 + linear.flight]
+        ),
+    )
+
+
+def dense(linear):
+    """Return the same loss where every stretch sees every column, most of them for nothing."""
+    count, wide = len(linear.flight), len(linear.scaled)
+    hessian, slope = np.zeros((count, wide, wide)), np.zeros((count, wide))
+    for number, seen in enumerate(linear.seen):
+        hessian[number][np.ix_(seen, seen)] = linear.hessian[number]
+        slope[number, seen] = linear.score[number]
+    return replace(linear, hessian=hessian, score=slope, seen=None)
+
+
+def test_columns_that_one_flight_sees_are_columns_like_others():
+    own = by_flight(linear_fit(0.5, -0.3, 0.0, 0.2), 1)
+    group, inside = 3 + np.arange(FLIGHTS), own.flight != 1
+    step = own.step(np.concatenate([MODEL, group]), inside=inside)
+    np.testing.assert_allclose(
+        step, dense(own).step(np.concatenate([MODEL, group]), inside=inside), rtol=1e-12
+    )
+    assert step[3 + 1] == 0.0
+    np.testing.assert_allclose(own.change_of_loss(step), dense(own).change_of_loss(step))
+    found, wanted = (score(one, MODEL, group, candidates=2) for one in (own, dense(own)))
+    assert found.reason is SelectionCode.PREDICTS_SECTIONS
+    for name in ("gain_fit", "chance"):
+        assert getattr(found, name) == pytest.approx(getattr(wanted, name), rel=1e-6, abs=1e-300)
+
+
+def test_flights_show_what_surrounds_them_however_strongly_each_does():
+    """One flight shows a hundred times more than another: sections of both are predicted."""
+    own = by_flight(linear_fit(5.0, -0.5, 0.5, -0.5), 1)
+    found = score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2)
+    assert found.reason is SelectionCode.PREDICTS_SECTIONS
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("correlated", [False, True])
+def test_noise_buys_no_column_for_each_flight(seed, correlated):
+    own = by_flight(linear_fit(0.0, seed=seed, correlated=correlated), 1)
+    assert not score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2).earns_place

@@ -1,23 +1,53 @@
 """The whole selection on short simulated flights whose truth holds a term, or does not."""
 
+import numpy as np
 import pytest
 
 from tests.tuner.selection.making import BASE, job_with
 from tuner.config import JobFile
-from tuner.job import selection
+from tuner.job import selection, terms
 from tuner.job.terms import with_terms_selected
+from tuner.objective.criterion import units_of
 from tuner.selection.table import SelectionCode
 from tuner.uncertainty.estimates import uncertainty_of
 
 DRAG = 0.03
 
 
-def selected(drag, *, seed=0, job=None):
+def selected(drag, *, seed=0, job=None, around=None):
     messages = []
     result = with_terms_selected(
-        *job_with(drag, seed=seed, job=job), lambda *_: None, messages.append
+        *job_with(drag, seed=seed, job=job, around=around), lambda *_: None, messages.append
     )
     return result, messages
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("group", "around"),
+    [
+        ("wind", {"wind_x": (0.25, -0.2), "wind_y": (0.2, 0.25)}),
+        ("battery_decline", {"battery_decline": (0.004, 0.006)}),
+    ],
+)
+def test_what_surrounded_each_flight_is_found_and_estimated(monkeypatch, group, around):
+    """Among what may surround a flight alone, which makes it cheap."""
+    monkeypatch.setattr(terms, "candidate_groups", lambda *_: {})
+    result, _ = selected(0.0, around=around)
+    row, *others = result.rows
+    assert (row.group, row.kept, row.names) == (group, True, tuple(around))
+    assert not any(other.kept for other in others)
+    assert result.job.space.names == BASE_IN_ORDER
+    assert result.job.objective.conditions == tuple(around)
+    found = conditions_of_point(result.fitted)
+    for name, values in around.items():
+        assert found[name] == pytest.approx(values, abs=0.05 * max(map(abs, values)))
+
+
+def conditions_of_point(fitted):
+    names = fitted.objective.conditions
+    rows = np.asarray(fitted.point.offsets)[-len(names) :] * units_of(names)[:, None]
+    return dict(zip(names, rows, strict=True))
 
 
 @pytest.mark.long
