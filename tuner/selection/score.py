@@ -20,6 +20,8 @@ SMALLEST = 1e-6
 """Share of the loss that a flight has at least, where flights count alike."""
 SURE = 2.0
 """Standard deviations by which what was left out must be predicted better."""
+MEMORY = 2
+"""Stretches over which residuals are taken to be correlated."""
 DETERMINED = 1e-8
 """Share of a group's information that must be left once the model's coefficients follow it."""
 
@@ -105,12 +107,15 @@ def score(
         by_section = _held_out(linear, columns, (without, begin), linear.section)
         if by_section.is_sure:
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
-    chance = _chance(linear, model, group, (alone, with_group))
+    minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
+    chance = _chance(linear, model, group, minima)
+    if reason is SelectionCode.PREDICTS_SECTIONS and held_out.is_sure:
+        chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
     elif fit.share < MATERIAL:
         reason = SelectionCode.IMMATERIAL
-    elif chance > SIGNIFICANCE / max(candidates, 1):
+    elif chance > limit:
         reason = SelectionCode.NOT_SIGNIFICANT
     elif not held_out.is_sure:
         reason = SelectionCode.NOT_PREDICTED
@@ -128,9 +133,11 @@ def surviving(
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
-    The group that predicts least is taken away first, then all others are scored without it. Of
-    groups that can do without each other the stand-ins go first: with more coefficients they do
-    what one term of the vehicle does, and noise would choose between the two.
+    Of those that do not predict, the group that chance explains best is taken away first, then all
+    others are scored without it: a few flights left out say little about which of two it should be,
+    where one flight alone shows something. Of groups that can do without each other the stand-ins
+    go first: with more coefficients they do what one term of the vehicle does, and noise would
+    choose between the two.
 
     Parameters
     ----------
@@ -155,7 +162,10 @@ def surviving(
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:
             return scores, taken
-        least = min(idle, key=lambda name: (name not in stand_ins, scores[name].gain_holdout))
+        least = max(
+            idle,
+            key=lambda name: (name in stand_ins, scores[name].chance, -scores[name].gain_fit),
+        )
         taken[least] = scores[least]
         del left[least]
 
@@ -264,8 +274,13 @@ def _chance(
     model: Columns,
     group: Columns,
     minima: tuple[NDArray[np.float64], NDArray[np.float64]],
+    *,
+    every_stretch_counts: bool = True,
 ) -> float:
     """Return the probability of such a score if the group were neutral, by Hotelling's T².
+
+    Gusts that a loop answers to are still there a stretch later: how much the sum of all stretches
+    scatters is Newey and West's (1987) estimate, in which neighbours count.
 
     Parameters
     ----------
@@ -275,20 +290,44 @@ def _chance(
         The changes (K,) that lead to the minimum without and with the group. The score of the
         group's coefficients, the model's following them, is that of the first; how much it scatters
         from stretch to stretch is seen at the second, where only what is no such term is left.
+    every_stretch_counts
+        Whether the scatter is known as well as so many stretches let it be: else as well as those
+        do that scatter most, which may be one manoeuvre's.
     """
     total = linear.information() + linear.prior
     follow = np.linalg.solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
     without, with_group = (
         (at := linear.slopes(change))[:, group] - at[:, model] @ follow for change in minima
     )
-    seen = np.any(linear.diagonals[:, group] > 0.0, axis=1)
-    count, size = int(seen.sum()), len(group)
+    size, seen = len(group), with_group[np.any(linear.diagonals[:, group] > 0.0, axis=1)]
+    unit = 1.0 / np.sqrt(np.maximum((seen**2).sum(axis=0), 1e-300))
+    count = float(len(seen)) if every_stretch_counts else _effective_count(seen * unit)
     if count <= size + 1:
         return 1.0
     sum_of_scores = (without - with_group).sum(axis=0)
-    spread = with_group.T @ with_group * count / (count - 1)
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
-    scaled = spread * np.outer(unit, unit) + RIDGE * np.eye(size)
+    spread = _long_run(with_group * unit, linear.flight) * count / (count - 1.0)
     along = sum_of_scores * unit
-    hotelling = float(along @ np.linalg.solve(scaled, along))
-    return float(stats.f.sf(hotelling * (count - size) / (size * (count - 1)), size, count - size))
+    hotelling = float(along @ np.linalg.solve(spread + RIDGE * np.eye(size), along))
+    return float(
+        stats.f.sf(hotelling * (count - size) / (size * (count - 1.0)), size, count - size)
+    )
+
+
+def _effective_count(scores: NDArray[np.float64]) -> float:
+    """Return how many stretches of equal scatter would know as much of it as these (S, L) do.
+
+    Where a few scatter most, as those of one manoeuvre, few are all that its estimate rests on.
+    """
+    square = scores.T @ scores + RIDGE * np.eye(scores.shape[1])
+    shares = np.einsum("sp,sp->s", scores @ np.linalg.inv(square), scores)
+    return float(shares.sum() ** 2 / max((shares**2).sum(), 1e-300))
+
+
+def _long_run(scores: NDArray[np.float64], flight: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the covariance (L, L) of the sum of scores (S, L) that are correlated in a flight."""
+    spread = scores.T @ scores
+    for apart in range(1, MEMORY + 1):
+        same = flight[apart:] == flight[:-apart]
+        across = scores[apart:][same].T @ scores[:-apart][same]
+        spread = spread + (1.0 - apart / (MEMORY + 1.0)) * (across + across.T)
+    return np.asarray(spread)
