@@ -54,7 +54,7 @@ def require_voltage(flights: Sequence[Flight]) -> None:
 def log_voltage_of(
     flights: Sequence[Flight], windows: Sequence[Window], schedule: Schedule
 ) -> Float[Array, "ticks F"] | None:
-    """Return the logarithm of the voltage in V, smoothed, one a control tick.
+    """Return the logarithm of the voltage in V, smoothed, one a control tick: in its middle.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def log_voltage_of(
         return None
     rate = schedule.position_control_rate
     longest = max(window.flight.duration for window in windows)
-    clock = np.arange(padded_size(int(np.ceil(longest * rate)) + 2)) / rate
+    clock = (np.arange(padded_size(int(np.ceil(longest * rate)) + 2)) + 0.5) / rate
     columns = []
     for flight, window in zip(flights, windows, strict=True):
         if id(flight) not in curves:

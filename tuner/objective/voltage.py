@@ -113,12 +113,18 @@ def _mean_cube(flight: Flight, signal: str) -> Series | None:
 
 
 def _followed(time: Numbers, values: Numbers) -> Numbers:
-    """Return values (n, k) that held between stamps, after a first-order lag of `LAG`."""
-    followed = values.copy()
-    keep = np.exp(-np.diff(time) / LAG)[:, None]
+    """Return values (n, k) that move steadily between stamps, after a first-order lag of `LAG`.
+
+    Recorders take what was sent last: held from one stamp to the next, the values would be half a
+    gap late.
+    """
+    gaps = np.diff(time)
+    keep, slope = np.exp(-gaps / LAG)[:, None], np.diff(values, axis=0) / gaps[:, None]
+    behind = np.zeros_like(values)  # of the lag, at every stamp
     for row in range(1, len(values)):
-        followed[row] = values[row - 1] + keep[row - 1] * (followed[row - 1] - values[row - 1])
-    return followed
+        steady = -LAG * slope[row - 1]
+        behind[row] = steady + keep[row - 1] * (behind[row - 1] - steady)
+    return values + behind
 
 
 def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:

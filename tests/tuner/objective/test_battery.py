@@ -87,6 +87,29 @@ def test_the_sag_follows_the_load_and_the_noise_goes(gap):
     assert np.mean(errors) < 0.5 * NOISE
 
 
+def test_the_sag_comes_no_later_where_commands_were_recorded_less_often():
+    """Held until the next one, those of every 40 ms would make it 20 ms late."""
+    fine = np.arange(-2.0, 30.0, 0.0025)
+    swinging = 0.5 + 0.1 * np.sin(2.0 * np.pi * fine / 1.5)[:, None] * np.ones(4)
+    curves = []
+    for every in (1, 16):
+        command = Series(fine[::every], swinging[::every])
+        mean = ((command.values + IDLE) ** 3).mean()
+        known, _ = loaded()
+        volts = 16.3 - 0.2 * np.interp(TIME, fine, ((swinging + IDLE) ** 3).mean(axis=1) / mean)
+        known = replace(
+            known,
+            series=dict(known.series)
+            | {"command": command, "battery_voltage": series(TIME, volts)},
+        )
+        (curve,) = voltages_of([known])
+        curves.append(np.interp(fine, curve.time, curve.volts))
+    inside = (fine > 0.0) & (fine < 29.0)
+    often, rarely = (curve[inside] - curve[inside].mean() for curve in curves)
+    slope = np.gradient(often, fine[inside])
+    assert abs(slope @ (rarely - often) / (slope @ slope)) < 1e-3  # s
+
+
 def test_a_voltage_without_a_load_is_a_smooth_curve():
     noise = NOISE * np.random.default_rng(0).normal(size=len(TIME))
     (curve,) = voltages_of([flight(volts=series(TIME, sagging(TIME) + noise))])
@@ -128,6 +151,8 @@ def test_windows_see_the_whole_flights_voltage():
     np.testing.assert_allclose(table[0], [16.0, 15.8], atol=1e-3)
     np.testing.assert_allclose(table[50], [15.995, 15.795], atol=1e-3)
     np.testing.assert_allclose(table[-1], [15.99, 15.79], atol=1e-3)  # holds after the end
+    ticks = -np.arange(2.0)[:, None] / 100.0 - 0.005  # in the middle of what takes its value
+    np.testing.assert_allclose(table[:2], [16.0, 15.8] + 0.01 * ticks, atol=2e-6)
 
 
 def test_a_flight_without_a_voltage_has_none():
