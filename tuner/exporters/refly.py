@@ -31,7 +31,7 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     """
     if not run.result.flights:  # of ground measurements
         return {}
-    settings = _settings(run, vehicle)
+    settings = _settings(run)
     wanted = {flight.name: flight for flight in run.result.flights}
     recordings = [r for r in read_recordings(settings) if r.flight.name in wanted]
     for flight in (recording.flight for recording in recordings):
@@ -45,14 +45,19 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     return {name: errors.rmse for name, errors in flown.items()}
 
 
-def _settings(run: Run, vehicle: VehicleFile) -> Settings:
+def _settings(run: Run) -> Settings:
+    """Return how the run read its recordings.
+
+    Inlets, and commands that follow from a commanded wrench, go by the vehicle that it began with.
+    """
     settings = run.result.settings
     try:
+        vehicle = VehicleFile.model_validate(settings["vehicle"])
         controller = ControllerFile.model_validate(settings["controller"])
         job = JobFile.model_validate(settings["job"])
     except (KeyError, ValidationError):
         raise InputError(
-            run.folder / RunResult.FILE, "does not hold the controller that flew", "fit again"
+            run.folder / RunResult.FILE, "does not hold what flew", "fit again"
         ) from None
     paths = tuple(dict.fromkeys(Path(flight.path) for flight in run.result.flights))
     for path in paths:

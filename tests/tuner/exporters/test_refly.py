@@ -15,6 +15,7 @@ from tuner.config import (
     write_vehicle,
 )
 from tuner.errors import ExportError
+from tuner.exporters import refly as refly_module
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
 from tuner.recordings import Recording
@@ -63,6 +64,7 @@ def run(bag, flight, updated, tmp_path):
         settings={
             "controller": ControllerFile().model_dump(mode="json"),
             "job": JobFile().model_dump(mode="json"),
+            "vehicle": start.model_dump(mode="json"),
         },
         coefficients=coefficients,
         flights=(held_out,),
@@ -89,6 +91,19 @@ def test_a_true_run_flies_again_as_it_says(run):
     done = export(run, "yaml", refly=refly, today=date(2024, 5, 6))
     assert all(gate.passed for gate in done.gates)
     assert read_vehicle(done.path).aerodynamics == run.vehicle.aerodynamics
+
+
+def test_recordings_are_read_as_the_run_read_them(run, monkeypatch):
+    def read(settings):
+        seen.append(settings.vehicle)
+        return reading(settings)
+
+    seen, reading = [], refly_module.read_recordings
+    monkeypatch.setattr(refly_module, "read_recordings", read)
+    refly(run, with_values(run.vehicle, {"motor_constant": 2e-5}))
+    (began_with,) = seen  # by it commands follow from a commanded wrench, and inlets are chosen
+    assert values_of(began_with)["rotor_drag_coefficient"] == 4e-4
+    assert values_of(began_with)["motor_constant"] == values_of(run.vehicle)["motor_constant"]
 
 
 def test_numbers_that_fly_otherwise_are_refused(run):
