@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from tuner.config import ControllerFile, VehicleFile
@@ -9,6 +10,7 @@ from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
+from tuner.flights.notes import NoteCode
 from tuner.objective.explained import Explained, Source, explained
 from tuner.objective.inlets import INLETS
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
@@ -19,6 +21,8 @@ rotors can be fed into a simulation that turns: real 100 Hz logs of commands tha
 to 0.5, one at 41 Hz of a faster loop has 0.0."""
 
 REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
+DROPPED = (NoteCode.OUT_OF_RANGE, NoteCode.NOT_A_NUMBER, NoteCode.OUTLIERS)
+"""What reading says of samples that it dropped for their values."""
 FED_BY: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
 """Inlet in which the simulated vehicle turns by what was recorded of its rotors -> that signal."""
 
@@ -100,20 +104,35 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
     RecordingError
         The recording does not hold what the inlet needs.
     """
+    preferred = next((inlet for inlet in INLETS.values() if inlet.is_preferred(flight)), None)
     if requested == "auto":
-        for inlet in INLETS.values():
-            if inlet.is_preferred(flight):
-                return inlet.name
+        if preferred is not None:
+            return preferred.name
+        fed = tuple(dict.fromkeys(signal for inlet in INLETS.values() for signal in inlet.needs))
         raise RecordingError(
             flight.path,
             "holds neither a reference with velocities, nor rate set-points, nor four motor "
-            "commands, nor four rotor speeds, nor thrust set-points",
+            "commands, nor four rotor speeds, nor thrust set-points" + _dropped(flight, fed),
             "name its trajectory in the job file",
         )
     (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)
     if not inlet.can_be_fed(flight):
         missing = " and no ".join(inlet.needs)
+        dropped = _dropped(flight, inlet.needs)
+        remedy = inlet.remedy
+        if preferred is None:
+            remedy = "inspect the recording: nothing in it can be fed in"
         raise RecordingError(
-            flight.path, f"holds no {missing} for the {inlet.name} inlet", inlet.remedy
+            flight.path, f"holds no {missing} for the {inlet.name} inlet{dropped}", remedy
         )
     return inlet.name
+
+
+def _dropped(flight: Flight, signals: Sequence[str]) -> str:
+    """Return how many samples of some signals were dropped as corrupt, as a clause."""
+    counts = [
+        (signal, sum(n.count for n in flight.notes if n.code in DROPPED and signal in n.names))
+        for signal in signals
+    ]
+    parts = [f"{count} {name.replace('_', ' ')} samples" for name, count in counts if count]
+    return f": {' and '.join(parts)} were dropped as corrupt" if parts else ""

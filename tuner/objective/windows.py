@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, InitialState, Series
@@ -24,6 +25,9 @@ FEWEST = 8
 """Poses that a stretch must hold to be a window."""
 UNFED = 0.25
 """Share of a window for which what is fed in may be unknown at a time, if not two samples."""
+STEADY = 0.6
+"""Share of the gaps between samples that are about as long in what was logged slowly: what is left
+of a signal that was mostly corrupt has gaps of all lengths."""
 MOSTLY = 0.5
 """Share of a flight that must make windows: less of it is no flight to judge a vehicle by."""
 
@@ -148,11 +152,18 @@ def _is_fed(flight: Flight, first: int, last: int, fed: Collection[str]) -> bool
             known = series.time[np.isfinite(column)]
             if len(known) < 2:
                 return False
-            longest = max(UNFED * (end - begin), 2.0 * float(np.median(np.diff(known))))
+            longest = max(UNFED * (end - begin), 2.0 * _period(known))
             known = known[(known > begin) & (known < end)]
             if np.diff(known, prepend=begin, append=end).max() > longest:
                 return False
     return True
+
+
+def _period(time: NDArray[np.float64]) -> float:
+    """Return the s between samples; 0 of what is left of a signal most of which was dropped."""
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    return usual if np.mean(np.abs(steps - usual) < 0.5 * usual) > STEADY else 0.0
 
 
 def _window(flight: Flight, first: int, last: int, initial: InitialState | None) -> Window | None:

@@ -14,6 +14,7 @@ from tuner.config.job import Search
 from tuner.errors import ConfigError, RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Series
+from tuner.flights.notes import Note, NoteCode
 from tuner.flights.outliers import HONEST, sticking_out
 from tuner.job.check import said_once
 from tuner.job.findings import flights_worse, turning_unexplained
@@ -52,6 +53,35 @@ def test_a_flight_without_any_command_is_refused_in_one_line(flight):
     bare = without_commands(flight, -5.0, 50.0)
     with pytest.raises(RecordingError, match="no 1 s with command throughout"):
         windows_of(bare, 1.0, fed=("command",))
+
+
+def test_what_is_left_of_corrupt_commands_is_no_slow_log(flight, bag):
+    settings, command = settings_for(bag), flight.series["command"]
+
+    def with_rows(rows):
+        thinned = Series(command.time[rows], command.values[rows])
+        return replace(flight, series=dict(flight.series) | {"command": thinned})
+
+    generator = np.random.default_rng(3)
+    left = np.flatnonzero(generator.random(len(command.time)) < 0.05)
+    with pytest.raises(RecordingError, match="lacks a continuous command"):
+        recordings_of(settings, [with_rows(left)])
+    slow = np.arange(0, len(command.time), 20)  # the same number, at 5 Hz
+    (recording,) = recordings_of(settings, [with_rows(slow)])
+    assert recording.inlet == "actuator"
+
+
+def test_a_flight_whose_every_command_is_corrupt_is_said_to_be(flight, bag):
+    signals = {name: rows for name, rows in flight.signals.items() if name != "command"}
+    note = Note(NoteCode.OUT_OF_RANGE, "info", "motor", 4221, names=("command",))
+    bare = replace(flight, signals=signals, notes=(note,))
+    with pytest.raises(RecordingError, match="4221 command samples were dropped as corrupt"):
+        recordings_of(settings_for(bag), [bare])
+    poses = {name: signals[name] for name in ("position", "attitude")}
+    nothing_to_feed = replace(bare, signals=poses)
+    with pytest.raises(RecordingError, match="nothing in it can be fed in") as caught:
+        recordings_of(settings_for(bag), [nothing_to_feed])
+    assert "use inlet: auto" not in str(caught.value)
 
 
 def test_a_flight_most_of_whose_commands_are_corrupt_is_left_out_by_name(flight, bag, monkeypatch):
