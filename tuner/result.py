@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import VehicleFile, read_vehicle
+from tuner.design.log_proposal import LogProposal
 from tuner.disk import exists
 from tuner.errors import InputError
 from tuner.files import FiniteOrNone, Part, ResultFile
@@ -246,7 +247,8 @@ class RunResult(ResultFile):
 
     ``coefficients`` is the first answer of a run, what is true of the vehicle; ``effective`` the
     second, None where the target simulator lacks nothing and both are the same. ``selection`` holds
-    the terms that the fit could have added, empty where it was not asked.
+    the terms that the fit could have added, empty where it was not asked; ``next_log`` what to log
+    next time, the most helpful signal first.
     """
 
     FILE = "result.json"
@@ -263,6 +265,7 @@ class RunResult(ResultFile):
     search: SearchResult
     selection: tuple[SelectionRow, ...] = ()
     effective: EffectiveResult | None = None
+    next_log: tuple[LogProposal, ...] = ()
     sources: dict[str, Sources] = Field(default_factory=dict)
 
 

@@ -53,6 +53,12 @@ class Examination:
     full_problem: FullProblem
     information: FisherInformation
 
+    @property
+    def known(self) -> Array:
+        """The information (K, K) about the fitted coefficients, priors included."""
+        count = len(self.full_problem.fitted)
+        return np.asarray(self.information.total[:count, :count])
+
 
 def examine(
     fitted: Fitted,

@@ -11,6 +11,7 @@ from pydantic import JsonValue
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import VehicleFile, write_vehicle
+from tuner.design.log_proposal import LogProposal
 from tuner.disk import write_text
 from tuner.files import csv_text
 from tuner.job.best_fit import (
@@ -69,6 +70,7 @@ def result_of(
     command: str = "",
     selection: tuple[SelectionRow, ...] = (),
     effective: EffectiveResult | None = None,
+    next_log: tuple[LogProposal, ...] = (),
 ) -> RunResult:
     """Assemble ``result.json``."""
     settings = job.settings
@@ -106,6 +108,7 @@ def result_of(
         ),
         selection=selection,
         effective=effective,
+        next_log=next_log,
     )
 
 

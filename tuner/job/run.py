@@ -38,6 +38,7 @@ from tuner.job.folder import folder_for
 from tuner.job.held_out import Validation, validate
 from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
+from tuner.job.next_log import what_to_log
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
 from tuner.job.search import OnProgress, parameters_of
@@ -123,8 +124,7 @@ def run(
             job, fitted, examination, listener.on_message
         )
     uncertainty = examination.uncertainty
-    count = len(uncertainty.names)
-    sources = sources_of(fitted, uncertainty, examination.information.total[:count, :count])
+    sources = sources_of(fitted, uncertainty, examination.known)
     conflicts = ground_conflicts(sources)
     _report(conflicts, listener, force=True)
     listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
@@ -149,6 +149,8 @@ def run(
             on_progress=_reporting(listener),
             on_message=listener.on_message,
         )
+    with span("what to log"):
+        next_log = what_to_log(job, fitted, examination.known, vehicle)
     result = result_of(
         job,
         fitted,
@@ -158,6 +160,7 @@ def run(
         command=command,
         selection=selected.rows,
         effective=None if effective is None else effective.result,
+        next_log=next_log,
     )
     with span("results"):
         write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)

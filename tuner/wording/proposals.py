@@ -30,7 +30,7 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
             gains.setdefault(best.name, []).append((share, label))
     sentences = []
     for flight, shares in sorted(gains.items(), key=lambda item: min(item[1])):
-        effects = listed([_effect(share, label) for share, label in sorted(shares)])
+        effects = listed([effect(share, label) for share, label in sorted(shares)])
         sentences.append(f"{flight[0].upper()}{flight[1:]} would {effects}.")
     if not_narrowed:
         sentences.append(
@@ -40,9 +40,14 @@ def proposals_in_words(proposals: Proposals) -> list[str]:
     return sentences
 
 
-def _effect(share: float, label: str) -> str:
+def effect(share: float, label: str) -> str:
+    """Return what would become of an interval that keeps a share of its width; of all by default.
+
+    ``label`` names the coefficient.
+    """
+    of = f"the interval of {label}" if label else "every interval"
     if HALVED[0] <= share <= HALVED[1]:
-        return f"halve the interval of {label}"
+        return f"halve {of}"
     if share < HALVED[0]:
-        return f"narrow the interval of {label} to {share:.0%} of what it is"
-    return f"narrow the interval of {label} by {1 - share:.0%}"
+        return f"narrow {of} to {share:.0%} of what it is"
+    return f"narrow {of} by {1 - share:.0%}"

@@ -11,6 +11,7 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, SignalErrors
 from tuner.comparison.tabulate import table_of
 from tuner.config import VehicleFile, read_vehicle, values_of, write_vehicle
+from tuner.design.log_proposal import LogProposal
 from tuner.examination.sensitivity_json import (
     CoefficientKnowledge,
     EffectOverTime,
@@ -271,6 +272,9 @@ def _result(
                 kept=False,
                 reason=SelectionCode.IMMATERIAL,
             ),
+        ),
+        next_log=(
+            LogProposal(signal="command", change="faster", rate=200.0, shrinks={"mass": 0.7}),
         ),
         search=SearchResult(
             method="gradient",

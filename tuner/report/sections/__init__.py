@@ -21,6 +21,7 @@ from tuner.report.sections.forces import forces
 from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
+from tuner.report.sections.next_log import next_log
 from tuner.report.sections.profiles import profiles
 from tuner.report.sections.provenance import provenance
 from tuner.report.sections.refits import refits
@@ -43,6 +44,7 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     effects,
     information,
     next_flight,
+    next_log,
     profiles,
     global_sensitivity,
     residuals,
