@@ -111,14 +111,14 @@ def beyond_noise(criterion: Criterion) -> float:
 def _information(fitted: Fitted, signal: str, noise: float) -> Array:
     """Return the information (K, K) of a signal at the fitted point, were it logged."""
     objective, criterion = fitted.objective, fitted.criterion
+    others = objective.segments.measured.values()
+    ends = np.max([np.asarray(other.time).max(axis=0) for other in others], axis=0)
     seconds = objective.samples / float(objective.schedule.log_rate)
-    time = np.arange(1, max(int(seconds * RATE), 2)) / RATE
-    count, width = objective.segments.count, 3 if signal == "body_rate" else 4
-    shape = (len(time), width, count)
+    time = np.repeat(np.arange(1, max(int(seconds * RATE), 2))[:, None] / RATE, len(ends), axis=1)
+    width = 3 if signal == "body_rate" else 4
+    weight = np.repeat((time <= ends)[:, None] / noise, width, axis=1)
     measured = Measured(
-        time=jnp.asarray(np.repeat(time[:, None], count, axis=1)),
-        values=jnp.zeros(shape),
-        weight=jnp.full(shape, 1.0 / noise),
+        time=jnp.asarray(time), values=jnp.zeros(weight.shape), weight=jnp.asarray(weight)
     )
     alone: Objective = eqx.tree_at(lambda o: o.segments.measured, objective, {signal: measured})
     scale = {signal: jnp.full(objective.flights, beyond_noise(criterion))}

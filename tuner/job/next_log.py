@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from tuner.design.next_log import (
     share_at_twice_the_rate,
     signals_to_add,
 )
+from tuner.errors import InputError
 from tuner.flights.flight import Series
 from tuner.job.prepare import Job, job_of
 from tuner.objective.inlets import INLETS, STEADY_TORQUE, TURNING
@@ -46,11 +48,10 @@ def what_to_log(
     vehicle
         With the fitted coefficients.
     """
-    found = [
-        *signals_to_add(fitted, known, job.inlets, vehicle),
-        *_faster(job, fitted),
-        *_fed(job, fitted),
-    ]
+    found = signals_to_add(fitted, known, job.inlets, vehicle)
+    for otherwise in (_faster, _fed):
+        with suppress(InputError):  # of so few samples no flight can be simulated
+            found += otherwise(job, fitted)
     useful = [proposal for proposal in found if min(proposal.shrinks.values()) < WORTH_LOGGING]
     return tuple(sorted(useful, key=lambda proposal: min(proposal.shrinks.values())))
 
@@ -67,7 +68,7 @@ def _faster(job: Job, fitted: Fitted) -> list[LogProposal]:
     signal = INLETS[inlets.pop()].needs[0]
     losses = [_loss(fitted, fitted.objective)]
     for every in (2, 4):
-        rows = [_thinned(recording, signal, every) for recording in job.recordings]
+        rows = [_thinned(r, signal, every) for r in job.recordings if not r.holdout]
         coarser = job_of(job.settings, rows).objective.segments
         if coarser.count != segments.count:
             return []

@@ -11,6 +11,7 @@ from tuner.config import values_of
 from tuner.design import next_log as design
 from tuner.design.log_proposal import LogProposal
 from tuner.design.next_log import errors_of
+from tuner.errors import RecordingError
 from tuner.flights.flight import Series
 from tuner.job import next_log
 from tuner.job.next_log import what_to_log
@@ -92,6 +93,20 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     assert (faster.signal, faster.change) == ("command", "faster")
     assert faster.rate == pytest.approx(400.0, rel=0.01)
     assert 0.5 <= faster.shrinks["motor_constant"] < 1.0
+
+
+def test_a_log_too_slow_to_be_thinned_is_no_error(full_flight, full_bag, updated, monkeypatch):
+    def refused(_, recordings):
+        assert [recording.flight.name for recording in recordings] == [full_flight.name]
+        raise RecordingError("full_circle", "holds no 0.5 s with rotor speed throughout", "")
+
+    job = job_through("rotor_speed", full_flight, full_bag, updated, free=FREE[2:])
+    elsewhere = replace(job.recordings[0], flight=with_series(full_flight, rotor_speed=None))
+    held_out = replace(elsewhere, holdout=True)
+    job = replace(job, recordings=(*job.recordings, held_out))
+    monkeypatch.setattr(next_log, "job_of", refused)
+    fitted = at_truth(job, updated)
+    assert what_to_log(job, fitted, np.eye(len(job.space)), updated) == ()
 
 
 @pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
