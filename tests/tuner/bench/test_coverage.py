@@ -92,10 +92,13 @@ def test_an_estimate_lies_near_the_truth(rig):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", RIGS)
-def test_the_truth_lies_in_the_interval_as_often_as_it_says(rig):
-    off = [deviations(rig(np.random.default_rng(seed))) for seed in range(200)]
+@pytest.mark.parametrize(
+    ("repeats", "least"), [(40, 0.85), pytest.param(200, 0.9, marks=pytest.mark.long)]
+)
+def test_the_truth_lies_in_the_interval_as_often_as_it_says(rig, repeats, least):
+    off = [deviations(rig(np.random.default_rng(seed))) for seed in range(repeats)]
     inside = np.mean(np.abs(np.concatenate(off)) < 1.959964)
-    assert 0.9 <= inside <= 0.995, inside
+    assert least <= inside <= (0.995 if repeats == 200 else 1.0), inside
 
 
 def test_a_second_lag_is_named():

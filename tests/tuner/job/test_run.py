@@ -137,7 +137,12 @@ def test_a_run_started_from_best_fit_starts_where_the_fit_ended(finished):
             assert getattr(flown[flight.name].rmse, axis) == pytest.approx(value, rel=1e-9)
 
 
-SHORT = {"fit": ["inertia_zz", "moment_constant"], "vehicle": "hovergames_updated"}
+NO_TERMS = str(Path(__file__).with_name("no_terms.yaml"))
+SHORT = {
+    "fit": ["inertia_zz", "moment_constant"],
+    "vehicle": "hovergames_updated",
+    "config": NO_TERMS,
+}
 
 
 def short_job():
@@ -182,6 +187,7 @@ def salvaged(broken, tmp_path_factory):
     """A run that the command made of it, and what it printed meanwhile."""
     out = tmp_path_factory.mktemp("salvaged") / "run"
     words = ["--flights", str(broken), "--fit", *SHORT["fit"], "--vehicle", SHORT["vehicle"]]
+    words += ["--config", NO_TERMS]
     printed = io.StringIO()
     with redirect_stdout(printed), redirect_stderr(printed):
         status = main([*words, "--out", str(out), "--quiet"])

@@ -10,12 +10,19 @@ from tuner.config import ControllerFile, configs_folder
 from tuner.errors import InputError
 from tuner.job.examination_files import arena_of
 
+FREE = ["motor_constant", "inertia_zz", "moment_constant"]
+
 
 @pytest.fixture(scope="module")
 def examined(bag, updated, tmp_path_factory):
     out = tmp_path_factory.mktemp("examined") / "out"
     return tuner.sensitivity(
-        [bag], vehicle=updated, controller=ControllerFile(), arena=(4.0, 4.0, 2.0), out=out
+        [bag],
+        vehicle=updated,
+        controller=ControllerFile(),
+        free=FREE,
+        arena=(4.0, 4.0, 2.0),
+        out=out,
     )
 
 
@@ -87,8 +94,8 @@ def test_the_other_way_round_is_refused_too(bag):
 def test_the_command_prints_a_line_for_each_coefficient(bag, tmp_path, capsys):
     vehicle = configs_folder() / "vehicles" / "hovergames_updated.yaml"
     out = tmp_path / "out"
-    words = ["sensitivity", "--flights", str(bag), "--vehicle", str(vehicle), "--out", str(out)]
-    assert main(words) == 0
+    words = ["sensitivity", "--flights", str(bag), "--vehicle", str(vehicle), "--fit", *FREE]
+    assert main([*words, "--arena", "4,4,2", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
     assert "rolling_moment_coefficient (fixed)" in shown
     assert "The worst determined combination of coefficients: " in shown
