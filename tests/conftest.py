@@ -38,6 +38,10 @@ settings.load_profile("project")
 
 MOST_MEMORY = 800 * 2**20
 """bytes of a test process at the end of a test beyond which its compiled programs are dropped."""
+GROWTH = 150 * 2**20
+"""bytes by which a process grows beyond what it could not give back before it tries again."""
+
+most_memory = MOST_MEMORY
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -65,13 +69,18 @@ def resident_memory() -> int:
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown() -> None:
-    """Give back what is free once the process has grown too large, then what jax has compiled."""
-    if "jax" not in sys.modules or resident_memory() <= MOST_MEMORY:
+    """Give back what is free once the process has grown too large, then what jax has compiled.
+
+    It takes a second: a process that stays large does not try after every test.
+    """
+    global most_memory  # noqa: PLW0603 (of this process)
+    if "jax" not in sys.modules or resident_memory() <= most_memory:
         return
     _give_back()
     if resident_memory() > MOST_MEMORY:
         sys.modules["jax"].clear_caches()
         _give_back()
+    most_memory = max(MOST_MEMORY, resident_memory() + GROWTH)
 
 
 def _give_back() -> None:
