@@ -17,7 +17,7 @@ from tuner.errors import InputError
 
 #: Function -> its command, and what each calls by another name or has alone.
 PEERS = {
-    api.fit: (tune_command, {"free": "fit", "fixed": "fix"}, {"quiet", "dry_run"}),
+    api.fit: (tune_command, {"free": "fit", "fixed": "fix"}, {"quiet", "dry_run", "profile"}),
     api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps"}),
     api.simulate: (simulate_command, {"grid": "sweep"}, {"quiet", "out"}),
     api.sensitivity: (sensitivity_command, {"free": "fit", "fixed": "fix"}, {"quiet"}),
