@@ -43,6 +43,11 @@ def links(page: Path) -> list[str]:
     return [*_LINK.findall(text), *_IMAGE.findall(text)]
 
 
+def figures(page: Path) -> list[str]:
+    """Return the names of the pictures of a page that a command has drawn."""
+    return [Path(link).name for link in _IMAGE.findall(prose(page)) if link.endswith(".svg")]
+
+
 def anchors(page: Path) -> set[str]:
     """Return the anchors of a page: those of its headings, and those that it sets itself."""
     text = _BLOCK.sub("", page.read_text(encoding="utf-8"))

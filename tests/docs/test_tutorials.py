@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands
+from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands, figures
 from tuner.cli import main
 
 pytestmark = pytest.mark.slow
@@ -69,6 +69,10 @@ def test_its_commands_run_and_print_what_it_shows(
     for block in blocks(page, "text"):
         for shown in block.splitlines():
             assert is_printed(shown, printed) or is_of_the_fit(shown, place), shown
+    drawn = {path.name for path in place.glob("runs/*/plots/*.svg")}
+    if not set(figures(page)) <= drawn:
+        drawn = {path.name for path in (request.getfixturevalue("demo")[0] / "plots").iterdir()}
+    assert set(figures(page)) <= drawn
 
 
 def is_printed(line: str, printed: str) -> bool:
