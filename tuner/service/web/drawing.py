@@ -97,8 +97,8 @@ def history_bars(history: CoefficientHistory) -> Bars:
         bars.append(Bar(x, y, under, over, point))
     every = -(-len(points) // 6)
     days = tuple(Tick(bar.x, _day(bar.point)) for bar in bars[::every])
-    values = (low + (high - low) * part for part in (0.1, 0.5, 0.9))
-    return Bars(tuple(bars), days, tuple(Tick(_up(v, low, high), f"{v:.4g}") for v in values))
+    values = tuple(Tick(_up(v, low, high), label) for v, label in _round_numbers(low, high))
+    return Bars(tuple(bars), days, values)
 
 
 def _day(point: Point) -> str:
@@ -117,6 +117,17 @@ def _up(value: float, low: float, high: float) -> float:
 def _whole_steps(first: int, last: int) -> list[int]:
     step = max(1, round((last - first) / 5))
     return list(range(first, last + 1, step))
+
+
+def _round_numbers(low: float, high: float) -> list[tuple[float, str]]:
+    """Return two to six round numbers between two others, with as many digits as they differ by."""
+    widest = (high - low) / 2
+    power = 10.0 ** math.floor(math.log10(widest))
+    step = max(factor * power for factor in (1, 2, 5) if factor * power <= widest)
+    leading = math.log10(max(abs(low), abs(high)))
+    digits = math.floor(leading) - math.floor(math.log10(step)) + 1
+    numbers = range(math.ceil(low / step), math.floor(high / step) + 1)
+    return [(number * step, f"{number * step:.{max(digits, 1)}g}") for number in numbers]
 
 
 def _decades(low: float, high: float) -> list[float]:
