@@ -19,7 +19,11 @@ HALF_WAY = 3
 """Iterations of the search."""
 JOB = {
     "vehicle": "hovergames",
-    "settings": {"free": ["motor_constant", "estimate_latency"], "terms": "none"},
+    "settings": {
+        "free": ["motor_constant", "estimate_latency"],
+        "terms": "none",
+        "search": {"max_iterations": 6},
+    },
 }
 
 
