@@ -10,6 +10,7 @@ import ast
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -121,8 +122,13 @@ def known_messages() -> list[Message]:
     return list(anchors.values())
 
 
-def sites() -> Iterator[tuple[str, list[Message]]]:
-    """Yield where each error is raised, as ``file:line``, and the messages that it may have."""
+@cache
+def sites() -> tuple[tuple[str, list[Message]], ...]:
+    """Return where each error is raised, as ``file:line``, and the messages that it may have."""
+    return tuple(_sites())
+
+
+def _sites() -> Iterator[tuple[str, list[Message]]]:
     for path in sorted(PACKAGE.rglob("*.py")):
         place = path.relative_to(PACKAGE).as_posix()
         topic = next(title for part, title in TOPICS.items() if part in place)
