@@ -22,6 +22,11 @@ SURE = 2.0
 """Standard deviations by which what was left out must be predicted better."""
 MEMORY = 2
 """Stretches over which residuals are taken to be correlated."""
+EARNING = (
+    SelectionCode.PREDICTS_FLIGHTS,
+    SelectionCode.PREDICTS_SECTIONS,
+    SelectionCode.SIGNIFICANT,
+)
 DETERMINED = 1e-8
 """Share of a group's information that must be left once the model's coefficients follow it."""
 
@@ -52,8 +57,8 @@ class Score:
 
     @property
     def earns_place(self) -> bool:
-        """Whether what was left out is predicted better."""
-        return self.reason in (SelectionCode.PREDICTS_FLIGHTS, SelectionCode.PREDICTS_SECTIONS)
+        """Whether it may stay in the model, or come into it."""
+        return self.reason in EARNING
 
 
 def score(
@@ -66,6 +71,10 @@ def score(
     gone: Columns | None = None,
 ) -> Score:
     """Return what a group is worth beside a model.
+
+    What is in the model stays where chance does not explain it and nothing left out contradicts it:
+    flights that are fitted without the one that shows most can predict hardly anything for sure.
+    What is not has to predict.
 
     A group with columns for each flight is nothing that other flights could predict: sections of
     the flight's own do, and flights count alike however strongly each shows it.
@@ -109,7 +118,8 @@ def score(
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
     minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
     chance = _chance(linear, model, group, minima)
-    if reason is SelectionCode.PREDICTS_SECTIONS and held_out.is_sure:
+    inside = neutral is not None and held_out.share > -held_out.scatter
+    if reason is SelectionCode.PREDICTS_SECTIONS or (inside and not held_out.is_sure):
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
@@ -118,7 +128,7 @@ def score(
     elif chance > limit:
         reason = SelectionCode.NOT_SIGNIFICANT
     elif not held_out.is_sure:
-        reason = SelectionCode.NOT_PREDICTED
+        reason = SelectionCode.SIGNIFICANT if inside else SelectionCode.NOT_PREDICTED
     return Score(fit.share, held_out.share, held_out.scatter, chance, reason)
 
 

@@ -17,6 +17,8 @@ class SelectionCode(StrEnum):
     """Kept: each flight is predicted better by a fit to the others that holds it."""
     PREDICTS_SECTIONS = "predicts_sections"
     """Kept: sections of the flights are, where one flight alone shows it."""
+    SIGNIFICANT = "significant"
+    """Kept: chance does not explain what it is worth, and nothing left out contradicts it."""
     ASKED_FOR = "asked_for"
     """Kept: the job file names it."""
     HOVERS_TILTED = "hovers_tilted"

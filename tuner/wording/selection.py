@@ -11,6 +11,8 @@ _REASONS = {
     SelectionCode.PREDICTS_FLIGHTS: "flights left out of the fit are predicted better with it",
     SelectionCode.PREDICTS_SECTIONS: "sections of flights left out of the fit are predicted better "
     "with it; no single flight is by the others",
+    SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
+    "of the fit contradicts it",
     SelectionCode.ASKED_FOR: "the job file names it",
     SelectionCode.HOVERS_TILTED: "every recording shows a hover that is not level",
     SelectionCode.NOT_SIGNIFICANT: "residuals that are correlated in time gain as much from chance",

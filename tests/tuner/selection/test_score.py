@@ -166,6 +166,18 @@ def test_a_term_in_the_model_is_worth_what_taking_it_away_would_cost():
     assert inside.earns_place
 
 
+def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
+    """Flights that show it unequally, in gusts: chance does not explain it, nor do they predict."""
+    before = linear_fit(0.8, 0.0, 0.8, 0.4, seed=14, gusts=True)
+    assert score(before, MODEL, FIRST, candidates=1).reason is SelectionCode.NOT_PREDICTED
+    after = moved_to_minimum(before, np.concatenate([MODEL, FIRST]))
+    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    assert inside.reason is SelectionCode.SIGNIFICANT
+    assert inside.earns_place
+    shared = score(after, MODEL, FIRST, candidates=10, neutral=np.zeros(4))
+    assert shared.reason is SelectionCode.NOT_SIGNIFICANT
+
+
 def by_flight(linear, column):
     """Return the same loss seen by a column of its own for each flight in the place of one."""
     others = np.delete(np.arange(4), column)
