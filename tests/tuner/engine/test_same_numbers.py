@@ -58,6 +58,7 @@ def vectors_around(point, count):
     return np.asarray(point.coefficients) + drawn
 
 
+@pytest.mark.slow
 def test_points_are_computed_alike_alone_and_in_a_row_here_and_elsewhere(problem, two_workers):
     objective, fitted = problem
     vectors = vectors_around(fitted.point, 3)
@@ -70,6 +71,7 @@ def test_points_are_computed_alike_alone_and_in_a_row_here_and_elsewhere(problem
     assert np.ptp(np.asarray(here.loss), axis=0).max() > 0.0
 
 
+@pytest.mark.slow
 def test_points_are_the_same_though_a_worker_is_lost(problem, two_workers):
     objective, fitted = problem
     vectors = vectors_around(fitted.point, 8)

@@ -42,9 +42,8 @@ def served(tmp_path, table):
     service.close()
 
 
-@pytest.mark.parametrize(
-    "examples", [EXAMPLES, pytest.param(MANY, marks=(pytest.mark.slow, pytest.mark.long))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("examples", [EXAMPLES, pytest.param(MANY, marks=pytest.mark.long)])
 def test_no_answer_is_a_fault_or_undocumented(served, examples):
     client, job = served
     schema = schemathesis.openapi.from_url(f"{client.base_url}/api/v1/openapi.json")
