@@ -66,6 +66,7 @@ def examine(
     names: Sequence[str] | None = None,
     offsets_fitted: NDArray[np.bool_] | None = None,
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> Examination:
     """Examine a fit, or a point where nothing was fitted.
 
@@ -81,6 +82,9 @@ def examine(
         (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     otherwise
         What might be simulated differently -> the problem so simulated, for the parts of errors.
+    in_doubt
+        Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
+        out of the model; empty where none was tried.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
@@ -107,6 +111,9 @@ def examine(
         )
         residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
     information = FisherInformation.joined(informations)
+    if in_doubt:
+        moves = [in_doubt.get(name, 0.0) for name in objective.space.names]
+        information = replace(information, in_doubt=np.array(moves))
     return Examination(
         uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
         freed={
@@ -143,6 +150,7 @@ def _restricted(information: FisherInformation, indices: NDArray[np.intp]) -> Fi
         prior=information.prior[square],
         ground=None if information.ground is None else information.ground[square],
         changes={name: change[:, indices] for name, change in information.changes.items()},
+        in_doubt=None if information.in_doubt is None else information.in_doubt[indices],
     )
 
 

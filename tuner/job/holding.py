@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +38,8 @@ def with_undetermined_held(
     fitted: Fitted,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
+    *,
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination]:
     """Return the fit once all that it does not identify is held, and its examination.
 
@@ -44,7 +47,11 @@ def with_undetermined_held(
     together they predict, even where the flights do not tell them apart, and each one's verdict
     says so.
     """
-    examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
+
+    def examined(fitted: Fitted) -> Examination:
+        return examine(fitted, otherwise=alternatives_of(fitted.objective), in_doubt=in_doubt)
+
+    examination = examined(fitted)
     segments = fitted.objective.segments
     predicts = segments.windowed and segments.freedom is None
     for _ in range(MAX_ROUNDS):
@@ -61,7 +68,7 @@ def with_undetermined_held(
             "others are fitted again."
         )
         fitted = hold(job, fitted, stand_ins, on_progress)
-        examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
+        examination = examined(fitted)
     return fitted, examination
 
 

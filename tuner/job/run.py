@@ -118,7 +118,9 @@ def run(
     job, fitted = selected.job, selected.fitted
     listener.on_message("Examining how well each coefficient is known.")
     with span("examination"):
-        fitted, examination = with_undetermined_held(job, fitted, on_progress, listener.on_message)
+        fitted, examination = with_undetermined_held(
+            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
+        )
     with span("balance"):
         fitted, examination, inertia = with_inputs_balanced(
             job, fitted, examination, listener.on_message

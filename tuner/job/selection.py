@@ -13,7 +13,7 @@ keeps its clocks.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +39,7 @@ from tuner.selection.candidates import (
     start_of,
     with_terms,
 )
+from tuner.selection.doubt import in_doubt
 from tuner.selection.linear import Linear, linear_at
 from tuner.selection.prediction import predicted_losses, vector_after
 from tuner.selection.score import Score, score, surviving
@@ -58,11 +59,19 @@ WORTH_FITTING = (
 
 @dataclass(frozen=True)
 class Selected:
-    """A job and its fit with the terms that were kept, and the table of all that were tried."""
+    """A job and its fit with the terms that were kept, and the table of all that were tried.
+
+    Attributes
+    ----------
+    in_doubt
+        Coefficient -> how far it would move, in the scaled coordinate, with terms that were tried
+        and not kept; empty where none was tried.
+    """
 
     job: Job
     fitted: Fitted
     rows: tuple[SelectionRow, ...] = ()
+    in_doubt: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -134,7 +143,21 @@ class Selection:
             outcomes=fitted.outcomes,
             point=Point(jnp.asarray(vector), _offsets(state.fitted, fitted.objective)),
         )
-        return Selected(job, fitted if state.added else self.fitted, self._rows(state, dropped))
+        rows = self._rows(state, dropped)
+        fitted = fitted if state.added else self.fitted
+        return Selected(job, fitted, rows, self._in_doubt(state, rows))
+
+    def _in_doubt(self, state: _State, rows: Sequence[SelectionRow]) -> dict[str, float]:
+        """Return how far each coefficient of the model would move with what is not in it."""
+        names = [*self.job.space.names, *_names(state.added)]
+        outside = [
+            self._columns(row.names)
+            for row in rows
+            if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
+        ]
+        moves = in_doubt(state.linear, self._columns(names), outside)
+        coefficients = [name for name in names if name not in conditions_in(self.candidates)]
+        return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
 
     def _wanted(self, state: _State, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
         """Return the groups to fit next: all that gain by more than chance, if one predicts.

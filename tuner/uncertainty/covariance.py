@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.inverse import Inverse
+from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.stretches import Stretches, stretches_of
 
 Array = NDArray[np.float64]
@@ -18,8 +18,6 @@ WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""
 MAX_LEVERAGE = 0.95
 """Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
-FEWEST_FREEDOM = 2.0
-"""Degrees of freedom: fewer would be a distribution without a variance."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +81,10 @@ def covariance_of(information: FisherInformation) -> Covariance:
     With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
     residuals' mean square. Gusts and model error are no white noise: stretches of time are summed
     up and their scores' spread takes the place of B (the sandwich estimate), each score corrected
-    for the stretch's own leverage on the fit. Few stretches make that estimate erratic: Student's
-    t with the degrees of freedom that they amount to takes the place of the normal distribution,
-    and an interval is never narrower than that of independent residuals. Both after Bell and
-    McCaffrey, "Bias reduction in standard errors for linear regression with multi-stage samples",
-    2002.
+    for the stretch's own leverage on the fit (Bell and McCaffrey, "Bias reduction in standard
+    errors for linear regression with multi-stage samples", 2002). Few stretches make that estimate
+    erratic: what is allowed for is weighed against what independent residuals would say, by the
+    degrees of freedom that the stretches amount to (`allowed_for`).
     """
     total = information.total
     inverse = Inverse.of(total, information.given)
@@ -95,9 +92,10 @@ def covariance_of(information: FisherInformation) -> Covariance:
     independent = inverse.sandwiched(white, information.given)
     meat, freedom = _scatter(stretches_of(information), total)
     nothing = np.zeros_like(total)
-    clustered = np.diag(inverse.sandwiched(meat, nothing)) * as_normal(freedom) ** 2
-    clustered = clustered + np.diag(inverse.sandwiched(nothing, information.given))
-    inflation = np.sqrt(np.maximum(clustered / np.diag(independent), 1.0))
+    of_noise, observed = (np.diag(inverse.sandwiched(inside, nothing)) for inside in (white, meat))
+    allowed = allowed_for(observed / np.maximum(of_noise, 1e-300), freedom)
+    from_flights = of_noise * (allowed**2 - 1.0)
+    inflation = np.sqrt(1.0 + from_flights / np.diag(independent))
     data = information.data + information.prior / WIDE**2
     data_inverse = Inverse.of(data, information.prior / WIDE**2).matrix
     matrix = independent * np.outer(inflation, inflation)
@@ -108,15 +106,6 @@ def covariance_of(information: FisherInformation) -> Covariance:
         inflation=inflation,
         beyond_noise=beyond_noise,
     )
-
-
-def as_normal(freedom: Array) -> Array:
-    """Return how much wider (K,) Student's t is than a normal distribution, at 95 %.
-
-    With so many degrees of freedom; a standard error times this says the same 95 % interval.
-    """
-    wide = stats.t.ppf(0.975, np.maximum(freedom, FEWEST_FREEDOM))
-    return np.asarray(wide / stats.norm.ppf(0.975))
 
 
 def _scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:

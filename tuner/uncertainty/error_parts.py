@@ -8,8 +8,8 @@ from tuner.files import FiniteOrNone, Part
 class ErrorParts(Part):
     """Standard errors of one coefficient, in its unit; the quoted one holds all of them.
 
-    Each is that of a normal distribution with the 95 % interval that is meant, which Student's t
-    widens where few stretches of time or few flights speak.
+    Each is that of a normal distribution with the 95 % interval that is meant, which is wider where
+    few stretches of time or few flights speak.
 
     Attributes
     ----------
@@ -19,7 +19,9 @@ class ErrorParts(Part):
         With all that is in them: disturbances and what the model lacks.
     left_out
         As the estimate moves when flights are left out in turn (parts of them where they are few);
-        None where there is one alone.
+        None where there are no three.
+    terms
+        As it would move with terms that were tried and not kept; None where none was tried.
     step
         Its move when the physics step is halved, and for a rotor's lag half of the finest step in
         which simulators take it; None where that was not asked.
@@ -28,4 +30,5 @@ class ErrorParts(Part):
     noise: FiniteOrNone
     residuals: FiniteOrNone
     left_out: FiniteOrNone = None
+    terms: FiniteOrNone = None
     step: FiniteOrNone = None

@@ -53,6 +53,8 @@ class FisherInformation:
         (K, K): what ground measurements contribute, as data of their own; None without.
     changes
         What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
+    in_doubt
+        (K,) how far the estimates would move with terms that were left out; None if none was tried.
     """
 
     channels: tuple[str, ...]
@@ -67,6 +69,7 @@ class FisherInformation:
     scale: Array
     ground: Array | None = None
     changes: Mapping[str, Array] = field(default_factory=dict)
+    in_doubt: Array | None = None
 
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:

@@ -1,4 +1,4 @@
-"""What a standard error is made of: noise, residuals, flights that disagree, physics steps."""
+"""What a standard error is made of: noise, residuals, flights, terms, physics steps."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.alternatives import STEP
-from tuner.uncertainty.covariance import as_normal
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.inverse import Inverse
+from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.stretches import parts_of
 
 Array = NDArray[np.float64]
@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 SIMULATORS_STEP = 1.0 / 4000.0
 """s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
 step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order."""
+FEWEST = 3
+"""Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
 TELLS = 1e-3
 """Share of a variance by which it must grow without a flight that tells of the coefficient."""
 
@@ -30,18 +32,20 @@ class Spread:
     noise: Array
     residuals: Array
     left_out: Array | None
+    terms: Array | None
     step: Array | None
 
     @property
     def quoted(self) -> Array:
         """The honest standard error (K,).
 
-        Noise, residuals and left-out flights show the same errors in three ways, of which the
-        largest counts; what steps do comes on top.
+        Noise, residuals, left-out flights and left-out terms show the same errors in four ways, of
+        which the largest counts; what steps do comes on top.
         """
         error = np.maximum(self.noise, self.residuals)
-        if self.left_out is not None:
-            error = np.maximum(error, self.left_out)
+        for part in (self.left_out, self.terms):
+            if part is not None:
+                error = np.maximum(error, part)
         return error if self.step is None else np.hypot(error, self.step)
 
     def of(self, index: int, slope: float) -> ErrorParts:
@@ -76,6 +80,7 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
         noise=noise_alone(information),
         residuals=residuals,
         left_out=left_out(information),
+        terms=information.in_doubt,
         step=moved.get(STEP),
     )
 
@@ -94,11 +99,11 @@ def left_out(information: FisherInformation) -> Array | None:
     right, the covariance of δ would be (H - H_i)⁻¹ - H⁻¹. The mean of the ratio of their squares
     scales the errors that H speaks for; a flight counts by how much it tells of the coefficient.
     (The plain jackknife takes all flights for alike, and one that alone tells of a coefficient for
-    one that contradicts the others.) Errors that last for a whole flight show here alone; Student's
-    t allows for how few the flights are.
+    one that contradicts the others.) Errors that last for a whole flight show here alone; few
+    flights leave open how large they are (`allowed_for`).
     """
     parts = parts_of(information)
-    if parts.count == 1:
+    if parts.count < FEWEST:
         return None
     total = information.total
     inverse = Inverse.of(total, information.given)
@@ -113,7 +118,7 @@ def left_out(information: FisherInformation) -> Array | None:
         squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
     beyond = (weights * squares).sum(axis=0) / of_all
-    freedom = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
+    alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
+    allowed = allowed_for(beyond, alike - 1.0)  # one degree of freedom is the estimate's own
     given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
-    from_flights = np.maximum(known - given, 0.0) * beyond * as_normal(freedom) ** 2
-    return np.asarray(np.sqrt(from_flights + given))
+    return np.asarray(np.sqrt(np.maximum(known - given, 0.0) * allowed**2 + given))

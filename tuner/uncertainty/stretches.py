@@ -14,11 +14,12 @@ Array = NDArray[np.float64]
 STRETCH = 8.0
 """s beyond which what disturbs a flight is forgotten: gusts last a second, and the closed loop
 makes a slow wandering of them. Of lengths from 2 to 18 s the one whose intervals held the truth as
-often as they should, and were narrow (`benchmarks.calibration`)."""
+often as they should, and were narrow: linear refits to simulated flights in gusts."""
 FEWEST_STRETCHES = 16
 """Of short recordings, stretches are shorter, so that there are as many."""
 FEWEST_PARTS = 4
-"""Where there are fewer flights to leave out in turn, each is cut into parts."""
+"""Where there are fewer flights to leave out in turn, each is cut into parts, none of them shorter
+than a stretch: those would show what stretches show."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +44,9 @@ def stretches_of(information: FisherInformation) -> Stretches:
 def parts_of(information: FisherInformation) -> Stretches:
     """Return the flights as they can be left out in turn: whole, or a few parts of each."""
     ends = _ends(information)
-    each = -(-FEWEST_PARTS // len(ends))
-    return _cut(information, float(ends.max()) / each if each > 1 else np.inf)
+    longest = float(ends.max())
+    each = min(-(-FEWEST_PARTS // len(ends)), int(longest / STRETCH))
+    return _cut(information, longest / each if each > 1 else np.inf)
 
 
 def _ends(information: FisherInformation) -> Array:

@@ -53,6 +53,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "noise alone": parts.noise,
         "residuals": parts.residuals,
         "left-out flights": parts.left_out,
+        "left-out terms": parts.terms,
         "step": parts.step,
     }
     size = 1.0 if unit is not None else max(abs(value), 1e-300)

@@ -41,9 +41,9 @@ def test_an_interval_with_everything_that_bears_on_it() -> None:
 
 
 def test_the_parts_of_an_interval() -> None:
-    parts = ErrorParts(noise=4e-6, residuals=3e-5, left_out=1.5e-5, step=None)
+    parts = ErrorParts(noise=4e-6, residuals=3e-5, left_out=1.5e-5, terms=2e-5, step=None)
     assert parts_in_words(parts, None, 0.02) == (
-        "noise alone ±0.039 %, residuals ±0.29 %, left-out flights ±0.15 %"
+        "noise alone ±0.039 %, residuals ±0.29 %, left-out flights ±0.15 %, left-out terms ±0.2 %"
     )
     assert parts_in_words(parts, "s", 0.02).startswith("noise alone ±0.0078 ms")
 
