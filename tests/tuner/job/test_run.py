@@ -100,6 +100,13 @@ def test_mass_and_rolling_moment_stay_as_given(finished):
 
 
 @pytest.mark.slow
+def test_no_term_is_added_to_flights_that_lack_none(finished):
+    table = finished[1].selection
+    assert len(table) > 5
+    assert not any(row.kept for row in table)
+
+
+@pytest.mark.slow
 def test_the_set_ups_integrator_is_identified_and_reported(finished):
     codes = [finding.code for finding in finished[1].findings]
     assert codes.count(Code.SATURATION_FEEDBACK) == 1
@@ -149,6 +156,7 @@ def short_job():
     return Options([str(FLIGHTS / "yaw_spin_3rps.bag")], **SHORT)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_refits_to_other_flights_predict_give_errors_and_leave_the_fit(tmp_path):
     bags = [str(FLIGHTS / f"{name}.bag") for name in ("yaw_spin_3rps", "circle_3mps")]

@@ -65,6 +65,7 @@ def test_a_term_that_was_flown_is_found_and_its_interval_holds_the_truth():
         assert messages[0].startswith("The flights call for more than the base model"), seed
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_no_term_is_added_to_flights_that_lack_none():
     for seed in range(6):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -10,10 +12,11 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.errors import InputError
-from tuner.examination.examination import Examination, examine
 from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
+from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
+from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import Profile, Profiles
 
@@ -38,22 +41,25 @@ def fitted(objective: Objective) -> Fitted:
 
 
 @pytest.fixture(scope="module")
-def examination(fitted: Fitted) -> Examination:
-    return examine(fitted)
+def full_problem(fitted: Fitted) -> FullProblem:
+    return full_problem_of(fitted.objective, fitted.point)
 
 
 @pytest.fixture(scope="module")
-def known(examination: Examination, fitted: Fitted) -> Profile:
-    return profile_likelihood(
-        examination.full_problem, examination.uncertainty, fitted.criterion, "moment_constant"
-    )
+def uncertainty(fitted: Fitted) -> Uncertainty:
+    return uncertainty_of(fitted)
+
+
+@pytest.fixture(scope="module")
+def known(full_problem: FullProblem, uncertainty: Uncertainty, fitted: Fitted) -> Profile:
+    return profile_likelihood(full_problem, uncertainty, fitted.criterion, "moment_constant")
 
 
 @pytest.mark.slow
 def test_a_well_known_coefficients_profile_is_its_interval(
-    examination: Examination, known: Profile
+    uncertainty: Uncertainty, known: Profile
 ) -> None:
-    low, high = examination.uncertainty.estimates["moment_constant"].ci95
+    low, high = uncertainty.estimates["moment_constant"].ci95
     assert known.interval[0] is not None
     assert known.interval[1] is not None
     assert known.interval[1] - known.interval[0] == pytest.approx(high - low, rel=0.1)
@@ -62,13 +68,15 @@ def test_a_well_known_coefficients_profile_is_its_interval(
 
 @pytest.mark.slow
 def test_what_is_not_identifiable_has_an_open_profile(
-    examination: Examination, fitted: Fitted, known: Profile, tmp_path: Path
+    full_problem: FullProblem,
+    uncertainty: Uncertainty,
+    fitted: Fitted,
+    known: Profile,
+    tmp_path: Path,
 ) -> None:
     rough = {name: 30.0 * scale for name, scale in fitted.criterion.scale.items()}
     criterion = eqx.tree_at(lambda s: s.scale, fitted.criterion, rough)
-    rolling = profile_likelihood(
-        examination.full_problem, examination.uncertainty, criterion, "rolling_moment_coefficient"
-    )
+    rolling = profile_likelihood(full_problem, uncertainty, criterion, "rolling_moment_coefficient")
     assert rolling.interval == (None, None)
     Profiles(profiles=[known, rolling]).write(tmp_path)
     read = Profiles.read_if_any(tmp_path)
@@ -76,7 +84,8 @@ def test_what_is_not_identifiable_has_an_open_profile(
     assert read.profiles == [known, rolling]
 
 
-@pytest.mark.slow
-def test_an_unknown_coefficient_is_named(examination: Examination) -> None:
+def test_an_unknown_coefficient_is_named(uncertainty: Uncertainty) -> None:
+    sensitivity = SimpleNamespace(names=uncertainty.names)
+    examined: Any = SimpleNamespace(uncertainty=uncertainty, freed={}, sensitivity=sensitivity)
     with pytest.raises(InputError, match="did you mean 'moment_constant'"):
-        _uncertainty_with(examination, "moment_constand")
+        _uncertainty_with(examined, "moment_constand")
