@@ -83,6 +83,43 @@ def _advanced(batch: tuple[State, Plant], shared: Plant, number: Int[Array, ""])
     return eqx.combine(per_vehicle, shared).sample(state, number)
 
 
+def begun(
+    vehicle: Vehicle,
+    controller: Controller,
+    schedule: Schedule,
+    inlet: Inlet,
+    start: Start,
+    *,
+    environment: Environment = NOTHING_AROUND,
+    limits: Limits | None = None,
+    gravity: float = GRAVITY,
+    precision: Precision | None = None,
+    reversible: bool = False,
+) -> tuple[Plant, State]:
+    """Return what is stepped, and the state at time 0; the arguments are those of `rollout`.
+
+    ``reversible``: whether reverse mode is to remember as little as can be.
+    """
+    _check_rotors(vehicle, inlet, start)
+    arguments = vehicle, controller, inlet, start, environment
+    dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
+    vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
+    shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
+    plant = Plant(
+        vehicle=vehicle,
+        controller=controller,
+        environment=environment,
+        schedule=schedule,
+        limits=Limits() if limits is None else limits,
+        gravity=gravity,
+        reversible=reversible,
+        inlet=inlet,
+        lag=_lag(vehicle, schedule),
+        gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
+    )
+    return plant, first_state(start, vehicle.motor, schedule, plant.gyro, shape)
+
+
 def rollout(
     vehicle: Vehicle,
     controller: Controller,
@@ -142,25 +179,20 @@ def rollout(
         The inlet or the start is for another number of rotors than the vehicle's, or the inlet
         needs the mixer and the vehicle is no quadrotor.
     """
-    _check_rotors(vehicle, inlet, start)
-    arguments = vehicle, controller, inlet, start, environment
-    dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
-    vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
-    shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
-    plant = Plant(
-        vehicle=vehicle,
-        controller=controller,
+    plant, first = begun(
+        vehicle,
+        controller,
+        schedule,
+        inlet,
+        start,
         environment=environment,
-        schedule=schedule,
-        limits=Limits() if limits is None else limits,
+        limits=limits,
         gravity=gravity,
+        precision=precision,
         reversible=horizon is None,
-        inlet=inlet,
-        lag=_lag(vehicle, schedule),
-        gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
-    causes = vehicle, controller, environment.at_first
-    first = first_state(start, vehicle.motor, schedule, plant.gyro, shape)
+    shape = jnp.shape(first.crash_time)
+    causes = plant.vehicle, plant.controller, plant.environment.at_first
     state = replaced(following(first, causes), crash_time=first.crash_time)
 
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:

@@ -43,6 +43,7 @@ class Code(StrEnum):
     TURNING_UNEXPLAINED = "turning_unexplained"  # explained (share)
     INERTIA_BALANCED = "inertia_balanced"  # error, NAME_fitted, NAME_balanced; names: NAMEs
     INERTIA_NOT_BALANCED = "inertia_not_balanced"  # likewise
+    DISTURBANCES_FOLLOWED = "disturbances_followed"  # gust, thrust (shares), both _seconds
     INPUT_LATE = "input_late"  # seconds
     GYRO_OFFSET = "gyro_offset"  # rate (rad/s); names: the axis
     FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise

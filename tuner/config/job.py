@@ -188,6 +188,10 @@ class JobFile(Section):
     terms
         What the fit may hold beyond Gazebo's motor model: ``auto`` adds those without which flights
         left out are predicted worse, ``none`` adds none; else the groups, or coefficients, to add.
+    disturbances
+        ``follow`` fits once more where the residuals hold more than measurement noise and rate and
+        thrust set-points were recorded: a Kalman filter follows what pushed the flights, which
+        takes some minutes; ``none`` leaves that to the intervals.
     target
         Which of a run's two answers the exports for simulators hold: ``gazebo``, the coefficients
         with which Gazebo, which lacks some of the terms, flies most like the vehicle; ``physical``,
@@ -217,6 +221,7 @@ class JobFile(Section):
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()
     terms: Literal["auto", "none"] | tuple[TermName, ...] = "auto"
+    disturbances: Literal["none", "follow"] = "none"
     target: Literal["gazebo", "physical"] = "gazebo"
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()

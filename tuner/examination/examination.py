@@ -9,6 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.filter_error.predictor import Predictor
 from tuner.objective.alternatives import residuals_at
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
@@ -67,6 +68,7 @@ def examine(
     offsets_fitted: NDArray[np.bool_] | None = None,
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
     in_doubt: Mapping[str, float] = MappingProxyType({}),
+    predictor: Predictor | None = None,
 ) -> Examination:
     """Examine a fit, or a point where nothing was fitted.
 
@@ -85,6 +87,8 @@ def examine(
     in_doubt
         Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
         out of the model; empty where none was tried.
+    predictor
+        Whose innovations say how well coefficients are known, rather than residuals.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
@@ -105,6 +109,8 @@ def examine(
         }
         informations.append(
             information_from_jacobian(*batch, jacobian, offsets_fitted=free, otherwise=moved)
+            if predictor is None
+            else predictor.among(flights).information(*batch, jacobian, free)
         )
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)

@@ -16,6 +16,7 @@ from tuner.comparison.tabulate import table_of
 from tuner.config import Options, Settings, settle, with_values, write_vehicle
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, EngineError, InputError, OutputError
+from tuner.examination.examination import Examination
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
@@ -24,6 +25,7 @@ from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check
 from tuner.job.cross_validation import cross_validate, jackknife_errors
+from tuner.job.disturbances import with_disturbances
 from tuner.job.effective import effective_fit
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.findings import (
@@ -115,12 +117,8 @@ def run(
     on_progress = _keeping_best(folder, listener)
     selected = _searched(job, folder, on_progress, findings, listener, resume=resume)
     drawing = BackgroundDrawing()
-    job, fitted = selected.job, selected.fitted
-    listener.on_message("Examining how well each coefficient is known.")
-    with span("examination"):
-        fitted, examination = with_undetermined_held(
-            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
-        )
+    job = selected.job
+    fitted, examination = _examined(selected, on_progress, listener)
     with span("balance"):
         fitted, examination, inertia = with_inputs_balanced(
             job, fitted, examination, listener.on_message
@@ -225,6 +223,23 @@ def _searched(
             f"Continue the search with --out {folder} --resume."
         )
         raise
+
+
+def _examined(
+    selected: Selected, on_progress: OnProgress, listener: Listener
+) -> tuple[Fitted, Examination]:
+    """Return the fit with what pushed the flights, or with what they leave open held.
+
+    And how well each coefficient is known.
+    """
+    job, fitted = selected.job, selected.fitted
+    with span("disturbances"):
+        followed = with_disturbances(job, fitted, on_progress, listener.on_message)
+    listener.on_message("Examining how well each coefficient is known.")
+    with span("examination"):
+        return followed or with_undetermined_held(
+            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
+        )
 
 
 def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:

@@ -12,10 +12,12 @@ from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
+from sim_jax.inlet import Inlet
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
+from sim_jax.state import Start
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
@@ -118,6 +120,34 @@ def simulate_segments(
     conditions
         Name, of `tuner.coefficients.conditions` -> what surrounds each segment, in its unit.
     """
+    start, inlet, environment = beginning_of(
+        model, segments, schedule, states=states, conditions=conditions
+    )
+    return rollout(
+        model.vehicle,
+        model.controller,
+        schedule,
+        inlet,
+        start,
+        samples=samples,
+        environment=environment,
+        horizon=horizon,
+        limits=limits,
+    )
+
+
+def beginning_of(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    states: Float[Array, "L F"] | None = None,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> tuple[Start, Inlet, Environment]:
+    """Return what segments start from, what is fed in and what surrounds them.
+
+    The arguments are those of `simulate_segments`.
+    """
     start, inlet = segments.start, segments.inlet
     markers = markers_of(model.vehicle)
     if markers is not None:
@@ -136,17 +166,7 @@ def simulate_segments(
     if states is not None and segments.freedom is not None:
         start = moved(start, states * segments.freedom)
         inlet = trimmed(inlet, model.vehicle, states * segments.freedom)
-    return rollout(
-        model.vehicle,
-        model.controller,
-        schedule,
-        inlet,
-        start,
-        samples=samples,
-        environment=environment,
-        horizon=horizon,
-        limits=limits,
-    )
+    return start, inlet, environment
 
 
 def accelerometer(

@@ -333,6 +333,17 @@ def _inertia_balanced(finding: Finding) -> str:
     )
 
 
+def _disturbances_followed(finding: Finding) -> str:
+    numbers = finding.numbers
+    return (
+        "The residuals hold more than measurement noise, as gusts leave it: a Kalman filter "
+        f"follows a push of {100.0 * numbers['gust']:.2g} % of the weight that lasts "
+        f"{numbers['gust_seconds']:.2g} s, and thrust that wanders by "
+        f"{100.0 * numbers['thrust']:.2g} % for {1e3 * numbers['thrust_seconds']:.0f} ms. The "
+        "coefficients are those that then predict every sample best from the ones before."
+    )
+
+
 def _flight_unmatched(finding: Finding) -> str:
     multiples = ", ".join(
         f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
@@ -350,6 +361,7 @@ SENTENCES: Mapping[Code, Callable[[Finding], str]] = {
     Code.SATURATION_FEEDBACK: _saturation_feedback,
     Code.FLIGHT_UNMATCHED: _flight_unmatched,
     Code.INLET_CHOSEN: _inlet_chosen,
+    Code.DISTURBANCES_FOLLOWED: _disturbances_followed,
     Code.INERTIA_BALANCED: _inertia_balanced,
     Code.INERTIA_NOT_BALANCED: _inertia_balanced,
     Code.SETPOINTS_SCALED: _setpoints_scaled,
@@ -361,6 +373,7 @@ REMEDIES: Mapping[Code, Callable[[Finding], str]] = {
     Code.SALVAGED: lambda _: "Record the flight again if what was lost matters.",
     Code.SATURATION_FEEDBACK: _saturation_remedy,
     Code.INLET_CHOSEN: _inlet_remedy,
+    Code.DISTURBANCES_FOLLOWED: lambda _: "",
     Code.INERTIA_BALANCED: lambda _: "",
     Code.INERTIA_NOT_BALANCED: lambda _: (
         "Take these inertias for effective ones, and measure them on the ground (tune bench)."

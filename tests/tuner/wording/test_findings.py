@@ -30,6 +30,12 @@ MADE = {
     Code.SPARSE_INPUT: Finding(
         Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
     ),
+    Code.DISTURBANCES_FOLLOWED: Finding(
+        Code.DISTURBANCES_FOLLOWED,
+        "info",
+        "flights",
+        {"gust": 0.0027, "gust_seconds": 1.0, "thrust": 0.004, "thrust_seconds": 0.02},
+    ),
     Code.INERTIA_BALANCED: Finding(
         Code.INERTIA_BALANCED,
         "info",

@@ -1,0 +1,121 @@
+"""Two gusty flights: the gust is learnt, the fit sharper than least squares, and honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim_jax.rollout import rollout
+from tests.tuner.uncertainty import making
+from tuner.filter_error.disturbances import COUNT, disturbance_of, processes_of
+from tuner.filter_error.predictor import Predictor, unscaled
+from tuner.filter_error.refit import with_least_innovations
+from tuner.flights.flight import Flight, InitialState, Series
+from tuner.objective.criterion import Point
+from tuner.objective.normal import Objective
+from tuner.objective.residuals import beginning_of, trace_of
+from tuner.uncertainty.covariance import covariance_of
+from tuner.uncertainty.information import information_at, information_from_jacobian
+
+pytestmark = pytest.mark.slow
+
+FREE = ("inertia_xx", "inertia_yy", "time_constant_up", "motor_constant", "rotor_drag_coefficient")
+STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03])
+OFFSETS = np.zeros((5, 2), bool)
+
+
+@eqx.filter_jit
+def flown(objective: Objective, pushes: jax.Array):
+    """Fly a problem at its truth, pushed by the processes' values (D, ticks, F)."""
+    model, segments, schedule = objective.model, objective.segments, objective.schedule
+    start, inlet, around = beginning_of(model, segments, schedule)
+    pushing = disturbance_of(pushes)
+    pushing = jax.tree.map(lambda leaf: leaf[0], pushing)  # their own axis of time for the ticks
+    flight = rollout(
+        model.vehicle,
+        model.controller,
+        schedule,
+        inlet,
+        start,
+        samples=objective.samples,
+        environment=replace(around, disturbance=pushing),
+        limits=objective.limits,
+    )
+    return trace_of(flight, model, segments).channels, flight.log.setpoints
+
+
+def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
+    """Return the problem and its flights with gusts, turbulence and measurement noise."""
+    rng, rate = np.random.default_rng(seed), 100.0
+    processes = processes_of(exact.model.vehicle, jnp.asarray(STRENGTHS), rate)
+    ticks = round(making.SECONDS * rate) + 2
+    pushes = np.zeros((COUNT, ticks, 2))
+    pushes[:, 0] = np.asarray(processes.sd)[:, None] * rng.standard_normal((COUNT, 2))
+    for tick in range(1, ticks):
+        fresh = np.sqrt(processes.added)[:, None] * rng.standard_normal((COUNT, 2))
+        pushes[:, tick] = np.asarray(processes.keeps)[:, None] * pushes[:, tick - 1] + fresh
+    channels, setpoints = flown(exact, jnp.asarray(pushes))
+    every, measured = making.SAMPLE_EVERY, {}
+    for channel, old in exact.segments.measured.items():
+        values = np.asarray(channels[channel])[every : exact.samples - 1 : every]
+        noise = rng.standard_normal(values.shape) * making.NOISE[channel]
+        if channel == "attitude":
+            noise[:, 0] *= 0.0
+            noise /= 2.0  # of small turns about nearly level axes
+        measured[channel] = replace(old, values=jnp.asarray(values + noise))
+    per_tick = exact.schedule.log_rate // exact.schedule.position_control_rate
+    stamps = np.arange(0, exact.samples, per_tick) / exact.schedule.log_rate
+    unknown = np.full(4, np.nan)
+    initial = InitialState(np.zeros(3), np.zeros(3), np.eye(4)[0], np.zeros(3), unknown, unknown)
+    flights = []
+    for number, name in enumerate(making.FLIGHTS):
+        rates = np.asarray(setpoints.rate.stacked())[:, ::per_tick, number].T
+        thrust = np.asarray(setpoints.thrust)[::per_tick, number, None]
+        series = {
+            "rate_setpoint": Series(stamps, rates),
+            "thrust_setpoint": Series(stamps, thrust),
+        }
+        flights.append(Flight(name, "", "", 100.0, stamps, {}, series, initial))
+    return eqx.tree_at(lambda o: o.segments.measured, exact, measured), flights
+
+
+@pytest.fixture(scope="module")
+def exact() -> Objective:
+    return making.problem(FREE)
+
+
+@pytest.fixture(scope="module")
+def fitted(exact: Objective) -> tuple[Objective, Predictor, Point]:
+    """A gusty pair, and where its innovations are least."""
+    problem, flights = gusty(exact, 1)
+    truth = making.truth(exact)
+    criterion = making.fitted_of(problem, truth).criterion
+    moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
+    predictor = Predictor.of(problem, truth, flights)
+    assert predictor is not None
+    return problem, *with_least_innovations(predictor, flights, (problem, truth, criterion), moves)
+
+
+def test_what_is_learnt_of_the_disturbances_is_what_pushed(fitted) -> None:
+    _, predictor, _ = fitted
+    gust = np.exp(predictor.strengths[0] - STRENGTHS[0])
+    assert 1.0 / 3.0 < gust < 3.0  # of twelve seconds, in which gusts last one
+
+
+def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fitted, exact) -> None:
+    problem, predictor, point = fitted
+    criterion = making.fitted_of(problem, point).criterion
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    plain = covariance_of(information_at(problem, point, criterion, offsets_fitted=OFFSETS)).error
+    assert np.median(error / plain) < 0.6
+    space = exact.space
+    missed = (np.asarray(point.coefficients) - space.initial) * space.slope(space.initial)
+    assert (np.abs(missed) < 3.5 * error).all()

@@ -1,0 +1,51 @@
+"""Fits that measurement noise alone is left of are not touched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from tuner.config import JobFile
+from tuner.job.disturbances import COLOURED, with_disturbances
+from tuner.job.prepare import Job
+from tuner.search.fitted import Fitted
+
+NOBODY = cast(Any, None)
+
+
+def fitted(scale: float) -> Fitted:
+    return Fitted(
+        objective=NOBODY,
+        point=NOBODY,
+        criterion=NOBODY,
+        noise={},
+        scales={"circle": {"position": 1.0, "command": scale}},
+        iterations=(),
+        outcomes=(),
+        method="gradient",
+        evaluations=0,
+        wall_time=0.0,
+        loss_initial=1.0,
+        loss_best=1.0,
+        converged=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("fit", "asked"),
+    [
+        (fitted(1.05), "follow"),
+        (replace(fitted(2.0 * COLOURED), polished=False), "follow"),
+        (fitted(2.0 * COLOURED), "none"),
+    ],
+    ids=["nothing but noise is left", "the search is not at its end", "not asked for"],
+)
+def test_nothing_is_fitted_again_without_need(fit: Fitted, asked: str) -> None:
+    said: list[str] = []
+    settings = SimpleNamespace(job=JobFile(disturbances=asked))
+    job = cast(Job, SimpleNamespace(settings=settings))
+    assert with_disturbances(job, fit, lambda *_: None, said.append) is None
+    assert said == []

@@ -1,0 +1,99 @@
+"""What disturbs a flight: forces and moments, each a first-order Gauss-Markov process.
+
+Gusts push as the world has it, slowly; thrust wanders fast, at each rotor by itself, which is a
+thrust and three moments in the body. Each process d has a standard deviation σ and a time constant
+τ: from one tick to the next it keeps exp(-h/τ) of itself.
+
+Source: Gelb, "Applied optimal estimation", 1974, ch. 2 (Gauss-Markov process).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+
+from sim_jax.disturbance import Disturbance
+from sim_jax.numeric import GRAVITY
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+
+STRENGTHS = ("gust", "lift", "roll", "turbulence", "gust_lasts", "turbulence_lasts")
+"""What is estimated of them: shares of the weight by which gusts push sideways and upwards, and
+which they would need at a rotor's arm to turn the vehicle as they do; the share of itself by which
+a rotor's thrust wanders; the s that both last."""
+USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03])
+"""Logarithms of what they are before anything is known."""
+LEAST = np.log([1e-6, 1e-6, 1e-6, 1e-6, 0.2, 0.005])
+MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15])
+"""Logarithms between which they are looked for."""
+SLOW = ("force_x", "force_y", "force_z", "moment_x", "moment_y")
+FAST = ("thrust", "moment_x", "moment_y", "moment_z")
+COUNT = len(SLOW) + len(FAST)
+
+
+class Processes(eqx.Module):
+    """The processes of a vehicle, those of `SLOW` and then those of `FAST`.
+
+    Attributes
+    ----------
+    sd
+        (D,) in N and N m.
+    keeps
+        (D,) share that a process keeps from one tick to the next.
+    """
+
+    sd: Float[Array, " D"]
+    keeps: Float[Array, " D"]
+
+    @property
+    def added(self) -> Float[Array, " D"]:
+        """The variances (D,) that come anew with every tick."""
+        return self.sd**2 * (1.0 - self.keeps**2)
+
+
+def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -> Processes:
+    """Return the processes of a vehicle.
+
+    Parameters
+    ----------
+    vehicle
+        Whose weight, arms and moment constant say what a share of a thrust is.
+    strengths
+        Logarithms of `STRENGTHS`.
+    rate
+        Hz of the ticks.
+    """
+    gust, lift, roll, turbulence, gust_lasts, turbulence_lasts = jnp.exp(strengths)
+    weight, count = vehicle.body.mass * GRAVITY, len(vehicle.rotors)
+    own = turbulence * weight / count
+    width = jnp.sqrt(sum(rotor.position.y**2 for rotor in vehicle.rotors))
+    length = jnp.sqrt(sum(rotor.position.x**2 for rotor in vehicle.rotors))
+    arm = (width + length) / (2.0 * count**0.5)
+    turning = vehicle.aerodynamics.moment_constant
+    sd = [gust * weight, gust * weight, lift * weight, roll * weight * arm, roll * weight * arm]
+    sd += [own * count**0.5, own * width, own * length, own * turning * count**0.5]
+    lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
+    return Processes(jnp.stack(sd), jnp.exp(-1.0 / rate / jnp.stack(lasts)))
+
+
+def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
+    """Return the disturbance that the processes' values are, the same throughout a tick."""
+    rows: dict[str, Array] = {}
+    for name, value in zip((*SLOW, *FAST), values, strict=True):
+        rows[name] = rows[name] + value if name in rows else value
+
+    def along(kind: str) -> Vec3:
+        still = jnp.zeros_like(values[0])
+        return Vec3(*(rows.get(f"{kind}_{axis}", still)[None] for axis in "xyz"))
+
+    return Disturbance(force=along("force"), thrust=rows["thrust"][None], moment=along("moment"))
+
+
+def within(strengths: Sequence[float] | np.ndarray) -> np.ndarray:
+    """Return strengths (6,), logarithms, inside their limits."""
+    return np.clip(strengths, LEAST, MOST)

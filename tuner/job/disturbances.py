@@ -1,0 +1,88 @@
+"""The coefficients once more with what pushed the flights, where something did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from tuner.examination.examination import Examination, examine
+from tuner.filter_error.predictor import Predictor, hidden
+from tuner.filter_error.recorded import FLIGHT_CONTROLLER
+from tuner.filter_error.refit import with_least_innovations
+from tuner.findings import Code, Finding
+from tuner.job.polish import polished
+from tuner.job.prepare import Job
+from tuner.job.search import free_offsets
+from tuner.objective.criterion import Point
+from tuner.search.fitted import Fitted
+from tuner.search.optimiser import Free
+from tuner.search.progress import Progress
+from tuner.uncertainty.full_problem import full_problem_of
+
+COLOURED = 1.2
+"""Residuals over measurement noise from which something else than noise must be in them."""
+
+
+def with_disturbances(
+    job: Job,
+    fitted: Fitted,
+    on_progress: Callable[[Job, Progress], None],
+    on_message: Callable[[str], None],
+) -> tuple[Fitted, Examination] | None:
+    """Return the fit in which what pushed the flights is estimated too, and its examination.
+
+    None where the job does not ask for it, where the residuals hold no more than noise, where
+    set-points were not recorded, and where nothing would be known better.
+    """
+    largest = max(max(scale.values()) for scale in fitted.scales.values())
+    if largest < COLOURED or not fitted.polished or job.settings.job.disturbances == "none":
+        return None
+    full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
+    predictor = Predictor.of(full.objective, full.point, job.fitted)
+    if predictor is None:
+        return None
+    clock = time.perf_counter()
+    names, count = full.objective.space.names, len(full.fitted)
+    moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
+    offsets = free_offsets(job)
+    enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
+    free = np.concatenate([moves & ~hidden(names), enter.ravel()])
+    on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
+    problem = full.objective, full.point, fitted.criterion
+    predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
+    again = polished(
+        job,
+        replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)),
+        free=Free((moves & hidden(names))[:count], offsets),
+        title="what set-points hide",
+        on_progress=lambda progress: on_progress(job, progress),
+        stages=1,
+    )
+    again = replace(
+        again,
+        wall_time=fitted.wall_time + time.perf_counter() - clock,
+        findings=(*again.findings, _finding(predictor)),
+    )
+    examination = examine(again, predictor=predictor)
+    return (again, examination) if _is_sharper(examination, examine(fitted)) else None
+
+
+def _is_sharper(new: Examination, old: Examination) -> bool:
+    """Return whether coefficients are known better, in the mean of their errors' logarithms."""
+    errors = [np.log(examination.uncertainty.covariance.error) for examination in (new, old)]
+    return bool(np.mean(errors[0] - errors[1]) < 0.0)
+
+
+def _finding(predictor: Predictor) -> Finding:
+    """Return what is said of the disturbances."""
+    gust, _, _, thrust, gust_seconds, thrust_seconds = np.exp(predictor.strengths).tolist()
+    numbers = {
+        "gust": gust,
+        "gust_seconds": gust_seconds,
+        "thrust": thrust,
+        "thrust_seconds": thrust_seconds,
+    }
+    return Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", numbers)
