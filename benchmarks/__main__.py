@@ -1,9 +1,9 @@
 """``python -m benchmarks [throughput derivatives ...] [--out FILE]``: measure, and write a page.
 
-Without names everything is measured and benchmarks/RESULTS.md written; with names the parts are
-printed. Two environment variables bring others into the comparison: TUNE_YARDSTICK, the folder of
-the C++ program, and TUNE_PEERS, a Python that has drone-models, crazyflow and mujoco installed
-(``pip install -e '.[bench]'`` puts them beside this project).
+Without names everything is measured that speaks of speed, and benchmarks/RESULTS.md written; with
+names the parts are printed. Two environment variables bring others into the comparison:
+TUNE_YARDSTICK, the folder of the C++ program, and TUNE_PEERS, a Python that has drone-models,
+crazyflow and mujoco installed (``pip install -e '.[bench]'`` puts them beside this project).
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ PARTS = (
     "workers",
     "prediction",
 )
+NO_SPEED = ("lab",)
+"""Parts that are measured by name alone: they take as long as all others together."""
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
 
@@ -47,7 +49,7 @@ def page(sections: list[Section], where: str, minutes: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("parts", nargs="*", choices=[[], *PARTS])
+    parser.add_argument("parts", nargs="*", choices=[[], *PARTS, *NO_SPEED])
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     began, where, sections = time.perf_counter(), machine(), list[Section]()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -21,6 +22,7 @@ RPM_PER_RAD_S = 60.0 / (2.0 * np.pi)
 PWM_LOW, PWM_SPAN = 1000, 1000
 #: s of hover at the first point before the set-points begin, as labs record them.
 HOVER_BEFORE = 2.0
+BATTERY = "/mavros/battery"
 ONLY_IN_FLIGHT = ("/mavros/setpoint_raw/attitude", "/mavros/rc/out")
 #: Mask of a reference that holds position, velocity and acceleration.
 NO_JERK_NO_SNAP = 2
@@ -52,14 +54,17 @@ TOPICS = {
     "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
     "/reference/flatsetpoint": "controller_msgs/msg/FlatTarget",
     "/trajectory_publisher/lap_completed": "std_msgs/msg/Int32",
+    BATTERY: "sensor_msgs/msg/BatteryState",
 }
 
 
 def write_bag(simulation: Simulation, path: Path) -> None:
     """Write a flight as MAVROS, a motion capture system and the trajectory publisher record one.
 
-    Two seconds of hover come first. Every message carries the time at which it is true; nothing is
-    noisy or late. Commands are PWM in whole µs, as autopilots send them. The file appears whole.
+    What comes before time zero is hover, without set-points and commands; where nothing does, two
+    seconds at the first point come first. Every message carries the time at which it is true;
+    nothing is late, or noisier than the flight. Commands are PWM in whole µs, as autopilots send
+    them. The file appears whole.
 
     Raises
     ------
@@ -80,6 +85,7 @@ def _write(simulation: Simulation, path: Path) -> None:
         connections = {
             topic: writer.add_connection(topic, kind, typestore=store)
             for topic, kind in TOPICS.items()
+            if topic != BATTERY or "battery_voltage" in simulation.signals
         }
         for topic, nanoseconds, message in _in_time(simulation, messages):
             raw = store.serialize_ros1(message, TOPICS[topic])
@@ -88,20 +94,25 @@ def _write(simulation: Simulation, path: Path) -> None:
 
 def _in_time(simulation: Simulation, messages: _Messages) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time in ns and message of the hover before the flight, then of the flight."""
-    step = float(simulation.time[1] - simulation.time[0])
-    resting = replace(
-        simulation, signals={name: values[:1] for name, values in simulation.signals.items()}
-    )
-    before = round(HOVER_BEFORE / step)
-    for number in range(before):
+    flown, step = simulation.time >= 0.0, float(simulation.time[1] - simulation.time[0])
+    mission, hover = _rows(simulation, flown), _rows(simulation, ~flown)
+    if not len(hover.time):
+        hover = _rows(simulation, np.zeros(round(HOVER_BEFORE / step), int))
+    for number in range(len(hover.time)):
         nanoseconds = EPOCH + round(number * step * 1e9)
-        for topic, message in messages.at(resting, 0, nanoseconds):
+        for topic, message in messages.at(hover, number, nanoseconds):
             if topic not in ONLY_IN_FLIGHT:
                 yield topic, nanoseconds, message
-    for index, seconds in enumerate(simulation.time):
-        nanoseconds = EPOCH + round((before * step + float(seconds)) * 1e9)
-        for topic, message in messages.at(simulation, index, nanoseconds):
+    for index, seconds in enumerate(mission.time):
+        nanoseconds = EPOCH + round((len(hover.time) * step + float(seconds)) * 1e9)
+        for topic, message in messages.at(mission, index, nanoseconds):
             yield topic, nanoseconds, message
+
+
+def _rows(simulation: Simulation, rows: NDArray[Any]) -> Simulation:
+    """Return some samples of a simulation."""
+    signals = {name: values[rows] for name, values in simulation.signals.items()}
+    return replace(simulation, time=simulation.time[rows], signals=signals)
 
 
 class _Messages:
@@ -163,12 +174,22 @@ class _Messages:
                 self._still,
             ),
         )
+        if "battery_voltage" in now and np.isfinite(now["battery_voltage"][0]):
+            yield BATTERY, self._battery(world, now["battery_voltage"][0])
         laps = flight.signals["lap"][:, 0]
         if index and laps[index] != laps[index - 1]:
             yield (
                 "/trajectory_publisher/lap_completed",
                 self._make("std_msgs/msg/Int32", int(laps[index])),
             )
+
+    def _battery(self, header: Any, volts: float) -> Any:
+        unknown, none = float("nan"), np.zeros(0, np.float32)
+        amounts = (unknown,) * 6  # temperature, current, charge, capacity, design and share of it
+        state = (0, 0, 0, True)  # power supply unknown, battery present
+        return self._make(
+            "sensor_msgs/msg/BatteryState", header, volts, *amounts, *state, none, none, "", ""
+        )
 
     def _imu(self, header: Any, attitude: Any, now: Mapping[str, list[float]]) -> Any:
         unknown = np.zeros(9)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,22 @@ def test_tune_reads_its_own_bag(circle, tmp_path):
                 atol=tolerance.get(name, 1e-12),
                 err_msg=name,
             )
+
+
+def test_what_comes_before_time_zero_is_hover_and_a_voltmeter_reads_now_and_then(circle, tmp_path):
+    rows = len(circle.time)
+    volts = np.where(np.arange(rows) % 10 == 0, 16.0 - 0.01 * circle.time, np.nan)[:, None]
+    signals = {**circle.signals, "battery_voltage": volts}
+    begun = replace(circle, time=circle.time - 1.0, signals=signals)
+    write_flights([begun], tmp_path / "circle.bag")
+    flight = load_flight(tmp_path / "circle.bag")
+    assert flight.duration == pytest.approx(3.0, abs=0.011)
+    read = flight.series["battery_voltage"]
+    np.testing.assert_allclose(read.values[:, 0], volts[::10, 0], rtol=1e-6)
+    np.testing.assert_allclose(read.time, circle.time[::10] - 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        flight.signals["position"][0], circle.signals["position"][100], atol=1e-12
+    )
 
 
 def test_the_same_flight_gives_the_same_bag(circle, tmp_path):

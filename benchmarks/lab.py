@@ -1,0 +1,162 @@
+"""How true fits of simulated lab flights are: bias and coverage of each coefficient, terms found.
+
+``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.lab_flights import Lab, drawn, write
+from benchmarks.table import Section, figure
+from tuner.coefficients import COEFFICIENTS
+from tuner.config import Options, settle, values_of
+from tuner.job.first_terms import with_first_terms
+from tuner.job.holding import with_undetermined_held
+from tuner.job.prepare import job_of
+from tuner.job.terms import search_with_terms
+from tuner.recordings import read_usable
+from tuner.uncertainty.estimates import Estimate
+
+SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A laboratory and what a fit made of its flights.
+
+    Attributes
+    ----------
+    lab
+        The truth.
+    found
+        Groups of terms in the fit.
+    estimates
+        Coefficient -> estimate, of those that are free and not held.
+    seconds
+        Of processor time.
+    """
+
+    lab: Lab
+    found: tuple[str, ...]
+    estimates: Mapping[str, Estimate]
+    seconds: float
+
+    def true(self, name: str) -> float:
+        """Return the true value of a coefficient."""
+        known, neutral = values_of(self.lab.vehicle), COEFFICIENTS[name].neutral
+        return known.get(name, 0.0 if neutral is None else neutral)
+
+
+def measure() -> Section:
+    """Fly, fit and compare every seed."""
+    trials = []
+    for seed in SEEDS:
+        trials.append(trial_of(seed))
+        print(_line(seed, trials[-1]), flush=True)
+    missed = [group for trial in trials for group in trial.lab.groups if group not in trial.found]
+    false = [group for trial in trials for group in trial.found if group not in trial.lab.groups]
+    flown = sum(len(trial.lab.groups) for trial in trials)
+    gusts = sum(trial.lab.gusts for trial in trials)
+    text = (
+        f"{len(trials)} laboratories ({gusts} with gusts), each with a vehicle, effects and set-up "
+        "of its own, three flights of 18 s fitted from the original coefficients with the mass "
+        f"given. Of {flown} groups of terms that were flown {flown - len(missed)} are found"
+        f"{_named('; missed', missed)}; {len(false)} are found that were not flown"
+        f"{_named('', false)}. Errors are shares of the truth, or, of what may be zero, of the "
+        "coefficient's usual size; the interval's half-width likewise. "
+        f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
+    )
+    head = ["coefficient", "fits", "mean error", "RMS error", "95 % interval ±", "hold the truth"]
+    return Section("Simulated lab flights", text, head, list(_rows(trials)))
+
+
+def trial_of(seed: int) -> Trial:
+    """Fly and fit the laboratory of a seed."""
+    lab = drawn(seed)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        paths = write(lab, folder, seed=seed)
+        settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+        recordings, _ = read_usable(settings)
+        job = with_first_terms(job_of(settings, recordings))
+        clock = time.process_time()
+        selected = search_with_terms(
+            job, folder, resume=False, on_progress=lambda *_: None, on_message=print
+        )
+        fitted, examination = with_undetermined_held(
+            selected.job, selected.fitted, lambda *_: None, print
+        )
+        seconds = time.process_time() - clock
+    free = {
+        name: estimate
+        for name, estimate in examination.uncertainty.estimates.items()
+        if name not in fitted.held
+    }
+    found = tuple(row.group for row in selected.rows if row.kept)
+    return Trial(lab, found, free, seconds)
+
+
+def _line(seed: int, trial: Trial) -> str:
+    """Return a trial in a line, as soon as it is there."""
+    errors = {name: _error(trial, name) for name in trial.estimates}
+    inside = [name for name in errors if _holds(trial, name)]
+    flown, found = set(trial.lab.groups), set(trial.found)
+    worst = sorted(errors, key=lambda name: -abs(errors[name]))[:6]
+    return (
+        f"seed {seed}{' with gusts' if trial.lab.gusts else ''}: {trial.seconds:.0f} s, missed "
+        f"{sorted(flown - found)}, false {sorted(found - flown)}, {len(inside)} of {len(errors)} "
+        f"intervals hold; {', '.join(f'{name} {100 * errors[name]:+.1f} %' for name in worst)}"
+    )
+
+
+def _rows(trials: Sequence[Trial]) -> list[list[str]]:
+    names = [name for name in COEFFICIENTS if any(name in trial.estimates for trial in trials)]
+    rows = []
+    for name in names:
+        having = [trial for trial in trials if name in trial.estimates]
+        errors = np.array([_error(trial, name) for trial in having])
+        half = np.mean([_half_width(trial, name) for trial in having])
+        held = sum(_holds(trial, name) for trial in having)
+        rows.append(
+            [
+                name,
+                str(len(having)),
+                f"{100 * errors.mean():+.2f} %",
+                f"{figure(100 * np.sqrt(np.mean(errors**2)))} %",
+                f"{figure(100 * half)} %",
+                f"{held} of {len(having)}",
+            ]
+        )
+    return rows
+
+
+def _size(trial: Trial, name: str) -> float:
+    """Return what errors of a coefficient are compared with."""
+    row, true = COEFFICIENTS[name], trial.true(name)
+    return max(abs(true), row.prior_sd) if row.scale == "linear" else abs(true)
+
+
+def _error(trial: Trial, name: str) -> float:
+    return (trial.estimates[name].value - trial.true(name)) / _size(trial, name)
+
+
+def _half_width(trial: Trial, name: str) -> float:
+    low, high = trial.estimates[name].ci95
+    return 0.5 * (high - low) / _size(trial, name)
+
+
+def _holds(trial: Trial, name: str) -> bool:
+    low, high = trial.estimates[name].ci95
+    return low <= trial.true(name) <= high
+
+
+def _named(what: str, groups: Sequence[str]) -> str:
+    return f"{what} ({', '.join(sorted(groups))})" if groups else ""

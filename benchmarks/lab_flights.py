@@ -1,0 +1,327 @@
+"""Simulated flights of a laboratory whose vehicle has more than Gazebo's motor model: truth known.
+
+The vehicle, which of the effects it has and how large they are, is drawn from a seed. It is flown
+by this project's own simulator, at a finer physics step than a fit takes, its battery sagging with
+the load; then recorded with noise, through markers that are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Environment
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.numeric import GRAVITY
+from sim_jax.rollout import Rollout, rollout
+from sim_jax.schedule import Schedule
+from sim_jax.state import hover
+from sim_jax.trim import in_trim
+from sim_jax.vector import Vec3
+from tuner.coefficients import term_groups
+from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, read_vehicle, with_values
+from tuner.disk import write_text
+from tuner.model import Model, model_of, schedule_of, with_terms_computed
+from tuner.simulation.bag import write_bag
+from tuner.simulation.simulate import Simulation
+from tuner.simulation.trajectory import Published, published
+from tuner.yaml_files.shipped import find_config
+
+Numbers = NDArray[np.float64]
+
+SECONDS, HOVER = 18.0, 2.0
+"""s of every flight, of which the publisher's wind-up takes ten; and of the hover before it."""
+RATE, PHYSICS = 100, 1600
+"""Hz of the recording, and of the physics that flies it: four times that of a fit."""
+TRAJECTORIES = {
+    "circle_3mps": TrajectorySettings(name="circle", speed_scale=2.1),
+    "lemniscate_4mps": TrajectorySettings(name="lemniscate", speed_scale=2.0),
+    "yaw_spin_3rps": TrajectorySettings(name="yaw_spin", yaw_rate=3.0),
+    "circle_4mps": TrajectorySettings(name="circle", speed_scale=2.9),
+}
+HOLDOUT = "circle_4mps"
+NOISE = {
+    "position": 5e-4,
+    "velocity": 5e-3,
+    "body_rate": 0.01,
+    "rotor_speed": 2.0,
+    "acceleration": 0.15,
+}
+"""White, in each signal's unit; poses are turned by `TURNED` rad about each axis."""
+TURNED = 1e-3
+VOLTS, CURRENT = 16.4, 5.0
+"""V of the fresh battery, and A of a rotor in hover; the current goes with the speed's cube."""
+METER, READ_EVERY = 0.02, 10
+"""V of the voltmeter's noise, and how many samples apart its readings are."""
+SAGS = 3
+"""Flights that find the voltage: each is flown on the battery that the last one drained."""
+GUST, GUST_TIME = 0.1, 1.0
+"""m/s, standard deviation of the wind along x and y, twice that along z; s, it forgets."""
+WANDER, WANDER_TIME = 0.004, 0.02
+"""Share by which each rotor's thrust wanders, and s in which it forgets."""
+
+
+@dataclass(frozen=True)
+class Lab:
+    """A vehicle with its set-up.
+
+    Attributes
+    ----------
+    vehicle
+        The truth.
+    groups
+        Groups of terms that it has.
+    resistance, drain
+        Ω of the battery, and V per A s by which it declines.
+    gusts
+        Whether the air moves.
+    """
+
+    vehicle: VehicleFile
+    groups: tuple[str, ...]
+    resistance: float
+    drain: float
+    gusts: bool
+
+
+def drawn(seed: int) -> Lab:
+    """Return the laboratory of a seed; every other one has gusts."""
+    random = np.random.default_rng(seed)
+
+    def between(low: float, high: float, *, signed: bool = False) -> float:
+        sign = random.choice([-1.0, 1.0]) if signed else 1.0
+        return float(sign * random.uniform(low, high))
+
+    base = read_vehicle(find_config("vehicles", "hovergames", Path()))
+    mass, hover_speed = between(1.7, 2.4), between(580.0, 680.0)
+    inertia, time_constant = between(0.018, 0.03), between(0.014, 0.022)
+    scales = np.exp(random.normal(0.0, 0.015, 4))
+    scales /= np.prod(scales) ** 0.25
+    effects = {
+        "battery": {"battery_exponent": 1.0},
+        "rotor_drag_ratio": {"rotor_drag_ratio_y": float(np.exp(between(0.15, 0.5, signed=True)))},
+        "fuselage_drag": {"fuselage_drag": between(0.015, 0.06)},
+        "thrust_inflow": {"thrust_inflow_coefficient": between(5e-5, 2e-4)},
+        "center_of_mass": {
+            "center_of_mass_x": between(0.001, 0.005, signed=True),
+            "center_of_mass_y": between(0.001, 0.005, signed=True),
+            "center_of_mass_z": between(0.005, 0.025, signed=True),
+        },
+        "rotor_thrust_scale": {
+            f"rotor_thrust_scale_{number}": float(scales[number - 1]) for number in range(1, 5)
+        },
+        "rotor_inertia": {"rotor_inertia": between(1e-5, 4e-5)},
+        "flapping_moment": {"flapping_moment_coefficient": between(3e-6, 1e-5)},
+        "marker_offset": {
+            f"marker_offset_{axis}": between(0.005, 0.04, signed=True) for axis in "xyz"
+        },
+        "marker_tilt": {
+            f"marker_tilt_{axis}": between(0.006, 0.025, signed=True) for axis in "xyz"
+        },
+    }
+    has = {group: bool(random.random() < 0.6) for group in effects}
+    has["marker_offset"] = has["marker_tilt"]  # a rigid body is either defined with care or not
+    values = {
+        "mass": mass,
+        "inertia_xx": inertia,
+        "inertia_yy": inertia * between(0.9, 1.2),
+        "inertia_zz": inertia * between(1.4, 1.8),
+        "input_scaling": between(920.0, 1060.0),
+        "zero_position_armed": between(80.0, 130.0),
+        "time_constant_up": time_constant,
+        "time_constant_down": time_constant * between(1.3, 1.9),
+        "motor_constant": mass * GRAVITY / 4.0 / hover_speed**2,
+        "moment_constant": between(0.015, 0.035),
+        "rotor_drag_coefficient": between(1e-4, 4e-4),
+        "estimate_latency": between(0.006, 0.015),
+        "actuator_latency": between(0.001, 0.004),
+    }
+    for group, coefficients in effects.items():
+        values |= coefficients if has[group] else {}
+    vehicle = with_values(base, values)
+    battery = vehicle.battery.replace(reference_voltage=VOLTS)
+    return Lab(
+        vehicle=vehicle.replace(battery=battery),
+        groups=tuple(group for group, there in has.items() if there),
+        resistance=between(0.006, 0.012),
+        drain=between(2e-4, 6e-4),
+        gusts=bool(seed % 2),
+    )
+
+
+def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
+    """Fly all trajectories, and write a recording of each beside the laboratory's job file."""
+    random = np.random.default_rng([seed, 1])
+    controller = ControllerFile()
+    fine = controller.replace(physics=controller.physics.replace(rate=float(PHYSICS)))
+    schedule = schedule_of(fine, log_rate=RATE)
+    sent = [
+        published(settings, duration=SECONDS, control_rate=schedule.position_control_rate)
+        for settings in TRAJECTORIES.values()
+    ]
+    air = _air(lab, random, schedule) if lab.gusts else None
+    own = {n: v for n, v in lab.vehicle.effects.items() if not n.startswith("marker")}
+    model = model_of(lab.vehicle.replace(effects=own), fine)
+    model = with_terms_computed(model, _all_terms())
+    volts = np.full((round(SECONDS * schedule.position_control_rate) + 2, len(sent)), VOLTS)
+    for _ in range(SAGS):
+        during = 0.5 * (volts + np.roll(volts, -1, axis=0))  # a tick, which takes one value
+        flown = _flier(schedule)(model, _references(sent), jnp.log(during / VOLTS), air)
+        volts = _voltage(lab, flown, len(volts))
+    if bool(jnp.isfinite(flown.crash_time).any()):
+        raise SystemExit(f"the vehicle of seed {seed} crashed")
+    paths = []
+    for number, (name, reference) in enumerate(zip(TRAJECTORIES, sent, strict=True)):
+        signals = _measured(lab, _signals(flown, number, reference, volts[:, number]), random)
+        paths.append(folder / f"{name}.bag")
+        time = np.arange(-round(HOVER * RATE), len(signals["lap"]) - round(HOVER * RATE)) / RATE
+        write_bag(Simulation(time, signals, None, {}), paths[-1])
+    job = f"mass: {lab.vehicle.mass!r}\ncontroller: hovergames\nholdout: [{HOLDOUT}]\n"
+    write_text(folder / "tune.yaml", job)
+    return paths
+
+
+def _all_terms() -> tuple[str, ...]:
+    """Return every term's coefficients but those of markers, through which `_measured` looks."""
+    names = (name for names in term_groups().values() for name in names)
+    return tuple(name for name in names if not name.startswith("marker"))
+
+
+def _references(sent: list[Published]) -> ReferenceInlet:
+    """Return the references side by side; a yaw spin is held level."""
+    points = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves, axis=-1), *(s.inlet.points for s in sent)
+    )
+    spins = jnp.stack([s.inlet.spins for s in sent])
+    rates = jnp.stack([s.inlet.yaw_rate for s in sent])
+    return ReferenceInlet(points, spins=spins, yaw_rate=rates, level_held=spins)
+
+
+@cache
+def _flier(schedule: Schedule) -> Callable[..., Rollout]:
+    """Return the compiled function that flies a laboratory's trajectories side by side."""
+
+    @eqx.filter_jit
+    def fly(
+        model: Model, inlet: ReferenceInlet, log_voltage: jax.Array, air: Disturbance | None
+    ) -> Rollout:
+        around = Environment(log_voltage=log_voltage, disturbance=air)
+        first = jax.tree.map(lambda leaf: leaf[0], inlet.points.position)
+        factor = around.speed_factor(
+            model.vehicle.effects["battery_exponent"], jnp.asarray(0), schedule
+        )
+        resting = jnp.ones(first.x.shape, bool)
+        start = hover(model.vehicle, first)
+        start = in_trim(model.vehicle, model.controller, start, resting, speed_factor=factor)
+        return rollout(
+            model.vehicle,
+            model.controller,
+            schedule,
+            inlet,
+            start,
+            samples=round(SECONDS * RATE),
+            environment=around,
+        )
+
+    return fly
+
+
+def _air(lab: Lab, random: np.random.Generator, schedule: Schedule) -> Disturbance:
+    """Return wind and thrust that wander, (ticks, flights), as Ornstein and Uhlenbeck's process."""
+    rate, flights = schedule.position_control_rate, len(TRAJECTORIES)
+    ticks = round(SECONDS * rate) + 4
+
+    def wandering(deviation: float, seconds: float, parts: int) -> Numbers:
+        keep = np.exp(-1.0 / rate / seconds)
+        steps = random.normal(size=(ticks, parts, flights)) * deviation * np.sqrt(1.0 - keep**2)
+        steps[0] /= np.sqrt(1.0 - keep**2)
+        return np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0))
+
+    wind = wandering(GUST, GUST_TIME, 3) * np.array([1.0, 1.0, 0.5])[:, None]
+    thrust = wandering(WANDER * lab.vehicle.mass * GRAVITY / 4.0, WANDER_TIME, 4)
+    places = np.array([rotor.position for rotor in lab.vehicle.rotors])
+    spins = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in lab.vehicle.rotors])
+    arms = (places[:, 1], -places[:, 0], -spins * lab.vehicle.aerodynamics.moment_constant)
+    return Disturbance(
+        gust=Vec3(*(jnp.asarray(wind[:, axis]) for axis in range(3))),
+        thrust=jnp.asarray(thrust.sum(axis=1)),
+        moment=Vec3(*(jnp.asarray(np.einsum("r,trf->tf", arm, thrust)) for arm in arms)),
+    )
+
+
+def _voltage(lab: Lab, flown: Rollout, ticks: int) -> Numbers:
+    """Return the voltage (ticks, flights) at control ticks of a battery that flights drain."""
+    weight = lab.vehicle.mass * GRAVITY / 4.0
+    hovering = np.sqrt(weight / lab.vehicle.aerodynamics.motor_constant)
+    speeds = np.stack([np.asarray(speed) for speed in flown.log.rotor_speed])
+    current = CURRENT * ((speeds / hovering) ** 3).sum(axis=0)
+    drawn_charge = np.cumsum(current, axis=0) / RATE
+    volts = VOLTS - lab.drain * drawn_charge - lab.resistance * current
+    return np.pad(volts, ((0, ticks - len(volts)), (0, 0)), mode="edge")
+
+
+def _signals(
+    flown: Rollout, number: int, reference: Published, volts: Numbers
+) -> dict[str, Numbers]:
+    """Return signal -> (samples, k) of a flight, the hover before it included."""
+    log = flown.log
+    motion, point = log.motion, reference.inlet.points
+    parts = {
+        "position": motion.position.stacked(),
+        "velocity": motion.velocity.stacked(),
+        "body_rate": motion.body_rate.stacked(),
+        "rotor_speed": jnp.stack(log.rotor_speed),
+        "command": jnp.stack(log.command),
+        "rate_setpoint": log.setpoints.rate.stacked(),
+        "thrust_setpoint": log.setpoints.thrust[None],
+    }
+    signals = {name: np.asarray(part)[..., number].T for name, part in parts.items()}
+    count = len(signals["position"])
+    for name in ("position", "velocity", "acceleration"):
+        signals[f"reference_{name}"] = np.asarray(getattr(point, name).stacked()).T[:count]
+    quaternion = motion.attitude
+    turns = Rotation.from_quat(
+        np.stack([np.asarray(getattr(quaternion, axis))[:, number] for axis in "xyzw"], axis=-1)
+    )
+    force = np.gradient(signals["velocity"], 1.0 / RATE, axis=0) + np.array([0.0, 0.0, GRAVITY])
+    signals["acceleration"] = turns.inv().apply(force)
+    signals["battery_voltage"] = volts[:count, None]
+    signals["lap"] = reference.lap[:count, None].astype(float)
+    signals["attitude"] = turns.as_quat(scalar_first=True)
+
+    before = round(HOVER * RATE)
+    return {name: np.pad(s, ((before, 0), (0, 0)), mode="edge") for name, s in signals.items()}
+
+
+def _measured(
+    lab: Lab, signals: Mapping[str, Numbers], random: np.random.Generator
+) -> dict[str, Numbers]:
+    """Return signals as they are measured: through the markers, with noise, the voltage rarely."""
+    effects = lab.vehicle.effects
+    offset, tilt = (
+        [effects.get(f"marker_{kind}_{axis}", 0.0) for axis in "xyz"] for kind in ("offset", "tilt")
+    )
+    true = Rotation.from_quat(signals["attitude"], scalar_first=True)
+    noise = Rotation.from_rotvec(TURNED * random.normal(size=(len(signals["lap"]), 3)))
+    measured = {
+        **signals,
+        "position": signals["position"] + true.apply(offset),
+        "attitude": (true * Rotation.from_rotvec(tilt) * noise).as_quat(scalar_first=True),
+    }
+    for name, deviation in NOISE.items():
+        measured[name] = measured[name] + deviation * random.normal(size=measured[name].shape)
+    read = np.arange(len(signals["lap"])) % READ_EVERY == 0
+    volts = measured["battery_voltage"] + METER * random.normal(size=(len(read), 1))
+    measured["battery_voltage"] = np.where(read[:, None], volts, np.nan)
+    return measured

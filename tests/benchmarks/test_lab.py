@@ -1,0 +1,47 @@
+"""The drawn laboratories are ones that fly, and the table of their fits counts right."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks.lab import Trial, _rows
+from benchmarks.lab_flights import drawn
+from sim_jax.numeric import GRAVITY
+from tuner.coefficients import term_groups
+from tuner.config import values_of
+
+SEEDS = range(8)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_drawn_vehicle_hovers_at_half_of_its_command(seed):
+    lab = drawn(seed)
+    values = values_of(lab.vehicle)
+    speed = np.sqrt(values["mass"] * GRAVITY / 4.0 / values["motor_constant"])
+    assert 0.4 < (speed - values["zero_position_armed"]) / values["input_scaling"] < 0.7
+    scales = [values.get(f"rotor_thrust_scale_{number}", 1.0) for number in range(1, 5)]
+    assert np.prod(scales) == pytest.approx(1.0)
+    assert drawn(seed) == lab
+
+
+def test_laboratories_differ_in_what_they_have():
+    labs = [drawn(seed) for seed in SEEDS]
+    assert len({lab.groups for lab in labs}) == len(labs)
+    assert sum(lab.gusts for lab in labs) == len(labs) / 2
+    for lab in labs:
+        there = {g for g, names in term_groups().items() if set(names) & set(lab.vehicle.effects)}
+        assert there == set(lab.groups)
+
+
+def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
+    lab = drawn(0)
+    true = values_of(lab.vehicle)["motor_constant"]
+
+    def trial(error, half):
+        value = true * (1.0 + error)
+        estimate = SimpleNamespace(value=value, ci95=(value - half * true, value + half * true))
+        return Trial(lab, (), {"motor_constant": estimate}, 1.0)
+
+    (row,) = _rows([trial(0.02, 0.03), trial(0.04, 0.01)])
+    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "1 of 2"]
