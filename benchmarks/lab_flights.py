@@ -46,7 +46,7 @@ RATE, PHYSICS = 100, 1600
 """Hz of the recording, and of the physics that flies it: four times that of a fit."""
 TRAJECTORIES = {
     "circle_3mps": TrajectorySettings(name="circle", speed_scale=2.1),
-    "lemniscate_4mps": TrajectorySettings(name="lemniscate", speed_scale=2.0),
+    "lemniscate_3mps": TrajectorySettings(name="lemniscate", speed_scale=1.5),
     "yaw_spin_3rps": TrajectorySettings(name="yaw_spin", yaw_rate=3.0),
     "circle_4mps": TrajectorySettings(name="circle", speed_scale=2.9),
 }
