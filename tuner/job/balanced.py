@@ -10,8 +10,9 @@ much worse.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from tuner.examination.examination import Examination, examine
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
+from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.many_points import sums_at
@@ -145,11 +147,16 @@ def _spread(values: Vector, axis: tuple[int, ...]) -> Vector:
 
 
 def with_inputs_balanced(
-    job: Job, fitted: Fitted, examination: Examination, on_message: Callable[[str], None]
+    job: Job,
+    fitted: Fitted,
+    examination: Examination,
+    on_message: Callable[[str], None],
+    *,
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination, tuple[Finding, ...]]:
     """Return the fit at which recorded motion and rotor speeds balance, or as it is; what to say.
 
-    With it the examination of what is returned.
+    With it the examination of what is returned; ``in_doubt`` is as for `examine`.
 
     Only where rotor speeds are fed in: how commands turn into them would have to be known first.
     """
@@ -174,7 +181,8 @@ def with_inputs_balanced(
         objective.space, np.asarray(segments.flight), point, fitted.criterion, scores
     )
     fitted = replace(fitted, point=point, loss_best=float(loss))
-    return fitted, examine(fitted), findings
+    otherwise = alternatives_of(fitted.objective)
+    return fitted, examine(fitted, otherwise=otherwise, in_doubt=in_doubt), findings
 
 
 def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, float]:

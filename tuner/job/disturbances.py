@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -31,8 +32,12 @@ def with_disturbances(
     fitted: Fitted,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
+    *,
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination] | None:
     """Return the fit in which what pushed the flights is estimated too, and its examination.
+
+    ``in_doubt`` is as for `tuner.examination.examination.examine`.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
     set-points were not recorded, and where nothing would be known better.
@@ -66,8 +71,9 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    examination = examine(again, predictor=predictor)
-    return (again, examination) if _is_sharper(examination, examine(fitted)) else None
+    examination = examine(again, predictor=predictor, in_doubt=in_doubt)
+    before = examine(fitted, in_doubt=in_doubt)
+    return (again, examination) if _is_sharper(examination, before) else None
 
 
 def _is_sharper(new: Examination, old: Examination) -> bool:

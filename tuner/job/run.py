@@ -121,7 +121,7 @@ def run(
     fitted, examination = _examined(selected, on_progress, listener)
     with span("balance"):
         fitted, examination, inertia = with_inputs_balanced(
-            job, fitted, examination, listener.on_message
+            job, fitted, examination, listener.on_message, in_doubt=selected.in_doubt
         )
     uncertainty = examination.uncertainty
     sources = sources_of(fitted, uncertainty, examination.known)
@@ -234,7 +234,9 @@ def _examined(
     """
     job, fitted = selected.job, selected.fitted
     with span("disturbances"):
-        followed = with_disturbances(job, fitted, on_progress, listener.on_message)
+        followed = with_disturbances(
+            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
+        )
     listener.on_message("Examining how well each coefficient is known.")
     with span("examination"):
         return followed or with_undetermined_held(
