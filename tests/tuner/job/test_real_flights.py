@@ -16,6 +16,7 @@ FITTED = ("B2_circle_fast_rep1", "B5_helix_medium_rep1")
 HELD_OUT = ("B2_circle_slow_rep1", "B3_figure8_medium_rep1")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.skipif(not FLIGHTS.is_dir(), reason=f"no real recordings in {FLIGHTS}")
 def test_held_out_flights_are_met_twice_as_well_as_by_the_unfitted_vehicle(tmp_path):
