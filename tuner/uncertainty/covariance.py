@@ -19,6 +19,9 @@ WIDE = 100.0
 MAX_LEVERAGE = 0.95
 """Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
 
+ROUNDING = 1e-9
+"""Share of a variance that the flights must have in it to say anything of it."""
+
 
 @dataclass(frozen=True)
 class Covariance:
@@ -93,8 +96,11 @@ def covariance_of(information: FisherInformation) -> Covariance:
     meat, freedom = _scatter(stretches_of(information), total)
     nothing = np.zeros_like(total)
     of_noise, observed = (np.diag(inverse.sandwiched(inside, nothing)) for inside in (white, meat))
-    allowed = allowed_for(observed / np.maximum(of_noise, 1e-300), freedom)
-    from_flights = of_noise * (allowed**2 - 1.0)
+    # where the prior alone speaks, what is left of the flights' share is rounding, of either sign
+    speaks = of_noise > ROUNDING * np.diag(independent)
+    ratio = np.where(speaks, observed / np.where(speaks, of_noise, 1.0), 1.0)
+    allowed = allowed_for(ratio, freedom)
+    from_flights = np.where(speaks, of_noise * (allowed**2 - 1.0), 0.0)
     inflation = np.sqrt(1.0 + from_flights / np.diag(independent))
     data = information.data + information.prior / WIDE**2
     data_inverse = Inverse.of(data, information.prior / WIDE**2).matrix
