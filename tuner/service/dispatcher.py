@@ -59,6 +59,7 @@ class Dispatcher:
             self._slots.put(slot)
         self._threads = ThreadPoolExecutor(max(1, settings.workers), "attempt")
         self._loop = threading.Thread(target=self._run, name="dispatcher", daemon=True)
+        self._held: dict[str, Claim] = {}
         self.deaths = 0
 
     def start(self) -> None:
@@ -89,11 +90,13 @@ class Dispatcher:
             try:
                 if time.monotonic() - looked_for_lost > self._settings.lease_seconds / 3:
                     looked_for_lost = time.monotonic()
+                    self._keep()
                     self._jobs.recover(own=False)
                 while not self._slots.empty() and not self._stopping.is_set():
                     claim = self._jobs.claim()
                     if claim is None:
                         break
+                    self._held[claim.word] = claim
                     self._threads.submit(self._work, claim, self._slots.get())
             except UnavailableError as error:
                 logger.warning("%s", error)
@@ -104,6 +107,11 @@ class Dispatcher:
             self._called.wait(LOOK)
             self._called.clear()
 
+    def _keep(self) -> None:
+        """Renew the leases of what is worked on: a result may take long to be stored."""
+        for claim in tuple(self._held.values()):
+            self._jobs.report(claim, (), {})
+
     def _work(self, claim: Claim, slot: int) -> None:
         try:
             self._attempt(claim, slot)
@@ -112,6 +120,7 @@ class Dispatcher:
             ours = f"this is a fault of ours: {type(error).__name__}"
             self._commit(claim, Outcome(State.FAILED, ours, exit_status=1))
         finally:
+            del self._held[claim.word]
             self._slots.put(slot)
             self._called.set()
 

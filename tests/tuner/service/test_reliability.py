@@ -21,8 +21,8 @@ import pytest
 from tests.tuner.service import serving
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.errors import InputError
+from tuner.service import attempt, jobs
 from tuner.service import database as database_module
-from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.queue import Outcome, Queue
 from tuner.service.request import JobRequest
@@ -188,6 +188,22 @@ def test_a_lease_that_is_renewed_is_not_taken_away(idle):
         time.sleep(0.1)
         assert first.report(claim, [], {})
         assert second.recover(own=False) == 0
+
+
+def test_a_result_that_takes_longer_to_store_than_a_lease_holds_is_not_fitted_again(
+    settings, table, monkeypatch
+):
+    store = attempt._stored
+
+    def slowly(*arguments):
+        time.sleep(2.5)
+        return store(*arguments)
+
+    monkeypatch.setattr(attempt, "_stored", slowly)
+    service = Service.open(replace(settings, lease_seconds=1.5))
+    with listening(service) as client:
+        done = ended(client, submit(client, upload(client, table.read_bytes())))
+        assert (done["state"], done["log"]) == ("done", ["begins at 0"])
 
 
 @pytest.mark.usefixtures("service")
