@@ -22,6 +22,7 @@ def selected(drag, *, seed=0, job=None, around=None):
     return result, messages
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("group", "around"),

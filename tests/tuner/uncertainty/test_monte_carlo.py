@@ -29,6 +29,7 @@ def refit(objective: Objective, start: Point) -> Point:
     return Point(jnp.asarray(step.point.coefficients[0]), jnp.asarray(offsets))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_standard_errors_are_the_spread_of_refits() -> None:
     exact = making.problem(FREE)
