@@ -124,7 +124,8 @@ def test_cancelling_stops_the_worker_and_a_retry_goes_on(client, recording):
     again = client.post(f"/api/v1/jobs/{job}/cancel")
     assert again.status_code == 409
     assert again.json()["detail"] == f"job {job}: is cancelled; there is nothing left to cancel"
-    assert client.post(f"/api/v1/jobs/{job}/retry").json()["state"] == "queued"
+    retried = client.post(f"/api/v1/jobs/{job}/retry").json()["state"]
+    assert retried in {"queued", "running"}  # a free worker may have taken it already
     done = ended(client, job)
     assert done["state"] == "done"
     begins = [line for line in done["log"] if line.startswith("begins")]
