@@ -1,4 +1,8 @@
-"""The objective of candidate flights: simulated and measured as the recorded ones were."""
+"""The objective of candidate flights: simulated and measured as the recorded ones were.
+
+Candidates are laid out in arrays of the recorded flights' sizes, so that the program that was
+compiled for the examination of these flies them, too.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.crash import Limits
+from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
-from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover
 from sim_jax.trajectory import shapes
 from sim_jax.vector import Vec3
@@ -21,14 +24,13 @@ from tuner.design.candidates import Candidate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
-from tuner.simulation.trajectory import published
+from tuner.padding import padded_size
+from tuner.simulation.trajectory import Published, published
 
 Array = NDArray[np.float64]
 
-LOG_RATE = 100
-"""Lowest rate at which candidates are logged, Hz."""
 SAMPLE_RATE = 100.0
-"""Rate at which candidates are compared, Hz; their weights stand for the samples in between."""
+"""Highest rate at which candidates are compared, Hz; their weights stand for more samples."""
 
 
 def candidate_problem(
@@ -43,7 +45,7 @@ def candidate_problem(
     Parameters
     ----------
     objective
-        The problem of the recorded flights.
+        The problem of the recorded flights, which are whole.
     flights
         The candidates.
     seconds
@@ -51,7 +53,7 @@ def candidate_problem(
     spin_channels
         Channels that a yaw spin is compared by.
     """
-    schedule = _with_low_log_rate(objective.schedule)
+    recorded, schedule = objective.segments, objective.schedule
     references = [
         published(
             flight.trajectory,
@@ -60,48 +62,60 @@ def candidate_problem(
         )
         for flight in flights
     ]
-    inlet: ReferenceInlet = jax.tree.map(
-        lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves], axis=-1),
-        *(reference.inlet for reference in references),
-    )
     starts = Vec3(
         *(
             jnp.stack([getattr(flown.start, axis) for flown in references])
             for axis in ("x", "y", "z")
         )
     )
+    samples = round(seconds * schedule.log_rate)
+    longer = samples > padded_size(objective.samples)
     spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
+    count = len(flights)
     segments = Segments(
-        inlet=inlet,
-        start=_hovering(objective, starts, len(flights)),
+        inlet=_laid(references, recorded),
+        start=_hovering(objective, starts, count),
         measured={
             name: _sampled(
                 measured,
                 silent=spins & (name not in spin_channels),
                 seconds=seconds,
                 recorded=_seconds(objective),
+                as_many_rows=not longer,
             )
-            for name, measured in objective.segments.measured.items()
+            for name, measured in recorded.measured.items()
         },
-        flight=jnp.arange(len(flights)),
+        flight=jnp.arange(count),
+        resting=None if recorded.resting is None else jnp.ones(count, bool),
+        log_voltage=_filled(recorded.log_voltage, count, np.nan),
+        wander=_filled(recorded.wander, count, 0.0),
     )
-    return Objective(
-        model=objective.model,
+    return replace(
+        objective,
         segments=segments,
-        space=objective.space,
-        schedule=schedule,
-        samples=round(seconds * schedule.log_rate),
-        limits=Limits(),
-        memory=objective.memory,
-        conditions=objective.conditions,
+        samples=samples if longer else objective.samples,
+        multiplicity=None,
     )
 
 
-def _with_low_log_rate(schedule: Schedule) -> Schedule:
-    """Return the schedule with the lowest rate of logging that is not below `LOG_RATE`."""
-    physics = schedule.physics_rate
-    rates = [physics // divisor for divisor in range(1, physics + 1) if physics % divisor == 0]
-    return replace(schedule, log_rate=min(rate for rate in rates if rate >= min(LOG_RATE, physics)))
+def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
+    """Return the references side by side, as long as the recorded ones, the last points held."""
+    assert isinstance(recorded.inlet, ReferenceInlet)
+    inlets = [reference.inlet for reference in references]
+    length = max(np.shape(recorded.inlet.points.position.x)[0], *(len(r.lap) for r in references))
+
+    def beside(*rows: jax.Array) -> jax.Array:
+        edges = [np.pad(np.asarray(row), (0, length - len(row)), mode="edge") for row in rows]
+        return jnp.asarray(np.stack(edges, axis=-1))
+
+    points: ReferencePoint = jax.tree.map(beside, *(inlet.points for inlet in inlets))
+    held = recorded.inlet.level_held
+    return ReferenceInlet(
+        points,
+        spins=jnp.stack([inlet.spins for inlet in inlets]),
+        yaw_rate=jnp.stack([inlet.yaw_rate for inlet in inlets]),
+        level_held=None if held is None else jnp.zeros(len(inlets), bool),
+    )
 
 
 def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
@@ -113,6 +127,11 @@ def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
     return wide
 
 
+def _filled(recorded: jax.Array | None, count: int, value: float) -> jax.Array | None:
+    """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
+    return None if recorded is None else jnp.full((*recorded.shape[:-1], count), value)
+
+
 def _seconds(objective: Objective) -> Array:
     """Return (F,) s that each segment was recorded for."""
     ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
@@ -120,7 +139,12 @@ def _seconds(objective: Objective) -> Array:
 
 
 def _sampled(
-    measured: Measured, *, silent: NDArray[np.bool_], seconds: float, recorded: Array
+    measured: Measured,
+    *,
+    silent: NDArray[np.bool_],
+    seconds: float,
+    recorded: Array,
+    as_many_rows: bool,
 ) -> Measured:
     """Return one channel of every candidate, as often and as precisely recorded as in the best.
 
@@ -132,29 +156,33 @@ def _sampled(
         (C,) for which candidates it is not compared.
     seconds, recorded
         How long a candidate lasts, and (F,) how long each segment was recorded, in s.
+    as_many_rows
+        Whether candidates have as many rows as the recorded ones, rather than what they need.
     """
     weight = np.asarray(measured.weight)
-    rate = (weight > 0).sum(axis=0) / recorded
+    rows = len(weight) if as_many_rows else int(seconds * SAMPLE_RATE)
+    rate = min(SAMPLE_RATE, (rows + 1) / seconds)
+    taken = min(int(seconds * rate) - 1, rows)
+    recorded_rate = (weight > 0).sum(axis=0) / recorded
     equivalent = np.where(
-        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(rate / SAMPLE_RATE), 0.0
+        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / rate), 0.0
     )
-    time = np.arange(1, int(seconds * SAMPLE_RATE)) / SAMPLE_RATE
     segments = len(silent)
-    values = np.zeros((len(time), np.asarray(measured.values).shape[1], segments))
+    time = np.zeros((rows, segments))
+    time[:taken] = np.arange(1, taken + 1)[:, None] / rate
+    values = np.zeros((rows, np.asarray(measured.values).shape[1], segments))
     if values.shape[1] > weight.shape[1]:
         values[:, 0] = 1.0  # an attitude
     constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
-    return Measured(
-        time=jnp.asarray(np.repeat(time[:, None], segments, axis=1)),
-        values=jnp.asarray(values),
-        weight=jnp.asarray(np.broadcast_to(constant, (len(time), *constant.shape))),
-    )
+    weights = np.zeros((rows, *constant.shape))
+    weights[:taken] = constant
+    return Measured(time=jnp.asarray(time), values=jnp.asarray(values), weight=jnp.asarray(weights))
 
 
 def candidate_point(
-    point: Point, criterion: Criterion, objective: Objective
+    point: Point, criterion: Criterion, objective: Objective, *, seconds: float
 ) -> tuple[Point, Criterion]:
-    """Return point and criterion of the candidates, weighed as the recorded flights mostly were."""
+    """Return point and criterion of candidates of so many s, weighed as most recorded flights."""
     count = objective.flights
     offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
     reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
@@ -163,7 +191,7 @@ def candidate_point(
         for name, of_segment in criterion.scale.items()
     }
     return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
-        horizon=jnp.asarray(objective.samples),
+        horizon=jnp.asarray(round(seconds * objective.schedule.log_rate)),
         scale=scale,
         reference_offset=jnp.asarray(reference_offset),
         huber=jnp.asarray(np.inf),

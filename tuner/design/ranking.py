@@ -54,22 +54,35 @@ def rank_next_flights(
     """
     full_problem = examination.full_problem
     flights = candidates(arena)
-    objective = candidate_problem(
-        full_problem.objective, flights, seconds=seconds, spin_channels=spin_channels
-    )
-    point, weights = candidate_point(full_problem.point, criterion, objective)
-    jacobian = objective.jacobian(point, weights)
-    kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
-    fitted_offsets = np.repeat(kinds[:, None], len(flights), axis=1)
-    information = information_from_jacobian(
-        objective, point, weights, jacobian, offsets_fitted=fitted_offsets
-    )
-    flown = ~information.crashed & _inside(objective, jacobian.residuals, arena)
-    gain = information.blocks.sum(axis=(0, 2))
+    at_once = min(full_problem.objective.segments.count, len(flights))
+    gains, flown = [], []
+    for first in range(0, len(flights), at_once):
+        # the last ones again where too few are left: as many as the program was compiled for
+        some = [flights[min(first + i, len(flights) - 1)] for i in range(at_once)]
+        objective = candidate_problem(
+            full_problem.objective, some, seconds=seconds, spin_channels=spin_channels
+        )
+        point, weights = candidate_point(full_problem.point, criterion, objective, seconds=seconds)
+        jacobian = objective.jacobian(point, weights, columns=full_problem.columns)
+        kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
+        information = information_from_jacobian(
+            objective,
+            point,
+            weights,
+            jacobian,
+            offsets_fitted=np.repeat(kinds[:, None], at_once, axis=1),
+        )
+        inside = _inside(objective, jacobian.residuals, arena)
+        gains += list(information.blocks.sum(axis=(0, 2)))
+        flown += list(~information.crashed & inside)
     now = examination.information.data + examination.information.prior / WIDE**2
     return _ranked(
         examination,
-        [pair for pair, flies in zip(zip(flights, gain, strict=True), flown, strict=True) if flies],
+        [
+            (flight, gain)
+            for flight, gain, flies in zip(flights, gains, flown, strict=False)
+            if flies
+        ],
         now,
         arena=arena,
         seconds=seconds,
