@@ -56,7 +56,11 @@ def examination(fitted: Fitted) -> Examination:
 
 def ranked(examination: Examination, fitted: Fitted) -> Proposals:
     return rank_next_flights(
-        examination, fitted.criterion, arena=ARENA, seconds=20.0, spin_channels=SPIN_CHANNELS
+        examination,
+        fitted.criterion,
+        arena=ARENA,
+        seconds=making.SECONDS,
+        spin_channels=SPIN_CHANNELS,
     )
 
 
