@@ -24,11 +24,12 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 from hypothesis import settings
 
 from tests.demo import demo
-from tuner.runtime import cache_folder, set_environment
+from tuner.runtime import cache_folder, collect_rarely, set_environment
 
 __all__ = ["demo"]
 
 set_environment()
+collect_rarely()
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")

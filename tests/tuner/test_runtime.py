@@ -1,3 +1,4 @@
+import gc
 import json
 import os
 import subprocess
@@ -77,3 +78,17 @@ def test_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setattr(sys, "platform", "darwin")
     assert runtime.cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"
+
+
+def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> None:
+    before = gc.get_threshold()
+    try:
+        gc.set_threshold(700, 10, 10)
+        runtime.collect_rarely()
+        rarely = gc.get_threshold()
+        assert rarely[0] > 10_000
+        gc.set_threshold(10 * rarely[0], 1, 1)
+        runtime.collect_rarely()
+        assert gc.get_threshold() == (10 * rarely[0], 1, 1)
+    finally:
+        gc.set_threshold(*before)

@@ -78,6 +78,7 @@ def test_no_term_is_added_to_flights_that_lack_none():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(monkeypatch):
     monkeypatch.setattr(selection.Selection, "_predicts_better", lambda *_, **__: False)
     result, _ = selected(DRAG)
