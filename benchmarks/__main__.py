@@ -1,9 +1,10 @@
-"""``python -m benchmarks [throughput derivatives ...] [--out FILE]``: measure, and write a page.
+"""``python -m benchmarks [throughput ...] [--out FILE | --update]``: measure, and write a page.
 
 Without names everything is measured that speaks of speed, and benchmarks/RESULTS.md written; with
-names the parts are printed. Two environment variables bring others into the comparison:
-TUNE_YARDSTICK, the folder of the C++ program, and TUNE_PEERS, a Python that has drone-models,
-crazyflow and mujoco installed (``pip install -e '.[bench]'`` puts them beside this project).
+names the parts are printed, and with ``--update`` they take their place on that page. Two
+environment variables bring others into the comparison: TUNE_YARDSTICK, the folder of the C++
+program, and TUNE_PEERS, a Python that has drone-models, crazyflow and mujoco installed
+(``pip install -e '.[bench]'`` puts them beside this project).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import importlib
 import time
 from pathlib import Path
 
-from benchmarks.table import Section, table
+from benchmarks.table import Section, table, updated
 from benchmarks.timing import machine
 from tuner import runtime
 
@@ -30,7 +31,7 @@ PARTS = (
     "workers",
     "prediction",
 )
-NO_SPEED = ("lab",)
+NO_SPEED = ("lab", "calibration")
 """Parts that are measured by name alone: they take as long as all others together."""
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
@@ -50,11 +51,14 @@ def page(sections: list[Section], where: str, minutes: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS, *NO_SPEED])
-    parser.add_argument("--out", type=Path)
+    target_of = parser.add_mutually_exclusive_group()
+    target_of.add_argument("--out", type=Path)
+    target_of.add_argument("--update", action="store_true")
     arguments = parser.parse_args()
     began, where, sections = time.perf_counter(), machine(), list[Section]()
     runtime.configure()
-    target = arguments.out or (None if arguments.parts else RESULTS)
+    whole = not arguments.parts and not arguments.update
+    target = RESULTS if whole and arguments.out is None else arguments.out
     for part in arguments.parts or PARTS:
         section = importlib.import_module(f"benchmarks.{part}").measure()
         sections.append(section)
@@ -62,6 +66,8 @@ def main() -> None:
         print(section.markdown(), *bars, sep="\n", flush=True)
         if target is not None:
             target.write_text(page(sections, where, (time.perf_counter() - began) / 60))
+        elif arguments.update:
+            RESULTS.write_text(updated(RESULTS.read_text(encoding="utf-8"), section))
 
 
 if __name__ == "__main__":

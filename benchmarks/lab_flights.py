@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from benchmarks.air import air
 from sim_jax.disturbance import Disturbance
 from sim_jax.environment import Environment
 from sim_jax.inlet import ReferenceInlet
@@ -28,7 +28,6 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.trim import in_trim
-from sim_jax.vector import Vec3
 from tuner.coefficients import term_groups
 from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, read_vehicle, with_values
 from tuner.disk import write_text
@@ -66,10 +65,6 @@ METER, READ_EVERY = 0.02, 10
 """V of the voltmeter's noise, and how many samples apart its readings are."""
 SAGS = 3
 """Flights that find the voltage: each is flown on the battery that the last one drained."""
-GUST, GUST_TIME = 0.1, 1.0
-"""m/s, standard deviation of the wind along x and y, twice that along z; s, it forgets."""
-WANDER, WANDER_TIME = 0.004, 0.02
-"""Share by which each rotor's thrust wanders, and s in which it forgets."""
 
 
 @dataclass(frozen=True)
@@ -238,25 +233,16 @@ def _flier(schedule: Schedule) -> Callable[..., Rollout]:
 
 
 def _air(lab: Lab, random: np.random.Generator, schedule: Schedule) -> Disturbance:
-    """Return wind and thrust that wander, (ticks, flights), as Ornstein and Uhlenbeck's process."""
-    rate, flights = schedule.position_control_rate, len(TRAJECTORIES)
-    ticks = round(SECONDS * rate) + 4
-
-    def wandering(deviation: float, seconds: float, parts: int) -> Numbers:
-        keep = np.exp(-1.0 / rate / seconds)
-        steps = random.normal(size=(ticks, parts, flights)) * deviation * np.sqrt(1.0 - keep**2)
-        steps[0] /= np.sqrt(1.0 - keep**2)
-        return np.asarray(lfilter([1.0], [1.0, -keep], steps, axis=0))
-
-    wind = wandering(GUST, GUST_TIME, 3) * np.array([1.0, 1.0, 0.5])[:, None]
-    thrust = wandering(WANDER * lab.vehicle.mass * GRAVITY / 4.0, WANDER_TIME, 4)
-    places = np.array([rotor.position for rotor in lab.vehicle.rotors])
-    spins = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in lab.vehicle.rotors])
-    arms = (places[:, 1], -places[:, 0], -spins * lab.vehicle.aerodynamics.moment_constant)
-    return Disturbance(
-        gust=Vec3(*(jnp.asarray(wind[:, axis]) for axis in range(3))),
-        thrust=jnp.asarray(thrust.sum(axis=1)),
-        moment=Vec3(*(jnp.asarray(np.einsum("r,trf->tf", arm, thrust)) for arm in arms)),
+    """Return what pushes a laboratory's flights."""
+    rate = schedule.position_control_rate
+    return air(
+        random,
+        shape=(round(SECONDS * rate) + 4, len(TRAJECTORIES)),
+        rate=rate,
+        mass=lab.vehicle.mass,
+        places=[rotor.position for rotor in lab.vehicle.rotors],
+        spins=[1.0 if rotor.spin == "ccw" else -1.0 for rotor in lab.vehicle.rotors],
+        moment_constant=lab.vehicle.aerodynamics.moment_constant,
     )
 
 

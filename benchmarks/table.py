@@ -66,6 +66,13 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
+def updated(page: str, section: Section) -> str:
+    """Return a page with a section in the place of the one of its title, or at its end."""
+    before, heading, rest = page.partition(f"## {section.title}\n")
+    _, following, after = rest.partition("\n## ") if heading else ("", "", "")
+    return f"{before.rstrip()}\n\n{section.markdown()}{following}{after}"
+
+
 def figure(value: float) -> str:
     """Return a number in three digits."""
     if value == 0 or not 1e-3 <= abs(value) < 1e5:

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from benchmarks.__main__ import page
-from benchmarks.table import Bar, Section, figure, millions
+from benchmarks.table import Bar, Section, figure, millions, updated
 from benchmarks.timing import Contestant, Spread, compete
 
 ANSWERS = """
@@ -52,6 +52,15 @@ def test_the_page_begins_with_the_bars_and_holds_every_table():
     assert "| twice as fast | 1.9 × | at least 2 × | missed |" in text
     assert text.index("twice as fast") < text.index("## Speed") < text.index("| ours | 2 (2–2) |")
     assert "NPROC" in text
+
+
+def test_a_part_takes_the_place_that_it_had_on_the_page():
+    one, two, three = (Section(t, "Old.", ["a"], [["1"]]) for t in ("One", "Two", "Three"))
+    old = updated(updated("# Page\n", one), two)
+    assert updated(old, two) == old
+    new = updated(old, Section("One", "New.", ["a"], [["2"]]))
+    assert new == old.replace("Old.", "New.", 1).replace("| 1 |", "| 2 |", 1)
+    assert updated(old, three).index("## Three") > old.index("## Two")
 
 
 def test_figures_have_three_digits():

@@ -10,7 +10,9 @@ from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.result import CoefficientResult
+from tuner.uncertainty.calibration import calibration
 from tuner.uncertainty.verdict import ReasonCode, Verdict
+from tuner.wording.calibration import calibration_in_words
 from tuner.wording.verdicts import (
     judgement_in_words,
     parts_in_words,
@@ -58,7 +60,8 @@ def coefficients(contents: Contents) -> Section | None:
     else:
         return None
     charts = [] if contents.knowledge is None else _intervals(contents.knowledge.coefficients)
-    values = {"rows": rows, "fit": contents.run is not None}
+    measured = calibration_in_words(calibration())
+    values = {"rows": rows, "fit": contents.run is not None, "calibration": measured}
     return Section("coefficients", "Coefficients", values, charts)
 
 

@@ -1,0 +1,315 @@
+"""How often intervals hold the truth: simulation-based calibration on the reference flights' plan.
+
+Truths are drawn from a prior, and flown with measurement noise; depending on the kind of flight
+with gusts, and with a random half of some terms beyond the motor model. Each set is fitted from the
+prior's mean by the last stages of the search, with that prior and with all of these terms in the
+model, and the truth is ranked. So what is calibrated is the interval of a model that can fly what
+flew: `benchmarks.lab` measures what selects terms. ``TUNE_CALIBRATION_DRAWS`` sets of each kind are
+drawn, in ``TUNE_CALIBRATION_WORKERS`` processes beside this one.
+
+Source: Talts, Betancourt, Simpson, Vehtari, Gelman, "Validating Bayesian inference algorithms with
+simulation-based calibration", 2018.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom, norm
+
+from benchmarks.simulated_recordings import recorded
+from benchmarks.table import Section, figure
+from benchmarks.timing import ROOT
+from tuner.coefficients.space import Space
+from tuner.config import Options, settle
+from tuner.engine import Report, engine_for
+from tuner.job.prepare import Job, job_of
+from tuner.job.search import free_offsets
+from tuner.model import with_terms_computed
+from tuner.objective.normal import Objective
+from tuner.recordings import read_recordings
+from tuner.search.continuation import grow
+from tuner.search.fitted import Fitted
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning, criterion_of, point_of
+from tuner.search.stages import plan
+from tuner.selection.candidates import with_terms
+from tuner.uncertainty.calibration import FILE, LEVELS, Calibration, Held
+from tuner.uncertainty.estimates import uncertainty_of
+
+DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
+WORKERS = int(os.environ.get("TUNE_CALIBRATION_WORKERS", "0")) or None
+
+NARROWED = 0.25
+"""The prior that truths are drawn from and fits are steadied by, over the usual one: with that,
+half of the vehicles could not fly."""
+TERMS = (
+    "rotor_drag_ratio_y",
+    "fuselage_drag",
+    "thrust_inflow_coefficient",
+    "rotor_inertia",
+    "center_of_mass_x",
+    "center_of_mass_y",
+)
+FLOWN = 0.5
+"""Probability that a vehicle has a term."""
+INSIDE = 0.01
+"""Share of its range by which a truth keeps away from a coefficient's bounds."""
+STAGES = 3
+"""Of the search: whole flights, and the polish."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What flights have beside measurement noise."""
+
+    name: str
+    gusts: bool
+    terms: bool
+
+
+KINDS = (
+    Kind("noise alone", gusts=False, terms=False),
+    Kind("gusts", gusts=True, terms=False),
+    Kind("terms and gusts", gusts=True, terms=True),
+)
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A set of flights, its truth ranked.
+
+    Attributes
+    ----------
+    off
+        Coefficient -> estimate minus truth, in quoted standard errors.
+    error
+        Coefficient -> the quoted standard error, of the scaled coordinate.
+    seconds
+        Of processor time.
+    """
+
+    off: dict[str, float]
+    error: dict[str, float]
+    seconds: float
+
+
+def measure() -> Section:
+    """Draw, fly, fit and rank every kind of flight; keep what is found for the report's page."""
+    tasks = [(number, seed) for number in range(len(KINDS)) for seed in range(DRAWS)]
+    found: dict[str, list[Ranked]] = {kind.name: [] for kind in KINDS}
+    with engine_for(WORKERS) as engine:
+        for (number, seed), ranked in zip(tasks, engine.stream(_task, tasks), strict=True):
+            found[KINDS[number].name].append(ranked)
+            print(_line(KINDS[number], seed, ranked), flush=True)
+    kinds = tuple(_held(name, sets) for name, sets in found.items())
+    today = datetime.date.today().isoformat()
+    text = Calibration(date=today, kinds=kinds).model_dump_json(indent=2)
+    FILE.write_text(f"{text}\n", encoding="utf-8")
+    return section(found, today)
+
+
+def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
+    """Return the table of what was found of each kind of flight."""
+    rows = [row for name, sets in found.items() for row in _rows(name, sets)]
+    draws = sorted({len(sets) for sets in found.values()})
+    seconds = [ranked.seconds for sets in found.values() for ranked in sets]
+    text = (
+        f"Measured in simulation, {date}: {' to '.join(map(str, draws))} sets of flights of each "
+        "kind, on the plan of the four fitted reference flights, at truths drawn from a prior "
+        f"{figure(NARROWED)} times as wide as the usual one, each of {len(TERMS)} terms there or "
+        "not. Fitted from the prior's mean with what may have flown in the model. The share of "
+        "intervals that hold the truth: of all coefficients with twice its standard error, by the "
+        "scatter from set to set; of each, beside it the range in which the share of so many sets "
+        "would lie 19 times of 20, were the intervals what they say. Estimate minus truth is in "
+        "quoted standard errors: its root mean square is 1 where these are exact, less where they "
+        f"are too large. {np.mean(seconds):.0f} s of processor time a set."
+    )
+    head = ["flights", "coefficient", "sets", *(f"{level} %" for level in LEVELS), "mean", "RMS"]
+    return Section("Calibration of the intervals", text, head, rows)
+
+
+def _task(task: tuple[int, int], _: Report) -> Ranked:
+    return ranked_set(KINDS[task[0]], task[1])
+
+
+def ranked_set(kind: Kind, seed: int) -> Ranked:
+    """Draw a truth, fly and fit it."""
+    clock = time.process_time()
+    random = np.random.default_rng([seed, KINDS.index(kind)])
+    objective = problem(terms=kind.terms)
+    flown = None
+    while flown is None:
+        truth = drawn(objective.space, random)
+        flown = recorded(objective, truth, random, gusts=kind.gusts)
+    found = fitted(flown)
+    error = uncertainty_of(found).covariance.error
+    space = objective.space
+    true, best = (np.asarray(space.scaled(jnp.asarray(v))) for v in (truth, _vector(found)))
+    off = dict(zip(space.names, ((best - true) / error).tolist(), strict=True))
+    errors = dict(zip(space.names, error.tolist(), strict=True))
+    return Ranked(off, errors, time.process_time() - clock)
+
+
+@lru_cache(maxsize=1)
+def reference_job() -> Job:
+    """Return the reference flights' job: their plan, stamps and noise."""
+    paths = [str(path) for path in sorted((ROOT / "reference_flights").glob("*.bag"))]
+    settings = settle(Options(paths, config=str(ROOT / "reference_flights" / "tune.yaml")))
+    return job_of(settings, read_recordings(settings))
+
+
+@lru_cache(maxsize=2)
+def problem(*, terms: bool) -> Objective:
+    """Return the reference flights' problem with the prior of the truths.
+
+    A spin is held level: nothing else holds a vehicle in gusts.
+    """
+    job = reference_job()
+    objective = job.objective
+    if terms:
+        objective = replace(objective, model=with_terms_computed(objective.model, TERMS))
+        start = objective.start(objective.space.initial)
+        objective, _ = with_terms(objective, start, list(TERMS), job.settings.job)
+    parameters = [replace(p, prior_sd=NARROWED * p.prior_sd) for p in objective.space.parameters]
+    inlet = objective.segments.inlet
+    held = replace(inlet, level_held=inlet.spins)
+    return replace(
+        objective,
+        space=Space(parameters, objective.space.fixed),
+        segments=replace(objective.segments, inlet=held),
+    )
+
+
+def drawn(space: Space, random: np.random.Generator) -> Array:
+    """Return the search vector (K,) of a truth from the prior; a term is there or not.
+
+    None is next to a bound, where an interval would be one-sided.
+    """
+    while True:
+        there = np.array([n not in TERMS or random.random() < FLOWN for n in space.names])
+        scaled = space.prior_mean + there * space.prior_sd * random.normal(size=len(space))
+        share = (scaled - space.lower) / space.width
+        if np.all((share > INSIDE) & (share < 1.0 - INSIDE)):
+            return space.at_share(share)
+
+
+def fitted(objective: Objective) -> Fitted:
+    """Return the fit that the last stages of the search lead to from the prior's mean."""
+    space, names = objective.space, [flight.name for flight in reference_job().fitted]
+    rate = float(objective.schedule.log_rate)
+    stages = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=8)
+    stages = stages[-STAGES:]
+    begin = space.at_share((space.prior_mean - space.lower) / space.width)
+    progress = grow(
+        objective,
+        stages,
+        beginning(objective, begin[None]),
+        free=Free(np.ones(len(space), bool), free_offsets(reference_job())),
+        clipped=False,
+        on_progress=lambda _: None,
+    )
+    point = point_of(progress.points, 0)
+    return Fitted(
+        objective=objective,
+        point=point,
+        criterion=criterion_of(stages[-1], progress.scales, np.asarray(point.offsets), None),
+        noise={},
+        scales={
+            name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
+            for i, name in enumerate(names)
+        },
+        iterations=(),
+        outcomes=(),
+        method="gradient",
+        evaluations=progress.evaluations,
+        wall_time=0.0,
+        loss_initial=float("nan"),
+        loss_best=float(progress.losses[0]),
+        converged=progress.converged,
+    )
+
+
+def _vector(found: Fitted) -> Array:
+    return np.asarray(found.point.coefficients)
+
+
+def share_within(off: Iterable[float], level: str) -> float:
+    """Return the share of intervals of a level in per cent that hold the truth."""
+    reach = norm.ppf(0.5 + float(level) / 200.0)
+    return float(np.mean(np.abs(list(off)) <= reach))
+
+
+def band(level: str, sets: int) -> tuple[float, float]:
+    """Return the shares between which those of 95 % of so many sets would lie."""
+    low, high = binom.ppf([0.025, 0.975], sets, float(level) / 100.0) / sets
+    return float(low), float(high)
+
+
+def scatter(sets: Sequence[Ranked], level: str) -> float:
+    """Return the standard error of the share of all coefficients, whose errors go together."""
+    shares = [share_within(ranked.off.values(), level) for ranked in sets]
+    return float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else float("nan")
+
+
+def _held(name: str, sets: Sequence[Ranked]) -> Held:
+    shares = {c: share_within((r.off[c] for r in sets), "95") for c in sets[0].off}
+    return Held(
+        flights=name,
+        sets=len(sets),
+        intervals=sum(len(ranked.off) for ranked in sets),
+        coverage={level: _share_of_all(sets, level) for level in LEVELS},
+        least=min(shares.values()),
+    )
+
+
+def _share_of_all(sets: Sequence[Ranked], level: str) -> float:
+    return share_within([off for ranked in sets for off in ranked.off.values()], level)
+
+
+def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
+    """Return a kind's rows, all coefficients together first."""
+    together = [
+        f"{_percent(_share_of_all(sets, level))} ± {figure(200 * scatter(sets, level))} %"
+        for level in LEVELS
+    ]
+    rows = [
+        [name, "all", str(len(sets)), *together, *_moments(o for r in sets for o in r.off.values())]
+    ]
+    for coefficient in sets[0].off:
+        off = [ranked.off[coefficient] for ranked in sets]
+        shares = []
+        for level in LEVELS:
+            low, high = band(level, len(sets))
+            shares.append(
+                f"{_percent(share_within(off, level))} ({100 * low:.0f}–{100 * high:.0f})"
+            )
+        rows.append([name, coefficient, str(len(sets)), *shares, *_moments(off)])
+    return rows
+
+
+def _moments(off: Iterable[float]) -> list[str]:
+    values = np.array(list(off))
+    return [f"{values.mean():+.2f}", figure(float(np.sqrt(np.mean(values**2))))]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def _line(kind: Kind, seed: int, ranked: Ranked) -> str:
+    """Return a set in a line, as soon as it is there."""
+    worst = sorted(ranked.off, key=lambda name: -abs(ranked.off[name]))[:4]
+    off = ", ".join(f"{name} {ranked.off[name]:+.1f}" for name in worst)
+    held = share_within(ranked.off.values(), "95")
+    return f"{kind.name} {seed}: {_percent(held)} hold, {off}; {ranked.seconds:.0f} s"

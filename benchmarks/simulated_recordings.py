@@ -1,0 +1,98 @@
+"""Recordings that a fit's own simulator makes: the flights of a problem, flown at a known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.air import air
+from sim_jax.disturbance import Disturbance
+from sim_jax.rollout import rollout
+from tuner.model import Model
+from tuner.objective.normal import Objective
+from tuner.objective.residuals import Trace, beginning_of, simulated_at_stamps, trace_of
+from tuner.objective.segments import CLOCKS, OFFSETS, Measured
+
+Array = NDArray[np.float64]
+
+
+def recorded(
+    objective: Objective, vector: Array, random: np.random.Generator, *, gusts: bool
+) -> Objective | None:
+    """Return a problem with recordings of its flights at a truth, stamped and noisy as its own.
+
+    Parameters
+    ----------
+    objective
+        Whole flights: their plan, stamps and noise.
+    vector
+        (K,) search vector of the truth.
+    random
+        Where noise and gusts come from.
+    gusts
+        Whether the air pushes them.
+
+    Returns
+    -------
+    Objective or None
+        None where a flight crashed.
+    """
+    model = objective.tunable.at(jnp.asarray(vector))
+    pushing = _air(objective, model, random) if gusts else None
+    trace = _flown(model, objective, pushing)
+    if bool(jnp.isfinite(trace.crash_time).any()):
+        return None
+    still = jnp.zeros((len(OFFSETS), objective.segments.count))
+    rate, measured = float(objective.schedule.log_rate), {}
+    for channel, old in objective.segments.measured.items():
+        clean = simulated_at_stamps(trace, channel, old, still, still[: len(CLOCKS)], rate=rate)
+        known = np.asarray(old.weight)
+        noise = random.normal(size=known.shape) / np.where(known > 0.0, known, np.inf)
+        noisy = _turned(np.asarray(clean), noise) if channel == "attitude" else clean + noise
+        measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
+    return replace(objective, segments=replace(objective.segments, measured=measured))
+
+
+def _air(objective: Objective, model: Model, random: np.random.Generator) -> Disturbance:
+    vehicle = model.vehicle
+    rate = float(objective.schedule.position_control_rate)
+    ticks = int(np.ceil(objective.samples * rate / objective.schedule.log_rate)) + 2
+    return air(
+        random,
+        shape=(ticks, objective.segments.count),
+        rate=rate,
+        mass=float(vehicle.body.mass),
+        places=[[float(x) for x in rotor.position.stacked()] for rotor in vehicle.rotors],
+        spins=[rotor.spin for rotor in vehicle.rotors],
+        moment_constant=float(vehicle.aerodynamics.moment_constant),
+    )
+
+
+@eqx.filter_jit
+def _flown(model: Model, objective: Objective, pushing: Disturbance | None) -> Trace:
+    segments = objective.segments
+    start, inlet, around = beginning_of(model, segments, objective.schedule)
+    flown = rollout(
+        model.vehicle,
+        model.controller,
+        objective.schedule,
+        inlet,
+        start,
+        samples=objective.samples,
+        environment=replace(around, disturbance=pushing),
+        limits=objective.limits,
+    )
+    return trace_of(flown, model, segments)
+
+
+def _turned(attitude: Array, by: Array) -> Array:
+    """Turn attitudes (n, 4, F), w first, by rotation vectors (n, 3, F)."""
+    true, noise = (np.moveaxis(part, 1, 2).reshape(-1, part.shape[1]) for part in (attitude, by))
+    turned = Rotation.from_quat(true, scalar_first=True) * Rotation.from_rotvec(noise)
+    shape = attitude.shape[0], attitude.shape[2], 4
+    return np.moveaxis(turned.as_quat(scalar_first=True).reshape(shape), 2, 1)
