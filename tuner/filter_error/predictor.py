@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
-from tuner.filter_error.observer import Expected, Feed, Gains, gains_of, innovations
+from tuner.filter_error.kalman import Gains, gains_of, innovations
+from tuner.filter_error.observer import Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
 from tuner.filter_error.strengths import likeliest
 from tuner.flights.flight import Flight

@@ -1,0 +1,70 @@
+"""What a filter corrects of the stepped loop arrives where it acts."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim_jax.rollout import begun
+from sim_jax.schedule import Schedule
+from tests.sim_jax.support import controller, moving_start, vehicle, wobble
+from tuner.filter_error.kalman import GATE, deviance
+from tuner.filter_error.observer import Observer, commands_in_flight, first_errors
+
+SCHEDULE = Schedule(log_rate=400, position_control_rate=400, longest_actuator_latency=0.02)
+TICK = jnp.asarray(25)  # beyond the delay line's ten places
+
+
+@pytest.fixture(scope="module")
+def begin():
+    """An observer of a vehicle whose commands take 1.4 steps, and its state."""
+    craft = eqx.tree_at(
+        lambda v: v.setup.actuator_latency, vehicle(), jnp.asarray(1.4 * SCHEDULE.step)
+    )
+    start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], moving_start(craft))
+    plant, state = begun(craft, controller(), SCHEDULE, wobble(craft, 200), start)
+    return Observer(plant, None, None, (), 400.0), state
+
+
+@pytest.mark.parametrize("in_flight", [0, 2])
+def test_numbers_move_by_what_they_are_corrected_by(begin, in_flight):
+    observer, state = begin
+    before = observer.numbers(state, TICK, in_flight)
+    assert commands_in_flight(state, len(before)) == in_flight
+    assert len(first_errors(state, in_flight)) == len(before)
+    change = jnp.arange(1.0, len(before) + 1.0)[:, None].at[6:10].set(0.0)  # no rotation then
+    after = observer.numbers(observer.corrected(state, change, TICK, in_flight), TICK, in_flight)
+    np.testing.assert_allclose(after - before, change, atol=1e-9)
+
+
+@pytest.mark.parametrize(("age", "acts"), [(1, True), (2, True), (3, False)])
+def test_a_command_on_its_way_moves_its_rotor_when_its_time_has_come(begin, age, acts):
+    """At 1.4 steps the commands of one and of two steps ago share the next step."""
+    observer, state = begin
+    own = len(observer.numbers(state, TICK, 0))
+    change = jnp.zeros((own + 12, 1)).at[own + 4 * (age - 1)].set(50.0)  # of the first rotor
+    moved = observer.corrected(state, change, TICK, 3)
+    ends = [observer.plant.step(each, TICK).rotor_speed for each in (state, moved)]
+    by = [float(new[0] - old[0]) for old, new in zip(*ends, strict=True)]
+    assert (by[0] > 1.0) == acts
+    assert by[1:] == [0.0, 0.0, 0.0]
+
+
+def test_innovations_of_the_right_size_are_the_likeliest():
+    """Of white samples the likelihood is largest where their deviation is taken for what it is."""
+    white = jnp.asarray(np.random.default_rng(0).standard_normal(20_000))
+    taken = np.exp(np.linspace(-0.5, 0.5, 21))
+    loss = [float(0.5 * deviance(white / sd).mean() + np.log(sd)) for sd in taken]
+    assert abs(np.log(taken[int(np.argmin(loss))])) < 0.06
+
+
+def test_an_outlier_counts_by_its_size_alone():
+    sizes = jnp.asarray([0.5, GATE, GATE + 1.0, GATE + 2.0])
+    np.testing.assert_allclose(deviance(-sizes), deviance(sizes))
+    small, gate, one, two = (float(value) for value in deviance(sizes))
+    assert small == pytest.approx(0.25)
+    assert gate == pytest.approx(GATE**2)
+    assert one - gate == pytest.approx(two - one) == pytest.approx(2.0 * GATE)

@@ -1,0 +1,284 @@
+"""A simulation that recorded samples correct, as a Kalman filter does.
+
+At each tick the samples since the one before correct motion, rotor speeds, the controller's memory
+and the disturbances. `gains` linearises the loop about the corrected simulation and propagates its
+covariance (extended Kalman filter); `innovations` flies with gains that are given, so that its
+derivative is that of a simulation: a predictor of fixed structure (Ljung 1999, 7.2).
+
+Innovations are whitened: with S = L Lᵀ their covariance, L⁻¹ times them is white and of unit
+variance if the model holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.scipy.linalg import solve_triangular
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from sim_jax.state import State
+from sim_jax.trees import row_of
+from tuner.filter_error.disturbances import COUNT
+from tuner.filter_error.observer import (
+    Expected,
+    Feed,
+    Observer,
+    commands_in_flight,
+    first_errors,
+)
+from tuner.objective.simulator import Simulator
+from tuner.parallel import over_devices
+
+T = TypeVar("T")
+
+GATE = 4.0
+"""Standard deviations beyond which an innovation corrects no further: an outlier."""
+
+
+def deviance(white: Array) -> Array:
+    """Return twice the negative log-likelihood of whitened innovations, but for a constant.
+
+    Beyond the gate it grows linearly (Huber): an outlier is no strong disturbance.
+    """
+    size = jnp.abs(white)
+    return jnp.where(size <= GATE, white**2, 2.0 * GATE * size - GATE**2)
+
+
+class Gains(eqx.Module):
+    """Of an observer, on T ticks; n numbers of the state are corrected by m samples.
+
+    Attributes
+    ----------
+    gain
+        (T, n, m, F) correction for one standard deviation of each whitened innovation.
+    whitens
+        (T, m, m, F) L⁻¹.
+    """
+
+    gain: Float[Array, "T n m F"]
+    whitens: Float[Array, "T m m F"]
+
+
+def _linearised(function: Callable[[Array], tuple[Array, T]], at: Array) -> tuple[T, Array]:
+    """Return what a function returns beside its value, and the value's derivatives.
+
+    Parameters
+    ----------
+    function
+        Of (n, F): the value (k, F), and something else. Segments do not depend on each other.
+    at
+        Where.
+
+    Returns
+    -------
+    tuple
+        The other thing, and the derivatives (F, k, n).
+    """
+
+    def push(row: Array) -> tuple[T, Array]:
+        along = row[:, None] * jnp.ones_like(at)
+        _, moved, beside = jax.jvp(function, (at,), (along,), has_aux=True)
+        return beside, moved
+
+    beside, columns = jax.vmap(push, out_axes=(None, 0))(jnp.eye(len(at)))
+    return beside, jnp.moveaxis(columns, (0, 1, 2), (2, 1, 0))
+
+
+def _undelayed(simulator: Simulator) -> Simulator:
+    """Return a simulator without the delay line of estimates, which rate control does not see."""
+    schedule = replace(simulator.schedule, longest_estimate_latency=0.0, pose_rate=None)
+    return replace(simulator, schedule=schedule)
+
+
+def _shortly_delayed(simulator: Simulator, expected: Expected) -> tuple[Simulator, int]:
+    """Return a simulator whose delay line of commands is no longer than needed.
+
+    And how many commands are on their way to the motors when a step begins: to correct each of them
+    costs as much as a rotor's speed.
+    """
+    schedule = simulator.schedule
+    if schedule.longest_actuator_latency == 0.0:
+        return simulator, 0
+    latency = float(expected.tunable.at(expected.coefficients).vehicle.setup.actuator_latency)
+    count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
+    short = replace(schedule, longest_actuator_latency=count * schedule.step)
+    return replace(simulator, schedule=short), count
+
+
+def gains_of(
+    simulator: Simulator, feed: Feed, expected: Expected, ticks: int
+) -> tuple[Gains, NDArray[np.float64]]:
+    """Return the Kalman gains, and each segment's (F,) negative log-likelihood.
+
+    Parameters
+    ----------
+    simulator, feed, expected
+        What flies, the recordings, and what is taken for true.
+    ticks
+        Up to which the likelihood counts and gains are computed; they are zero beyond.
+    """
+    short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
+    return _gains(short, in_flight)(feed, expected, np.asarray(ticks))
+
+
+@lru_cache(maxsize=4)
+def _gains(
+    simulator: Simulator, in_flight: int
+) -> Callable[..., tuple[Gains, NDArray[np.float64]]]:
+    def segmentwise(feed: Feed, expected: Expected, ticks: Array) -> tuple[Gains, Array]:
+        observer, first = Observer.of(simulator, feed, expected)
+        noise, first_sd = expected.noise, first_errors(first, in_flight)
+        processes = observer.processes
+        segments, size = feed.segments.flight.shape[0], len(first_sd) + COUNT
+        total, wide = next(iter(feed.samples.values())).values.shape[0], len(noise)
+        zero = jnp.zeros((size, segments))
+        unrest = jnp.diag(jnp.concatenate([jnp.zeros(size - COUNT), processes.added]))
+        sd = jnp.concatenate([jnp.asarray(first_sd), processes.sd])
+
+        def tick(number: Array, carried: Any) -> Any:
+            state, pushed, covariance, before, loss, kept = carried
+            samples = row_of(feed.samples, number)
+
+            def compare(change: Array) -> tuple[Array, Array]:
+                moved = observer.corrected(state, change[:-COUNT], number, in_flight)
+                errors = observer.errors(observer.seen(moved, number), before, samples)
+                return errors, errors
+
+            error, seen = _linearised(compare, zero)
+            spread = jnp.einsum("fij,fmj->fim", covariance, seen)
+            innovation = jnp.einsum("fmi,fin->fmn", seen, spread) + jnp.diag(noise**2)
+            factor = jnp.linalg.cholesky(innovation)
+            whitens = solve_triangular(
+                factor, jnp.broadcast_to(jnp.eye(wide), factor.shape), lower=True
+            )
+            gain = jnp.einsum("fim,fkm->fik", spread, whitens)
+            white = jnp.einsum("fkm,mf->kf", whitens, error)
+            covariance = covariance - jnp.einsum("fik,fjk->fij", gain, gain)
+            scatter = jnp.log(jnp.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
+            kept = jax.tree.map(
+                lambda rows, row: lax.dynamic_update_index_in_dim(
+                    rows, jnp.moveaxis(row, 0, -1).astype(rows.dtype), number, 0
+                ),
+                kept,
+                Gains(gain, whitens),
+            )
+            change = -jnp.einsum("fik,kf->if", gain, jnp.clip(white, -GATE, GATE))
+            state, pushed = (
+                observer.corrected(state, change[:-COUNT], number, in_flight),
+                pushed + change[-COUNT:],
+            )
+            before = observer.seen(state, number)
+
+            def advance(change: Array) -> tuple[Array, State]:
+                moved = observer.corrected(state, change[:-COUNT], number, in_flight)
+                after = observer.next(moved, pushed + change[-COUNT:], number)
+                kept = processes.keeps[:, None] * change[-COUNT:]
+                numbers = observer.numbers(after, number + 1, in_flight)
+                return jnp.concatenate([numbers, kept]), after
+
+            state, follows = _linearised(advance, zero)
+            covariance = jnp.einsum("fij,fjk,flk->fil", follows, covariance, follows) + unrest
+            covariance = 0.5 * (covariance + jnp.swapaxes(covariance, 1, 2))
+            return (
+                state,
+                pushed * processes.keeps[:, None],
+                covariance,
+                before,
+                loss + 0.5 * deviance(white).sum(axis=0) + scatter,
+                kept,
+            )
+
+        empty = Gains(
+            jnp.zeros((total, size, wide, segments), jnp.float32),
+            jnp.zeros((total, wide, wide, segments), jnp.float32),
+        )
+        begin = (
+            first,
+            jnp.zeros((COUNT, segments)),
+            jnp.broadcast_to(jnp.diag(sd**2), (segments, size, size)),
+            observer.seen(first, jnp.asarray(0)),
+            jnp.zeros(segments),
+            empty,
+        )
+        *_, loss, kept = lax.fori_loop(0, ticks, tick, begin)
+        return kept, loss
+
+    return over_devices(segmentwise, name=("observer's gains", simulator, in_flight))
+
+
+def innovations(
+    simulator: Simulator, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return whitened innovations (T, m, F) with given gains, and derivatives (N, T, m, F).
+
+    Parameters
+    ----------
+    simulator, feed, expected
+        As of `gains_of`.
+    gains
+        Of the observer.
+    directions
+        (N, K + offsets): along which is differentiated.
+    """
+    return _innovations(_undelayed(simulator))(
+        (feed, gains), expected, np.asarray(directions, float)
+    )
+
+
+@lru_cache(maxsize=4)
+def _innovations(
+    simulator: Simulator,
+) -> Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    def segmentwise(
+        batch: tuple[Feed, Gains], expected: Expected, directions: Array
+    ) -> tuple[Array, Array]:
+        feed, gains = batch
+        vector = expected.coefficients
+
+        def flown(vector: Array, offsets: Array) -> Array:
+            moved = eqx.tree_at(lambda f: f.offsets, feed, offsets)
+            at = eqx.tree_at(lambda e: e.coefficients, expected, vector)
+            observer, state = Observer.of(simulator, moved, at)
+            in_flight = commands_in_flight(state, gains.gain.shape[1] - COUNT)
+
+            def tick(carried: Any, given: Any) -> tuple[Any, Array]:
+                state, pushed, before = carried
+                number, samples, gain = given
+                error = observer.errors(observer.seen(state, number), before, samples)
+                white = jnp.einsum("kmf,mf->kf", gain.whitens, error)
+                change = -jnp.einsum("ikf,kf->if", gain.gain, jnp.clip(white, -GATE, GATE))
+                state, pushed = (
+                    observer.corrected(state, change[:-COUNT], number, in_flight),
+                    pushed + change[-COUNT:],
+                )
+                before = observer.seen(state, number)
+                after = observer.next(state, pushed, number)
+                return (after, pushed * observer.processes.keeps[:, None], before), white
+
+            begin = (
+                state,
+                jnp.zeros((COUNT, offsets.shape[-1])),
+                observer.seen(state, jnp.asarray(0)),
+            )
+            numbers = jnp.arange(gains.gain.shape[0])
+            white: Array = lax.scan(tick, begin, (numbers, feed.samples, gains))[1]
+            return white
+
+        def push(direction: Array) -> tuple[Array, Array]:
+            along = direction[len(vector) :, None] * jnp.ones_like(feed.offsets)
+            return jax.jvp(flown, (vector, feed.offsets), (direction[: len(vector)], along))
+
+        pushed: tuple[Array, Array] = jax.vmap(push, out_axes=(None, 0))(directions)
+        return pushed
+
+    return over_devices(segmentwise, name=("observer's innovations", simulator))
