@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,8 @@ def score(
 
     What is in the model stays where chance does not explain it and nothing left out contradicts it:
     flights that are fitted without the one that shows most can predict hardly anything for sure.
-    What is not has to predict.
+    All of such a flight's stretches share one error, that of the fit to the others; so flights, not
+    stretches, have to contradict it, and surely. What is not in the model has to predict.
 
     A group with columns for each flight is nothing that other flights could predict: sections of
     the flight's own do, and flights count alike however strongly each shows it.
@@ -105,21 +106,23 @@ def score(
     everything = np.ones(len(linear.flight), bool)
     alone, with_group = _steps(linear, columns, (without, begin), everything)
     fit = _Gain.of(linear, alone, with_group, everything)
-    by_flight = linear.sees_alike(group)
+    by_flight, inside = linear.sees_alike(group), neutral is not None
     folds = linear.flight if by_flight else linear.section
     held_out = _held_out(linear, columns, (without, begin), folds)
-    reason = SelectionCode.PREDICTS_FLIGHTS
+    reason, patience = SelectionCode.PREDICTS_FLIGHTS, SURE if inside else 1.0
+    if by_flight and inside:
+        held_out = held_out.with_flights_apart(linear.flight)
     if not by_flight:
         held_out = held_out.with_flights_alike(linear.flight)
         reason = SelectionCode.PREDICTS_SECTIONS
-    elif not held_out.is_sure and held_out.share > -held_out.scatter:  # no flight contradicts it
+    elif not held_out.is_sure and held_out.share > -patience * held_out.scatter:
         by_section = _held_out(linear, columns, (without, begin), linear.section)
         if by_section.is_sure:
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
     minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
     chance = _chance(linear, model, group, minima)
-    inside = neutral is not None and held_out.share > -held_out.scatter
-    if reason is SelectionCode.PREDICTS_SECTIONS or (inside and not held_out.is_sure):
+    stays = inside and held_out.share > -patience * held_out.scatter  # nothing contradicts it
+    if reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure):
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
@@ -128,7 +131,7 @@ def score(
     elif chance > limit:
         reason = SelectionCode.NOT_SIGNIFICANT
     elif not held_out.is_sure:
-        reason = SelectionCode.SIGNIFICANT if inside else SelectionCode.NOT_PREDICTED
+        reason = SelectionCode.SIGNIFICANT if stays else SelectionCode.NOT_PREDICTED
     return Score(fit.share, held_out.share, held_out.scatter, chance, reason)
 
 
@@ -186,10 +189,14 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 @dataclass(frozen=True)
 class _Gain:
-    """By how much each stretch's loss (S,) is lower with a group, and its loss (S,) without it."""
+    """By how much each stretch's loss (S,) is lower with a group, and its loss (S,) without it.
+
+    ``of_flight`` is the first summed over flights (N,), where their errors are one each.
+    """
 
     of_stretch: NDArray[np.float64]
     without: NDArray[np.float64]
+    of_flight: NDArray[np.float64] | None = None
 
     @staticmethod
     def of(
@@ -202,6 +209,10 @@ class _Gain:
         without = linear.change_of_loss(alone)
         gain = np.where(inside, without - linear.change_of_loss(with_group), 0.0)
         return _Gain(gain, np.where(inside, linear.loss / len(inside) + without, 0.0))
+
+    def with_flights_apart(self, flight: NDArray[np.intp]) -> _Gain:
+        """Return the gain whose scatter is that of the flights, if that is larger."""
+        return replace(self, of_flight=np.asarray(np.bincount(flight, self.of_stretch), np.float64))
 
     def with_flights_alike(self, flight: NDArray[np.intp]) -> _Gain:
         """Return the gain as a mean over flights (S,) of shares of their own losses."""
@@ -222,11 +233,14 @@ class _Gain:
 
     @property
     def scatter(self) -> float:
-        """Standard deviation of ``share`` if stretches are independent."""
-        if len(self.of_stretch) < 2:
-            return float("inf")
-        deviation = np.sqrt(len(self.of_stretch)) * np.std(self.of_stretch, ddof=1)
-        return float(deviation / self.loss_without)
+        """Standard deviation of ``share`` if stretches are independent, or flights alone are."""
+        several = [
+            parts
+            for parts in (self.of_stretch, self.of_flight)
+            if parts is not None and len(parts) > 1
+        ]
+        deviations = [np.sqrt(len(parts)) * np.std(parts, ddof=1) for parts in several]
+        return float(max(deviations, default=np.inf) / self.loss_without)
 
     @property
     def is_sure(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.selection.linear import Linear
-from tuner.selection.score import Score, score, surviving
+from tuner.selection.score import Score, _Gain, score, surviving
 from tuner.selection.table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
@@ -176,6 +176,21 @@ def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
     assert inside.earns_place
     shared = score(after, MODEL, FIRST, candidates=10, neutral=np.zeros(4))
     assert shared.reason is SelectionCode.NOT_SIGNIFICANT
+
+
+@pytest.mark.parametrize(
+    ("gains", "stays"), [((0.5, 0.5, 0.5, -4), True), ((-1, -1, -2, 0), False)]
+)
+def test_one_flight_that_the_others_predict_badly_takes_no_term_away(monkeypatch, gains, stays):
+    """All of its stretches lose by one error, that of the fit to the others."""
+    after = moved_to_minimum(linear_fit(0.8), np.concatenate([MODEL, FIRST]))
+    lost = np.repeat(gains, STRETCHES) * 0.002 * after.loss / STRETCHES
+    held_out = _Gain(lost, np.full(len(lost), after.loss / len(lost)))
+    monkeypatch.setattr("tuner.selection.score._held_out", lambda *_: held_out)
+    outside = score(linear_fit(0.8), MODEL, FIRST, candidates=1)
+    assert outside.reason is SelectionCode.NOT_PREDICTED
+    inside = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+    assert inside.earns_place is stays
 
 
 def by_flight(linear, column):
