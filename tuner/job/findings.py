@@ -11,7 +11,10 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, Pose
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
+from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.search.fitted import Fitted
+from tuner.search.progress import feedback_of
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import CONFLICT, Sources
 
@@ -69,6 +72,15 @@ def offset_findings(job: Job, offsets: NDArray[np.float64]) -> tuple[Finding, ..
             )
             findings.append(Finding(code, "info", flight.name, {unit: value}, (kind,)))
     return tuple(findings)
+
+
+def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
+    """Return what a fit shows about the set-up, the flights and their clocks."""
+    offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
+    return (
+        *end_findings(job, feedback_of(fitted.objective), fitted.scales),
+        *offset_findings(job, offsets),
+    )
 
 
 def end_findings(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ...]:

@@ -15,7 +15,14 @@ from tuner.objective.normal import Objective
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.search.progress import Progress, beginning, criterion_of, point_of
+from tuner.search.progress import (
+    Progress,
+    beginning,
+    criterion_of,
+    feedback_of,
+    point_of,
+    with_feedback,
+)
 from tuner.search.stages import Stage, plan
 
 
@@ -59,7 +66,7 @@ def polished(
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
+        feedback=feedback_of(fitted.objective),
     )
     return _grown(
         job,
@@ -67,6 +74,7 @@ def polished(
         progress,
         _stages(fitted.objective, job)[-stages:],
         free=free,
+        clipped=False,
         title=title,
         on_progress=on_progress,
     )
@@ -84,17 +92,26 @@ def searched_again(
     """Return a fit searched for again by all stages from a start vector (K,).
 
     The other arguments are those of `polished`. What terms that were missing did to a fit, a
-    coefficient at its bound say, is forgotten that way. The last polish is left to a fit of what
-    proves to be needed.
+    coefficient at its bound say, is forgotten that way; the mixer's saturation feedback, too, is
+    tried both ways again. The last polish is left to a fit of what proves to be needed.
     """
     progress = replace(
         beginning(fitted.objective, vector[None]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        feedback=float(fitted.objective.model.controller.rate.saturation_feedback),
+        feedback=feedback_of(job.objective),
     )
     stages = _stages(fitted.objective, job)[:-1]
-    return _grown(job, fitted, progress, stages, free=free, title=title, on_progress=on_progress)
+    return _grown(
+        job,
+        fitted,
+        progress,
+        stages,
+        free=free,
+        clipped=job.clipped,
+        title=title,
+        on_progress=on_progress,
+    )
 
 
 def _stages(objective: Objective, job: Job) -> tuple[Stage, ...]:
@@ -117,16 +134,20 @@ def _grown(
     stages: Sequence[Stage],
     *,
     free: Free,
+    clipped: bool,
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
     """Return where some stages lead."""
     stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
     objective, last = fitted.objective, stages[-1]
-    progress = grow(objective, stages, progress, free=free, clipped=False, on_progress=on_progress)
+    progress = grow(
+        objective, stages, progress, free=free, clipped=clipped, on_progress=on_progress
+    )
     point = point_of(progress.points, 0)
     return replace(
         fitted,
+        objective=with_feedback(objective, progress.feedback),
         point=point,
         criterion=criterion_of(last, progress.scales, np.asarray(point.offsets), progress.states),
         scales={

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from tuner.findings import Code, Finding
 from tuner.job.checkpoint import fingerprint, load, save
-from tuner.job.findings import end_findings, offset_findings, unmatched
+from tuner.job.findings import findings_at, unmatched
 from tuner.job.prepare import Job
 from tuner.job.starts import starting_vectors
-from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
@@ -193,7 +193,7 @@ class _Attempt:
             flight.name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
             for i, flight in enumerate(job.fitted)
         }
-        return Fitted(
+        fitted = Fitted(
             objective=objective,
             point=point,
             criterion=criterion,
@@ -207,12 +207,8 @@ class _Attempt:
             loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
             loss_best=float(progress.losses[best]),
             converged=progress.converged,
-            findings=(
-                *self.findings,
-                *end_findings(job, progress.feedback, scales),
-                *offset_findings(job, np.asarray(point.offsets)[: len(OFFSETS)] * OFFSET_UNIT),
-            ),
         )
+        return replace(fitted, findings=(*self.findings, *findings_at(job, fitted)))
 
 
 def _plan(job: Job, objective: Objective, method: str) -> tuple[Stage, ...]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.job.extension import extended
+from tuner.job.findings import findings_at
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
@@ -30,7 +31,7 @@ from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import Objective, with_conditions
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
-from tuner.search.progress import Progress
+from tuner.search.progress import Progress, feedback_of, with_feedback
 from tuner.selection.candidates import (
     Groups,
     coefficients_in,
@@ -139,10 +140,13 @@ class Selection:
         vector = [state.vector[name] for name in job.space.names]
         fitted = replace(
             state.fitted,
-            objective=fitted.objective,
+            objective=with_feedback(fitted.objective, feedback_of(state.fitted.objective)),
             outcomes=fitted.outcomes,
             point=Point(jnp.asarray(vector), _offsets(state.fitted, fitted.objective)),
         )
+        said = findings_at(self.job, self.fitted)
+        others = [finding for finding in fitted.findings if finding not in said]
+        fitted = replace(fitted, findings=(*others, *findings_at(job, fitted)))
         rows = self._rows(state, dropped)
         fitted = fitted if state.added else self.fitted
         return Selected(job, fitted, rows, self._in_doubt(state, rows))
@@ -259,7 +263,7 @@ class Selection:
         free = [*self.job.space.names, *wanted]
         filled = [*wanted, *spare[: -len(free) % FILLED_UP_TO]]
         objective, point = with_terms(
-            self._objective, self.fitted.point, filled, self.job.settings.job
+            self._objective_of(state.fitted), self.fitted.point, filled, self.job.settings.job
         )
         objective, _ = with_conditions(objective, point, around)
         start, names = np.array(point.coefficients), objective.space.names
@@ -298,7 +302,7 @@ class Selection:
     def _seen(self, fitted: Fitted, added: Groups) -> _State:
         """Return a fit as all candidates see it."""
         objective, point = with_terms(
-            self._objective,
+            self._objective_of(fitted),
             self.fitted.point,
             coefficients_in(self.candidates),
             self.job.settings.job,
@@ -320,10 +324,9 @@ class Selection:
         )
         return _State(fitted, added, linear)
 
-    @property
-    def _objective(self) -> Objective:
-        """The base problem with all candidates in the model, at their neutral values."""
-        objective = self.fitted.objective
+    def _objective_of(self, fitted: Fitted) -> Objective:
+        """Return a fit's base problem with all candidates in the model, at their neutral values."""
+        objective = with_feedback(self.fitted.objective, feedback_of(fitted.objective))
         neutral = start_of(coefficients_in(self.candidates))
         values = {name: jnp.asarray(value) for name, value in neutral.items()}
         return replace(objective, model=with_coefficients(objective.model, values))

@@ -86,6 +86,7 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
         losses=np.full(len(vectors), np.inf),
         iterations=(),
         evaluations=0,
+        feedback=feedback_of(objective),
     )
 
 
@@ -121,6 +122,11 @@ def point_of(points: Point, start: int) -> Point:
     """Return one of S points."""
     picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
     return picked
+
+
+def feedback_of(objective: Objective) -> float:
+    """Return the mixer's saturation feedback of an objective: 1 as in PX4, 0 without."""
+    return float(objective.model.controller.rate.saturation_feedback)
 
 
 def with_feedback(objective: Objective, feedback: float) -> Objective:

@@ -62,14 +62,16 @@ def job_with(
     objective = replace(truth, space=space)
     recordings = tuple(
         SimpleNamespace(
-            flight=SimpleNamespace(name=name, initial=hovering(tilt)),
+            flight=SimpleNamespace(name=name, initial=hovering(tilt), has=lambda _: False),
             holdout=False,
             inlet="reference",
             time_offset=0.0,
         )
         for name in FLIGHTS
     )
-    settings = SimpleNamespace(job=job or JobFile(), vehicle=vehicle_file())
+    settings = SimpleNamespace(
+        job=job or JobFile(), vehicle=vehicle_file(), controller=controller_file()
+    )
     made = Job(settings, recordings, NOISE, space, objective)
     fitted = fitted_of(objective, objective.start(space.initial))
     return made, _fit(made, fitted)
