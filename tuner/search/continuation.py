@@ -10,11 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.normal import Objective
+from tuner.objective.segments import CLOCKS
+from tuner.search.clocks import clocks_that_differ
 from tuner.search.evolution import CmaEs
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares
@@ -123,7 +126,7 @@ def _problem(search: _Search, stage: Stage, progress: Progress) -> StageProblem:
     """Return what the stage's optimiser minimises, from where the search stands."""
     (points, kept), free = _offsets_that_matter(stage, progress), search.free
     best = int(np.argmin(progress.losses))
-    return StageProblem(
+    problem = StageProblem(
         objective=with_feedback(search.objective, progress.feedback),
         criterion=criterion_of(
             stage, progress.scales, np.asarray(points.offsets[best]), progress.states
@@ -133,6 +136,23 @@ def _problem(search: _Search, stage: Stage, progress: Progress) -> StageProblem:
         losses=progress.losses,
         free=Free(free.coefficients & stage.coefficients, free.offsets & kept & stage.offsets),
         seed=1 + search.seed + 1000 * progress.stage,
+    )
+    return _with_clocks_set_right(problem, best) if stage.prunes else problem
+
+
+def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
+    """Return the problem with the clocks at zero that hardly matter."""
+    free, points = problem.free, problem.points
+    if not free.offsets[: len(CLOCKS)].any():
+        return problem
+    stay = clocks_that_differ(problem.objective, points, best, problem.criterion, free)
+    points = Point(points.coefficients, points.offsets * stay)
+    clocks = jnp.asarray(points.offsets[best])[: len(CLOCKS)] * OFFSET_UNIT
+    return replace(
+        problem,
+        points=points,
+        criterion=replace(problem.criterion, reference_offset=clocks),
+        free=Free(free.coefficients, free.offsets & stay),
     )
 
 
