@@ -27,6 +27,7 @@ from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
 from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 3
@@ -75,10 +76,14 @@ def with_undetermined_held(
 def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
     """Return each coefficient that the flights do not identify -> its stand-in, which is held.
 
-    A coefficient is its own stand-in unless it trades off against another one.
+    A coefficient is its own stand-in unless it trades off against another one. What they determine
+    but for disturbances and model error stays where they put it, with a wide interval: it is no
+    better known where the search began.
     """
     undetermined = [
-        name for name in uncertainty.names if not uncertainty.estimates[name].identifiable
+        name
+        for name in uncertainty.names
+        if not uncertainty.estimates[name].identifiable and name not in _known_roughly(uncertainty)
     ]
     stand_ins: dict[str, str] = {}
     for direction in uncertainty.directions:
@@ -90,6 +95,18 @@ def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:
         ranked = sorted(members, key=lambda name: _rank(name, direction.moves))
         stand_ins |= dict.fromkeys(members, ranked[0])
     return stand_ins | {name: name for name in undetermined if name not in stand_ins}
+
+
+def _known_roughly(uncertainty: Uncertainty) -> frozenset[str]:
+    """Return the coefficients whose interval would be narrow if residuals were noise alone."""
+    covariance = uncertainty.covariance
+    of_noise = covariance.data_error / covariance.beyond_noise / uncertainty.reference
+    return frozenset(
+        name
+        for name, error in zip(uncertainty.names, of_noise, strict=True)
+        if uncertainty.estimates[name].reason.code is ReasonCode.WIDE_INTERVAL
+        and error < IDENTIFIABLE_ERROR
+    )
 
 
 def _rank(name: str, moves: Mapping[str, float]) -> tuple[float, float]:

@@ -76,7 +76,7 @@ def _main_clause(reason: Reason) -> str:
         ReasonCode.NO_INFORMATION: "the flights hold no information about it; "
         f"the interval is that of {prior}",
         ReasonCode.WIDE_INTERVAL: f"the flights alone determine it only to ±{_half_width(reason)}; "
-        f"the interval is that of {prior}",
+        f"the interval leans on {prior}",
         ReasonCode.PRIOR_DOMINATES: f"{reason.prior_share or 0.0:.0%} of the information about it "
         f"is that of {prior}",
         ReasonCode.NOT_WITH_ALL_FREE: "the flights do not identify it while all others are free",
