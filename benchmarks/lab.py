@@ -92,7 +92,7 @@ def trial_of(seed: int) -> Trial:
             job, folder, resume=False, on_progress=lambda *_: None, on_message=print
         )
         fitted, examination = with_undetermined_held(
-            selected.job, selected.fitted, lambda *_: None, print
+            selected.job, selected.fitted, lambda *_: None, print, in_doubt=selected.in_doubt
         )
         seconds = time.process_time() - clock
     free = {
