@@ -1,10 +1,11 @@
 """Double precision, the program's own set-up, and bounded memory, for every test that uses jax.
 
 A test process keeps every program that it has compiled: gibibytes by the end of the suite, for most
-modules compile their own and use them once. When a process has grown beyond `MOST_MEMORY`, and
-still is when what is free was given back, all of them are dropped. A program that is asked for
-again comes from the compilation cache on disk, however small it is, which the processes of a run
-share, those that tests start included; it is traced again, not compiled.
+modules compile their own and use them once. When a process has grown beyond `MOST_MEMORY` by the
+end of a module, and still is when what is free was given back, all of them are dropped; inside of a
+module, whose tests share programs, beyond `MOST_IN_A_MODULE`. A program that is asked for again
+comes from the compilation cache on disk, however small it is, which the processes of a run share,
+those that tests start included; it is not compiled, but traced again, which takes seconds.
 """
 
 from __future__ import annotations
@@ -38,11 +39,14 @@ settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 MOST_MEMORY = 800 * 2**20
-"""bytes of a test process at the end of a test beyond which its compiled programs are dropped."""
+"""bytes of a test process at the end of a module beyond which its compiled programs are dropped."""
+MOST_IN_A_MODULE = 1300 * 2**20
+"""The same at the end of a test that others of its module follow."""
 GROWTH = 150 * 2**20
 """bytes by which a process grows beyond what it could not give back before it tries again."""
 
-most_memory = MOST_MEMORY
+grown = 0
+"""bytes that the process had left when it last could not give more back, and `GROWTH`."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -69,19 +73,21 @@ def resident_memory() -> int:
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_runtest_teardown() -> None:
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """Give back what is free once the process has grown too large, then what jax has compiled.
 
     It takes a second: a process that stays large does not try after every test.
     """
-    global most_memory  # noqa: PLW0603 (of this process)
-    if "jax" not in sys.modules or resident_memory() <= most_memory:
+    global grown  # noqa: PLW0603 (of this process)
+    ends = nextitem is None or nextitem.path != item.path
+    most = max(MOST_MEMORY if ends else MOST_IN_A_MODULE, grown)
+    if "jax" not in sys.modules or resident_memory() <= most:
         return
     _give_back()
     if resident_memory() > MOST_MEMORY:
         sys.modules["jax"].clear_caches()
         _give_back()
-    most_memory = max(MOST_MEMORY, resident_memory() + GROWTH)
+    grown = resident_memory() + GROWTH
 
 
 def _give_back() -> None:

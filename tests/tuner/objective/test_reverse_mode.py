@@ -17,6 +17,8 @@ def fit():
     return problem(FREE)
 
 
+@pytest.mark.long  # as `tests.sim_jax.test_rollout_derivatives` shows of a flight alone
+@pytest.mark.slow
 def test_reverse_mode_gives_forward_modes_gradient(fit):
     criterion = eqx.tree_at(lambda s: s.huber, criterion_of(fit), jnp.asarray(2.0))
     late = jnp.full((5, 2), 0.1)
