@@ -17,8 +17,8 @@ demo: $(READY)  ## fit the five recordings that ship with the project
 test: $(READY)  ## every test but what is marked long: that repeats others at length
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not long"
 
-test-all: $(READY)  ## every test; half an hour on two cores
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+test-all: $(READY)  ## every test, all code optimised; more than an hour on two cores
+	TUNE_TESTS_OPTIMISED=1 $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test-fast: $(READY)  ## what a change is checked against while it is being made
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow and not long"

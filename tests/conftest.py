@@ -21,6 +21,10 @@ import pytest
 
 os.environ.setdefault("JAX_ENABLE_X64", "true")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+if "TUNE_TESTS_OPTIMISED" not in os.environ:
+    given = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_optimization_level" not in given:
+        os.environ["XLA_FLAGS"] = f"{given} --xla_backend_optimization_level=0".strip()
 
 from hypothesis import settings
 
