@@ -1,6 +1,7 @@
 """How true fits of simulated lab flights are: bias and coverage of each coefficient, terms found.
 
-``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes.
+``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes. With
+``TUNE_LAB_WORKERS`` so many processes take a seed each.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from benchmarks.lab_flights import Lab, drawn, write
 from benchmarks.table import Section, figure
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import Options, settle, values_of
+from tuner.engine import engine_for
 from tuner.job.first_terms import with_first_terms
 from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
@@ -26,6 +28,7 @@ from tuner.recordings import read_usable
 from tuner.uncertainty.estimates import Estimate
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
+WORKERS = int(os.environ.get("TUNE_LAB_WORKERS", "0")) or None
 
 
 @dataclass(frozen=True)
@@ -58,9 +61,10 @@ class Trial:
 def measure() -> Section:
     """Fly, fit and compare every seed."""
     trials = []
-    for seed in SEEDS:
-        trials.append(trial_of(seed))
-        print(_line(seed, trials[-1]), flush=True)
+    with engine_for(WORKERS) as engine:
+        for seed, trial in zip(SEEDS, engine.stream(trial_of, SEEDS), strict=True):
+            trials.append(trial)
+            print(_line(seed, trial), flush=True)
     missed = [group for trial in trials for group in trial.lab.groups if group not in trial.found]
     false = [group for trial in trials for group in trial.found if group not in trial.lab.groups]
     flown = sum(len(trial.lab.groups) for trial in trials)
@@ -89,10 +93,14 @@ def trial_of(seed: int) -> Trial:
         job = with_first_terms(job_of(settings, recordings))
         clock = time.process_time()
         selected = search_with_terms(
-            job, folder, resume=False, on_progress=lambda *_: None, on_message=print
+            job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
         )
         fitted, examination = with_undetermined_held(
-            selected.job, selected.fitted, lambda *_: None, print, in_doubt=selected.in_doubt
+            selected.job,
+            selected.fitted,
+            lambda *_: None,
+            lambda _: None,
+            in_doubt=selected.in_doubt,
         )
         seconds = time.process_time() - clock
     free = {

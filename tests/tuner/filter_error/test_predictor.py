@@ -22,7 +22,7 @@ from tuner.objective.residuals import beginning_of, trace_of
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.information import information_at, information_from_jacobian
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 FREE = ("inertia_xx", "inertia_yy", "time_constant_up", "motor_constant", "rotor_drag_coefficient")
 STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03])

@@ -66,6 +66,7 @@ def thinned(series, every):
     return Series(series.time[::every], series.values[::every])
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, monkeypatch):
     monkeypatch.setattr(next_log, "WORTH_LOGGING", 1.0)

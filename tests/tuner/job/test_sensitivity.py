@@ -10,6 +10,8 @@ from tuner.config import ControllerFile, configs_folder
 from tuner.errors import InputError
 from tuner.job.examination_files import arena_of
 
+pytestmark = pytest.mark.slow
+
 FREE = ["motor_constant", "inertia_zz", "moment_constant"]
 
 
@@ -21,7 +23,7 @@ def examined(bag, updated, tmp_path_factory):
         vehicle=updated,
         controller=ControllerFile(),
         free=FREE,
-        arena=(4.0, 4.0, 2.0),
+        arena=(2.0, 2.0, 2.0),
         out=out,
     )
 
@@ -62,7 +64,7 @@ def test_what_matters_is_known_and_what_does_not_is_not(examined):
         for name in known
     }
     assert changes["motor_constant"] > 100 * changes["rolling_moment_coefficient"]
-    assert examined.proposals.arena == (4.0, 4.0, 2.0)
+    assert examined.proposals.arena == (2.0, 2.0, 2.0)
 
 
 def test_an_arena_is_taken_from_the_flights(flight):
@@ -90,13 +92,22 @@ def test_the_other_way_round_is_refused_too(bag):
         tuner.sensitivity([bag], arena=(8.0, 6.0))
 
 
-@pytest.mark.slow
-def test_the_command_prints_a_line_for_each_coefficient(bag, tmp_path, capsys):
+def test_the_command_asks_for_what_was_typed_and_prints_a_line_for_each_coefficient(
+    examined, bag, tmp_path, capsys, monkeypatch
+):
+    asked = []
+
+    def examine(options, request, *, out, **_):
+        asked.append((list(options.flights), list(options.fit), request.arena, out))
+        return examined
+
+    monkeypatch.setattr("tuner.job.sensitivity.examine_vehicle", examine)
     vehicle = configs_folder() / "vehicles" / "hovergames_updated.yaml"
     out = tmp_path / "out"
     words = ["sensitivity", "--flights", str(bag), "--vehicle", str(vehicle), "--fit", *FREE]
-    assert main([*words, "--arena", "4,4,2", "--out", str(out)]) == 0
+    assert main([*words, "--arena", "2,2,2", "--out", str(out)]) == 0
+    assert asked == [([str(bag)], FREE, (2.0, 2.0, 2.0), out)]
     shown = capsys.readouterr().out
     assert "rolling_moment_coefficient (fixed)" in shown
     assert "The worst determined combination of coefficients: " in shown
-    assert f"written to {out}/" in shown
+    assert f"written to {examined.folder}/" in shown
