@@ -8,7 +8,7 @@ READY := $(VENV)/.ready
 
 $(READY): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test,dev,docs,cluster,service]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[test,dev,docs,cluster,service]'
 	touch $(READY)
 
 demo: $(READY)  ## fit the five recordings that ship with the project

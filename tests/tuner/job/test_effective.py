@@ -1,13 +1,12 @@
 """The second answer: what Gazebo lacks is made up for, or named, and nothing else moves."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.tuner.selection.making import job_with
-from tests.tuner.uncertainty.making import controller_file, problem, vehicle_file, with_data
+from tests.tuner.uncertainty.making import problem, vehicle_file, with_data
 from tuner.config import JobFile, values_of
 from tuner.job.effective import (
     carried_terms,
@@ -29,16 +28,10 @@ def axes(*values):
     return AxesRmse(**dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True)))
 
 
-def with_controller(job):
-    settings = SimpleNamespace(**vars(job.settings), controller=controller_file())
-    return replace(job, settings=settings)
-
-
 @pytest.fixture(scope="module")
 def fit():
     """A base fit of flights that lack nothing, and its job."""
-    job, fitted = job_with(0.0, seed=0, job=JobFile())
-    return with_controller(job), fitted
+    return job_with(0.0, seed=0, job=JobFile())
 
 
 def test_a_vehicle_of_which_gazebo_lacks_nothing_has_one_answer(fit):
@@ -95,7 +88,7 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays():
     start = flown.space.vector_of(values)
     flown = with_data(flown, flown.start(start), noise=np.random.default_rng(0))
     job, base = job_with(0.0, seed=0, job=JobFile())
-    job = with_controller(replace(job, space=flown.space, objective=flown))
+    job = replace(job, space=flown.space, objective=flown)
     fitted = replace(base, objective=flown, point=flown.start(start))
     vehicle = vehicle_file().replace(
         effects={"linear_drag_x": 0.3, "linear_drag_y": 0.3},
