@@ -36,7 +36,8 @@ from tuner.config import (  # noqa: E402 (jax is configured first)
 from tuner.engine import Report, engine_for  # noqa: E402
 from tuner.findings import Code  # noqa: E402
 from tuner.flights.flight import Flight, Series  # noqa: E402
-from tuner.job.best_fit import validate, vehicle_fitted  # noqa: E402
+from tuner.job.best_fit import vehicle_fitted  # noqa: E402
+from tuner.job.held_out import validate  # noqa: E402
 from tuner.job.prepare import Job, job_of  # noqa: E402
 from tuner.job.search import search  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
@@ -92,9 +93,9 @@ def worst(job: Job, fitted: Fitted) -> str:
 def reference() -> str:
     """Fit from the original coefficients, and fly the held-out flight."""
     job, fitted, seconds = solved(settings_of())
-    before, after = validate(job, fitted, vehicle_fitted(job, fitted))
+    flown = validate(job, fitted, vehicle_fitted(job, fitted))
     (held,) = job.held_out
-    first, last = before[held.name].rmse, after[held.name].rmse
+    first, last = flown.initial[held.name].rmse, flown.best[held.name].rmse
     ratios = [getattr(first, axis) / getattr(last, axis) for axis in ("x", "y", "z")]
     place = ", ".join(f"{1e3 * getattr(last, axis):.2f}" for axis in ("x", "y", "z"))
     return (
