@@ -15,7 +15,7 @@ What was measured with jaxlib 0.10 on two cores with AVX-512, on steps of some h
 - The tiled emitter takes vectors of four for roots and divisions: a third slower than without.
 - A schedule for concurrency spreads kernels of a tenth of a microsecond over threads: twice slower.
 - 512-bit vectors give a seventh.
-- Of the seconds that Python traces, a third went into its search for garbage: it is made rare.
+- Two fifths of the time to trace went into Python's search for garbage: it is made rare.
 - Without the newer emitter of kernels a Jacobian compiles an eighth sooner, and runs as fast; but a
   gradient in reverse mode takes minutes to compile.
 
@@ -38,9 +38,9 @@ _RELEASES_KNOWN = ("0.10",)
 _LARGER_THAN_ANY_LOOP = 10**15
 """bytes"""
 _COLLECT_AFTER = (100_000, 20, 100)
-"""New objects, and collections of younger ones, after which Python looks for garbage: a program
-that jax traces is hundreds of thousands of objects that stay. At Python's own 700 a third of the
-time to trace went into looking through them again and again."""
+"""New objects, and collections of younger ones, after which Python looks for garbage. A program
+that jax traces is hundreds of thousands of objects that stay, which Python's own 700 look through
+again and again."""
 
 
 def cache_folder() -> Path:

@@ -102,10 +102,14 @@ def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet
     """Return the references side by side, as long as the recorded ones, the last points held."""
     assert isinstance(recorded.inlet, ReferenceInlet)
     inlets = [reference.inlet for reference in references]
-    length = max(np.shape(recorded.inlet.points.position.x)[0], *(len(r.lap) for r in references))
+    recorded_ticks = np.shape(recorded.inlet.points.position.x)[0]
+    length = max(recorded_ticks, *(len(r.lap) - 1 for r in references))  # none acts at the end
 
     def beside(*rows: jax.Array) -> jax.Array:
-        edges = [np.pad(np.asarray(row), (0, length - len(row)), mode="edge") for row in rows]
+        edges = [
+            np.pad(np.asarray(row)[:length], (0, max(length - len(row), 0)), mode="edge")
+            for row in rows
+        ]
         return jnp.asarray(np.stack(edges, axis=-1))
 
     points: ReferencePoint = jax.tree.map(beside, *(inlet.points for inlet in inlets))

@@ -55,6 +55,8 @@ def rank_next_flights(
     full_problem = examination.full_problem
     flights = candidates(arena)
     at_once = min(full_problem.objective.segments.count, len(flights))
+    kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
+    offsets_fitted = np.repeat(kinds[:, None], at_once, axis=1)
     gains, flown = [], []
     for first in range(0, len(flights), at_once):
         # the last ones again where too few are left: as many as the program was compiled for
@@ -64,13 +66,8 @@ def rank_next_flights(
         )
         point, weights = candidate_point(full_problem.point, criterion, objective, seconds=seconds)
         jacobian = objective.jacobian(point, weights, columns=full_problem.columns)
-        kinds = (np.asarray(full_problem.point.offsets) != 0.0).any(axis=1)
         information = information_from_jacobian(
-            objective,
-            point,
-            weights,
-            jacobian,
-            offsets_fitted=np.repeat(kinds[:, None], at_once, axis=1),
+            objective, point, weights, jacobian, offsets_fitted=offsets_fitted
         )
         inside = _inside(objective, jacobian.residuals, arena)
         gains += list(information.blocks.sum(axis=(0, 2)))

@@ -44,7 +44,7 @@ from tuner.job.next_log import what_to_log
 from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
 from tuner.job.search import OnProgress, parameters_of
-from tuner.job.selection import Selected
+from tuner.job.selected import Selected
 from tuner.job.terms import search_with_terms
 from tuner.prediction.input_lag import with_inputs_on_time
 from tuner.recordings import read_usable

@@ -13,7 +13,7 @@ keeps its clocks.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +26,7 @@ from tuner.job.findings import findings_at
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
+from tuner.job.selected import Selected, Standing
 from tuner.model import with_coefficients
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import Objective, with_conditions
@@ -41,7 +42,7 @@ from tuner.selection.candidates import (
     with_terms,
 )
 from tuner.selection.doubt import in_doubt
-from tuner.selection.linear import Linear, linear_at
+from tuner.selection.linear import linear_at
 from tuner.selection.prediction import predicted_losses, vector_after
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
@@ -56,48 +57,6 @@ WORTH_FITTING = (
     SelectionCode.PREDICTS_SECTIONS,
     SelectionCode.NOT_PREDICTED,
 )
-
-
-@dataclass(frozen=True)
-class Selected:
-    """A job and its fit with the terms that were kept, and the table of all that were tried.
-
-    Attributes
-    ----------
-    in_doubt
-        Coefficient -> how far it would move, in the scaled coordinate, with terms that were tried
-        and not kept; empty where none was tried.
-    """
-
-    job: Job
-    fitted: Fitted
-    rows: tuple[SelectionRow, ...] = ()
-    in_doubt: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _State:
-    """A fit with some groups in it, seen in linear approximation by all that could be in it.
-
-    Attributes
-    ----------
-    fitted
-        The fit; coefficients that only fill its space up stay at their neutral values.
-    added
-        Groups in it.
-    linear
-        The loss about it, by the base model's coefficients and all candidates.
-    """
-
-    fitted: Fitted
-    added: Groups
-    linear: Linear
-
-    @property
-    def vector(self) -> dict[str, float]:
-        """Coefficient -> number of the search vector."""
-        names, numbers = self.fitted.objective.space.names, self.fitted.point.coefficients
-        return dict(zip(names, np.asarray(numbers).tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -151,7 +110,7 @@ class Selection:
         fitted = fitted if state.added else self.fitted
         return Selected(job, fitted, rows, self._in_doubt(state, rows))
 
-    def _in_doubt(self, state: _State, rows: Sequence[SelectionRow]) -> dict[str, float]:
+    def _in_doubt(self, state: Standing, rows: Sequence[SelectionRow]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
         names = [*self.job.space.names, *_names(state.added)]
         outside = [
@@ -163,7 +122,7 @@ class Selection:
         coefficients = [name for name in names if name not in conditions_in(self.candidates)]
         return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
 
-    def _wanted(self, state: _State, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
+    def _wanted(self, state: Standing, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
         """Return the groups to fit next: all that gain by more than chance, if one predicts.
 
         As long as terms are missing, those that are there stand in for them and even what is true
@@ -176,7 +135,7 @@ class Selection:
         }
         return scores if any(found.earns_place for found in scores.values()) else {}
 
-    def _with_all(self, base: _State) -> _State | None:
+    def _with_all(self, base: Standing) -> Standing | None:
         """Return what backward elimination leaves of all groups, if it predicts better.
 
         Where something is missing the base fit lies anywhere, and what little it shows of the
@@ -201,8 +160,8 @@ class Selection:
         return None
 
     def _grown(
-        self, state: _State, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
-    ) -> _State | None:
+        self, state: Standing, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
+    ) -> Standing | None:
         """Return the fit with the groups that hold their places in it, if it predicts better."""
         best = max(wanted, key=lambda name: wanted[name].gain_holdout)
         for names in dict.fromkeys([tuple(wanted), (best,)]):
@@ -215,7 +174,7 @@ class Selection:
         dropped[best] = SelectionCode.WORSE_AFTER_REFIT
         return None
 
-    def _pruned(self, state: _State) -> _State:
+    def _pruned(self, state: Standing) -> Standing:
         """Return the fit without the groups that do not hold their places beside the others."""
         kept, taken = surviving(
             state.linear,
@@ -231,7 +190,7 @@ class Selection:
         groups = {name: self.candidates[name] for name in kept}
         return self._pruned(self._refitted(self._without(state, taken), groups))
 
-    def _without(self, state: _State, taken: Collection[str]) -> _State:
+    def _without(self, state: Standing, taken: Collection[str]) -> Standing:
         """Return a fit moved to where, to first order, the others end without some groups.
 
         They have to make up for what is taken away: from where they are, whole flights would lead
@@ -255,7 +214,7 @@ class Selection:
         point = Point(jnp.asarray(moved), jnp.asarray(offsets))
         return replace(state, fitted=replace(state.fitted, point=point))
 
-    def _refitted(self, state: _State, groups: Groups, *, anew: bool = False) -> _State:
+    def _refitted(self, state: Standing, groups: Groups, *, anew: bool = False) -> Standing:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted, around = coefficients_in(groups), conditions_in(self.candidates)
         idle = tuple(name for name in around if name not in conditions_in(groups))
@@ -299,7 +258,7 @@ class Selection:
             )
         return self._seen(fitted, groups)
 
-    def _seen(self, fitted: Fitted, added: Groups) -> _State:
+    def _seen(self, fitted: Fitted, added: Groups) -> Standing:
         """Return a fit as all candidates see it."""
         objective, point = with_terms(
             self._objective_of(fitted),
@@ -322,7 +281,7 @@ class Selection:
             offsets_fitted=np.asarray(at.offsets) != 0.0,
             around=around,
         )
-        return _State(fitted, added, linear)
+        return Standing(fitted, added, linear)
 
     def _objective_of(self, fitted: Fitted) -> Objective:
         """Return a fit's base problem with all candidates in the model, at their neutral values."""
@@ -366,7 +325,7 @@ class Selection:
         ]
         return np.array([self._space.index(name) for name in wanted], np.intp)
 
-    def _scores_outside(self, state: _State) -> dict[str, Score]:
+    def _scores_outside(self, state: Standing) -> dict[str, Score]:
         """Return what each group that is not in the model is worth beside it."""
         model = self._columns([*self.job.space.names, *_names(state.added)])
         return {
@@ -375,7 +334,7 @@ class Selection:
             if group not in state.added
         }
 
-    def _scores_inside(self, state: _State) -> dict[str, Score]:
+    def _scores_inside(self, state: Standing) -> dict[str, Score]:
         """Return what each group in the model is worth beside the others in it."""
         scores = {}
         for group, names in state.added.items():
@@ -390,7 +349,7 @@ class Selection:
         return scores
 
     def _rows(
-        self, state: _State, dropped: Mapping[str, SelectionCode]
+        self, state: Standing, dropped: Mapping[str, SelectionCode]
     ) -> tuple[SelectionRow, ...]:
         """Return the table: what is in the model first, by what it predicts."""
         rows = [
@@ -410,7 +369,7 @@ class Selection:
         ]
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
 
-    def _predicts_better(self, trial: _State, state: _State, *, by_flight: bool) -> bool:
+    def _predicts_better(self, trial: Standing, state: Standing, *, by_flight: bool) -> bool:
         """Return whether a refit predicts flights left out better than the fit before it.
 
         By more than the standard error over the flights, or, where only sections of flights can
@@ -423,7 +382,7 @@ class Selection:
         scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
-    def _predicted(self, state: _State, scale: Mapping[str, Array]) -> NDArray[np.float64]:
+    def _predicted(self, state: Standing, scale: Mapping[str, Array]) -> NDArray[np.float64]:
         model = self._columns([*self.job.space.names, *_names(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)

@@ -10,7 +10,8 @@ from pathlib import Path
 from tuner.findings import Finding
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, search
-from tuner.job.selection import Selected, Selection
+from tuner.job.selected import Selected
+from tuner.job.selection import Selection
 from tuner.objective.inlets import INLETS
 from tuner.search.fitted import Fitted
 from tuner.selection.candidates import Groups, candidate_groups, groups_around

@@ -20,6 +20,7 @@ from tuner.design.ranking import rank_next_flights
 from tuner.errors import InputError
 from tuner.examination.examination import Examination, examine
 from tuner.objective.normal import Objective
+from tuner.objective.simulator import Simulator
 from tuner.search.fitted import Fitted
 from tuner.wording.proposals import proposals_in_words
 
@@ -67,6 +68,18 @@ def ranked(examination: Examination, fitted: Fitted) -> Proposals:
 @pytest.fixture(scope="module")
 def proposals(examination: Examination, fitted: Fitted) -> Proposals:
     return ranked(examination, fitted)
+
+
+def test_candidates_are_flown_by_the_program_of_the_examination(
+    fitted: Fitted, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    examination = examine(fitted, names=("swing",))
+
+    def trace(*_: object) -> None:
+        raise AssertionError("a program was traced for the candidates")
+
+    monkeypatch.setattr(Simulator, "jacobian", trace)
+    assert ranked(examination, fitted).flights
 
 
 def test_what_the_swing_does_not_identify_a_yaw_spin_does(proposals: Proposals) -> None:
