@@ -1,7 +1,8 @@
 """``python -m benchmarks [throughput ...] [--out FILE | --update]``: measure, and write a page.
 
 Without names everything is measured that speaks of speed, and benchmarks/RESULTS.md written; with
-names the parts are printed, and with ``--update`` they take their place on that page. Two
+names the parts are printed, and with ``--update`` they take their place on that page. Either way
+the page's history gets a line. Two
 environment variables bring others into the comparison: TUNE_YARDSTICK, the folder of the C++
 program, and TUNE_PEERS, a Python that has drone-models, crazyflow and mujoco installed
 (``pip install -e '.[bench]'`` puts them beside this project).
@@ -13,9 +14,11 @@ import argparse
 import datetime
 import importlib
 import time
+from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks.table import Section, table, updated
+from benchmarks.history import remembered
+from benchmarks.table import Section, sections_of, table, updated, with_bars
 from benchmarks.timing import machine
 from tuner import runtime
 
@@ -36,8 +39,8 @@ NO_SPEED = ("lab", "calibration")
 RESULTS = Path(__file__).with_name("RESULTS.md")
 
 
-def page(sections: list[Section], where: str, minutes: float) -> str:
-    """Return the page: the bars first, then every table."""
+def page(sections: list[Section], where: str, minutes: float, before: str = "") -> str:
+    """Return the page: the bars first, then every table; what was not measured stays as it was."""
     bars = [bar.row() for section in sections for bar in section.bars]
     how = (
         f"`make bench` on {datetime.date.today()} in {minutes:.1f} minutes: {where}. "
@@ -45,7 +48,9 @@ def page(sections: list[Section], where: str, minutes: float) -> str:
         f"tune's settings: {runtime.describe()}."
     )
     parts = ["# Measured speed", how, table(["bar", "measured", "asked for", ""], bars)]
-    return "\n\n".join([*parts, *(section.markdown() for section in sections)])
+    measured = {section.title: section.markdown() for section in sections}
+    kept = {title: text for title, text in sections_of(before).items() if title not in measured}
+    return "\n\n".join([*parts, *measured.values(), *kept.values()])
 
 
 def main() -> None:
@@ -58,16 +63,27 @@ def main() -> None:
     began, where, sections = time.perf_counter(), machine(), list[Section]()
     runtime.configure()
     whole = not arguments.parts and not arguments.update
-    target = RESULTS if whole and arguments.out is None else arguments.out
+    target = arguments.out or (RESULTS if whole or arguments.update else None)
+    text = before = target.read_text(encoding="utf-8") if target and target.exists() else ""
     for part in arguments.parts or PARTS:
         section = importlib.import_module(f"benchmarks.{part}").measure()
         sections.append(section)
         bars = [" | ".join(bar.row()) for bar in section.bars]
         print(section.markdown(), *bars, sep="\n", flush=True)
-        if target is not None:
-            target.write_text(page(sections, where, (time.perf_counter() - began) / 60))
-        elif arguments.update:
-            RESULTS.write_text(updated(RESULTS.read_text(encoding="utf-8"), section))
+        if target is None:
+            continue
+        past = remembered(
+            before,
+            [bar for section in sections for bar in section.bars],
+            when=datetime.datetime.now(datetime.UTC),
+            version=version("multirotor-tune"),
+            whole=not arguments.parts,
+        )
+        if arguments.update:
+            text = updated(with_bars(updated(text, section), section.bars), past)
+        else:
+            text = page([past, *sections], where, (time.perf_counter() - began) / 60, before)
+        target.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

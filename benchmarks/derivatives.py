@@ -58,10 +58,15 @@ def measure() -> Section:
                 "at most",
                 " forward runs",
             ),
-            Bar("its temporary memory, of its output", temporary / output, 0.1, "at most"),
+            Bar(
+                "temporary memory of the Jacobian, of its output",
+                temporary / output,
+                0.1,
+                "at most",
+            ),
             Bar("reverse gradient", times[GRADIENT].median / base, 12, "at most", " forward runs"),
             Bar(
-                "its temporary memory",
+                "temporary memory of the gradient",
                 memory[GRADIENT][0] / (STEPS / 2),
                 20,
                 "at most",

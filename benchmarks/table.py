@@ -66,11 +66,28 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines)
 
 
+def sections_of(page: str) -> dict[str, str]:
+    """Return title -> section of a page, heading included, in their order."""
+    _, *parts = page.split("\n## ")
+    return {part.partition("\n")[0]: f"## {part.strip()}\n" for part in parts}
+
+
 def updated(page: str, section: Section) -> str:
     """Return a page with a section in the place of the one of its title, or at its end."""
     before, heading, rest = page.partition(f"## {section.title}\n")
     _, following, after = rest.partition("\n## ") if heading else ("", "", "")
     return f"{before.rstrip()}\n\n{section.markdown()}{following}{after}"
+
+
+def with_bars(page: str, bars: Sequence[Bar]) -> str:
+    """Return a page whose first table has these bars, in the place of those of their name."""
+    head, heading, rest = page.partition("\n## ")
+    rows = {bar.what: "| " + " | ".join(bar.row()) + " |" for bar in bars}
+    lines = [
+        rows.pop(line.split(" | ")[0].removeprefix("| "), line)
+        for line in head.rstrip().splitlines()
+    ]
+    return "\n".join([*lines, *rows.values()]) + "\n" + heading + rest
 
 
 def figure(value: float) -> str:
