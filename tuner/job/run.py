@@ -181,10 +181,12 @@ def run(
     drawing.begin(folder)
     with span("next flight"):
         write_next_flight(folder, job, examination, fitted)
-    with span("page"):
-        render(folder, wait_for_plots=drawing.wait)
-    with span("exports"):
-        _export(folder, settings, listener)
+    try:
+        with span("exports"):  # while figures are still being drawn
+            _export(folder, settings, listener)
+    finally:
+        with span("page"):
+            render(folder, wait_for_plots=drawing.wait)
     return folder, result
 
 
