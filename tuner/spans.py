@@ -5,6 +5,7 @@ A stage is a block ``with span("search"):``. Unless a run is recorded it costs a
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -42,7 +43,7 @@ class Span:
     detail
         What was traced or compiled.
     beside
-        Whether another process did it, while this one went on.
+        Whether another process or thread did it, while this one went on.
     processor
         Processor seconds of this process, all threads together; known of stages alone.
     """
@@ -65,6 +66,8 @@ class Recorder:
     """Collects the spans of one run, as they end."""
 
     spans: list[Span] = field(default_factory=list)
+    thread: int = field(default_factory=threading.get_ident)
+    """Whose stages they are."""
     began: float = field(default_factory=lambda: time.perf_counter() - time.process_time())
     """The process's begin on `time.perf_counter`: until now it has done nothing but compute."""
 
@@ -76,7 +79,8 @@ class Recorder:
         """Add what jax reports at its end, if it is one of `OF_JAX`."""
         if event in OF_JAX:
             end, detail = self.now(), str(kwargs.get("fun_name", ""))
-            self.spans.append(Span(OF_JAX[event], end - duration_secs, end, detail))
+            beside = threading.get_ident() != self.thread
+            self.spans.append(Span(OF_JAX[event], end - duration_secs, end, detail, beside))
 
 
 _RECORDER: ContextVar[Recorder | None] = ContextVar("_RECORDER", default=None)

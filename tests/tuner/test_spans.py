@@ -2,6 +2,7 @@
 
 import json
 import time
+from threading import Thread
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +60,18 @@ def test_what_jax_traces_and_compiles_counts_within_the_stage_that_asks_for_it()
     with span("not recorded"):
         pass
     assert "not recorded" not in {span.name for span in recorder.spans}
+
+
+def test_what_another_thread_compiles_goes_on_beside_the_stages():
+    with recording() as recorder, span("check"):
+        thread = Thread(target=lambda: jax.jit(lambda x: jnp.tanh(x) * 17.0)(jnp.arange(3.0)))
+        thread.start()
+        thread.join(60.0)
+    compiled = [row for row in recorder.spans if row.name == COMPILING]
+    assert compiled
+    assert all(row.beside for row in compiled)
+    (row, *_) = (r for r in table_of(recorder.spans, recorder.now(), 1.0) if r.stage == "check")
+    assert row.programs == 0
 
 
 def test_the_trace_nests_as_perfetto_wants_it_and_other_processes_have_a_row():

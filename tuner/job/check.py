@@ -45,6 +45,11 @@ def check(job: Job) -> tuple[Finding, ...]:
     tuple of Finding
         ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
     """
+    return (*check_recordings(job), *check_information(job))
+
+
+def check_recordings(job: Job) -> tuple[Finding, ...]:
+    """Look at what was recorded, and at where the search would begin, without a simulation."""
     return (
         *said_once(
             (
@@ -57,7 +62,6 @@ def check(job: Job) -> tuple[Finding, ...]:
         *_excitation(job),
         *_bounds(job),
         *_starts_on_bounds(job),
-        *_information(job),
     )
 
 
@@ -199,7 +203,8 @@ def information(job: Job) -> NDArray[np.float64]:
     return np.asarray(hessian / np.outer(slope, slope))
 
 
-def _information(job: Job) -> Iterator[Finding]:
+def check_information(job: Job) -> Iterator[Finding]:
+    """Look at what the recordings tell of the coefficients where the search would begin."""
     at_start = information(job)
     if not np.isfinite(at_start).all():
         yield Finding(Code.NOT_FINITE, "failure", "simulation")

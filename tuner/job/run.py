@@ -13,17 +13,18 @@ from math import nan
 from pathlib import Path
 
 from tuner.comparison.tabulate import table_of
-from tuner.config import Options, Settings, settle, with_values, write_vehicle
+from tuner.config import Options, Settings, VehicleFile, settle, with_values, write_vehicle
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.examination.examination import Examination
 from tuner.exporters.after_run import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
+from tuner.job.ahead import ProgramsAhead
 from tuner.job.balanced import with_inputs_balanced
 from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
-from tuner.job.check import check
+from tuner.job.check import check_information, check_recordings
 from tuner.job.cross_validation import cross_validate, jackknife_errors
 from tuner.job.disturbances import with_disturbances
 from tuner.job.effective import effective_fit
@@ -110,15 +111,13 @@ def run(
     settings = settle(options)
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
-    job, findings = _checked(settings)
+    job, findings = _prepared(settings)
     _report(findings, listener, force=force)
-
-    make_folder(folder)
-    on_progress = _keeping_best(folder, listener)
-    selected = _searched(job, folder, on_progress, findings, listener, resume=resume)
-    drawing = BackgroundDrawing()
+    selected, fitted, examination = _fitted(
+        job, findings, folder, listener, resume=resume, force=force
+    )
     job = selected.job
-    fitted, examination = _examined(selected, on_progress, listener)
+    drawing = BackgroundDrawing()
     with span("balance"):
         fitted, examination, inertia = with_inputs_balanced(
             job, fitted, examination, listener.on_message, in_doubt=selected.in_doubt
@@ -127,18 +126,10 @@ def run(
     sources = sources_of(fitted, uncertainty, examination.known)
     conflicts = ground_conflicts(sources)
     _report(conflicts, listener, force=True)
-    listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
     vehicle = vehicle_fitted(job, fitted)
-    with span("validation"):
-        validation = validate(job, fitted, vehicle)
-    worse = (
-        *flights_worse(validation.initial, validation.best),
-        *(inertia or turning_unexplained(validation.turning_explained)),
-    )
-    _report(worse, listener, force=True)
+    fitted, validation = _validated(job, fitted, vehicle, inertia, listener)
     fitted = replace(
-        fitted,
-        findings=(*worse, *fitted.findings, *finer_than_steps(uncertainty), *conflicts),
+        fitted, findings=(*fitted.findings, *finer_than_steps(uncertainty), *conflicts)
     )
     with span("effective coefficients"):
         effective = effective_fit(
@@ -190,41 +181,52 @@ def run(
     return folder, result
 
 
-def _checked(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
-    """Return the job of some settings, and what there is to say of it before it is searched."""
+def _prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
+    """Return the job of some settings, and what there is to say of it before it is simulated."""
     with span("reading"):
         recordings, left_out = read_usable(settings)
     with span("check"):
         recordings = with_inputs_on_time(recordings, settings.vehicle)
         job = with_first_terms(job_of(settings, recordings))
-        return job, (*left_out, *inputs_late(job), *check(job))
+        return job, (*left_out, *inputs_late(job), *check_recordings(job))
 
 
-def _searched(
+def _fitted(
     job: Job,
-    folder: Path,
-    on_progress: OnProgress,
     findings: tuple[Finding, ...],
+    folder: Path,
     listener: Listener,
     *,
     resume: bool,
-) -> Selected:
-    """Return where the search ends, with the terms that the flights call for."""
-    try:
-        return search_with_terms(
-            job,
-            folder,
-            resume=resume,
-            on_progress=on_progress,
-            on_message=listener.on_message,
-            findings=findings,
-        )
-    except (KeyboardInterrupt, OutputError, EngineError):
-        listener.on_message(
-            f"The best coefficients so far are in {folder}. "
-            f"Continue the search with --out {folder} --resume."
-        )
-        raise
+    force: bool,
+) -> tuple[Selected, Fitted, Examination]:
+    """Return where the search of a job ends, the fit that is reported, and how well it is known."""
+    with ProgramsAhead(job) as ahead:
+        with span("check"):
+            at_start = tuple(check_information(job))
+        _report(at_start, listener, force=force)
+
+        make_folder(folder)
+        on_progress = _keeping_best(folder, listener)
+        try:
+            selected = search_with_terms(
+                job,
+                folder,
+                resume=resume,
+                on_progress=on_progress,
+                on_message=listener.on_message,
+                findings=(*findings, *at_start),
+                before_selection=ahead.await_selection,
+            )
+        except (KeyboardInterrupt, OutputError, EngineError):
+            listener.on_message(
+                f"The best coefficients so far are in {folder}. "
+                f"Continue the search with --out {folder} --resume."
+            )
+            raise
+        if selected.job is job:
+            ahead.await_examination()
+        return (selected, *_examined(selected, on_progress, listener))
 
 
 def _examined(
@@ -244,6 +246,28 @@ def _examined(
         return followed or with_undetermined_held(
             job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
         )
+
+
+def _validated(
+    job: Job,
+    fitted: Fitted,
+    vehicle: VehicleFile,
+    inertia: Sequence[Finding],
+    listener: Listener,
+) -> tuple[Fitted, Validation]:
+    """Return the fit with what its simulated flights say of it, and these.
+
+    ``inertia`` is what the balance of moments has said; if nothing, the turning is looked at.
+    """
+    listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
+    with span("validation"):
+        validation = validate(job, fitted, vehicle)
+    worse = (
+        *flights_worse(validation.initial, validation.best),
+        *(inertia or turning_unexplained(validation.turning_explained)),
+    )
+    _report(worse, listener, force=True)
+    return replace(fitted, findings=(*worse, *fitted.findings)), validation
 
 
 def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:

@@ -76,7 +76,7 @@ class Selection:
 
     def run(self) -> Selected:
         """Add groups until none earns its place."""
-        state = self._seen(self.fitted, {})
+        state = self.seen(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
         if self._wanted(state, dropped):
             state = self._with_all(state) or state
@@ -256,9 +256,9 @@ class Selection:
             fitted = polished(
                 self.job, from_here, free=free_ones, title=title, on_progress=on_progress
             )
-        return self._seen(fitted, groups)
+        return self.seen(fitted, groups)
 
-    def _seen(self, fitted: Fitted, added: Groups) -> Standing:
+    def seen(self, fitted: Fitted, added: Groups) -> Standing:
         """Return a fit as all candidates see it."""
         objective, point = with_terms(
             self._objective_of(fitted),

@@ -27,11 +27,13 @@ def search_with_terms(
     on_progress: OnProgress,
     on_message: Callable[[str], None],
     findings: tuple[Finding, ...] = (),
+    before_selection: Callable[[], None] = lambda: None,
 ) -> Selected:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
-    CMA-ES looks for another beginning. Arguments and errors are those of `search`.
+    CMA-ES looks for another beginning. Arguments and errors are those of `search`;
+    ``before_selection`` is called between the two.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:
@@ -45,6 +47,7 @@ def search_with_terms(
                 provisional=provisional,
             )
         with span("selection of terms"):
+            before_selection()
             return with_terms_selected(job, fitted, on_progress, on_message)
 
     selected = searched(resume=resume, provisional=bool(candidates_of(job)))

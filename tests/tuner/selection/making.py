@@ -46,6 +46,19 @@ def job_with(
     Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
     each of them.
     """
+    made, fitted = unfitted_with(drag, seed=seed, job=job, tilt=tilt, around=around)
+    return made, _fit(made, fitted)
+
+
+def unfitted_with(
+    drag: float,
+    *,
+    seed: int,
+    job: JobFile | None = None,
+    tilt: tuple[float, float] = (0.0, 0.0),
+    around: Mapping[str, Sequence[float]] | None = None,
+) -> tuple[Job, Fitted]:
+    """Return the job of `job_with`, and its start as a fit that moved nothing."""
     truth = problem((*BASE, "fuselage_drag"))
     vector = truth.space.vector_of(
         dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
@@ -73,8 +86,7 @@ def job_with(
         job=job or JobFile(), vehicle=vehicle_file(), controller=controller_file()
     )
     made = Job(settings, recordings, NOISE, space, objective)
-    fitted = fitted_of(objective, objective.start(space.initial))
-    return made, _fit(made, fitted)
+    return made, fitted_of(objective, objective.start(space.initial))
 
 
 def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:

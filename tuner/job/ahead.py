@@ -1,0 +1,115 @@
+"""Programs that come after the search, made ready while it goes on.
+
+The selection of terms and the examination differentiate flights by more than the search does, each
+by a program of its own. To compile one takes a core some twenty seconds where it is not in the
+cache, and a second where it is, in which the other core has little to do. So another thread asks
+for both, about the vehicle that the search begins with and a horizon of one sample: nothing but the
+program comes of it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from tuner.examination.examination import examine
+from tuner.job.prepare import Job
+from tuner.job.selection import Selection
+from tuner.job.terms import candidates_of
+from tuner.objective.alternatives import alternatives_of
+from tuner.objective.flight_batches import portions
+from tuner.search.fitted import Fitted
+from tuner.search.progress import beginning, criterion_of, point_of
+from tuner.search.stages import Stage
+from tuner.uncertainty.full_problem import full_problem_of
+
+logger = logging.getLogger(__name__)
+
+
+class ProgramsAhead:
+    """Makes the programs of a job's selection and examination ready, one after the other.
+
+    Nothing is made ready where flights take turns: what is computed beside the search would need as
+    much memory again. What fails here fails, and is said, where it is needed.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self._executor = ThreadPoolExecutor(max_workers=1)
+        fitted = _not_fitted(job)
+        full = full_problem_of(fitted.objective, fitted.point)
+        together = len(list(portions(full.objective, full.point, fitted.criterion))) == 1
+        selects = together and bool(candidates_of(job))
+        self._selection = self._begun(lambda: _select(job, fitted)) if selects else None
+        self._examination = self._begun(lambda: _examine(fitted)) if together else None
+
+    def __enter__(self) -> Self:
+        """Return itself; at the end of the block no further program is begun."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Begin no further program; one that is being compiled ends on its own."""
+        self._executor.shutdown(wait=False, cancel_futures=True)
+
+    def await_selection(self) -> None:
+        """Return once the selection's program is ready, or left to whoever needs it."""
+        _await(self._selection)
+
+    def await_examination(self) -> None:
+        """Return once the examination's program is ready, or left to whoever needs it."""
+        _await(self._examination)
+
+    def _begun(self, make: Callable[[], object]) -> Future[None]:
+        def attempt() -> None:
+            try:
+                make()
+            except Exception as reason:  # such a start may be no vehicle; the search knows better
+                logger.debug("a program was not made ready: %s", reason)
+
+        return self._executor.submit(attempt)
+
+
+def _await(program: Future[None] | None) -> None:
+    """Wait for a program that is being made ready; one that has not been begun is let go."""
+    if program is not None and not program.cancel():
+        program.result()
+
+
+def _not_fitted(job: Job) -> Fitted:
+    """Return the start of a job's search as a fit to one sample of each flight."""
+    objective = job.objective
+    start = beginning(objective, job.space.initial[None])
+    stage = Stage("ahead", 1, 1.0, False, False, 1, 1.0, False, False)
+    offsets = np.asarray(start.points.offsets[0])
+    return Fitted(
+        objective=objective,
+        point=point_of(start.points, 0),
+        criterion=criterion_of(stage, start.scales, offsets, start.states),
+        noise=job.noise,
+        scales={flight.name: dict.fromkeys(start.scales, 1.0) for flight in job.fitted},
+        iterations=(),
+        outcomes=(),
+        method="none",
+        evaluations=0,
+        wall_time=0.0,
+        loss_initial=np.inf,
+        loss_best=np.inf,
+        converged=False,
+    )
+
+
+def _select(job: Job, fitted: Fitted) -> None:
+    Selection(job, fitted, candidates_of(job), lambda *_: None, lambda _: None).seen(fitted, {})
+
+
+def _examine(fitted: Fitted) -> None:
+    examine(fitted, otherwise=alternatives_of(fitted.objective))
