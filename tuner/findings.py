@@ -22,6 +22,8 @@ class Code(StrEnum):
     FLIGHT_WORSE = "flight_worse"  # before, after; names: position or attitude, its unit
     MISSING_SIGNALS = "missing_signals"  # names: the signals
     POSE_GAP = "pose_gap"  # seconds
+    WRONG_VEHICLE = "wrong_vehicle"  # lift, weight (N), mass (kg)
+    CANNOT_HOVER = "cannot_hover"  # idle, full, weight (N), mass (kg)
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
     INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal
     MOTOR_ORDER = "motor_order"  # names: the recorded columns, from 1, in the vehicle's order

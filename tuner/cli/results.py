@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
-    from tuner.result import EffectiveResult, RunResult
+    from tuner.result import AxesRmse, EffectiveResult, RunResult
+
+NOT_SIMULATED = "–"
+"""Of what a simulation follows as it was recorded, or nobody recorded."""
 
 
 def print_run(folder: Path, result: RunResult) -> None:
@@ -196,8 +199,8 @@ def _errors(result: RunResult) -> Table:
     for flight in result.flights:
         cells = []
         for axis in RMSE_UNITS:
-            before, after = getattr(flight.rmse_initial, axis), getattr(flight.rmse_best, axis)
-            cells.append(f"{_number(before)} → {_number(after)}")
+            both = [_axis(rmse, axis) for rmse in (flight.rmse_initial, flight.rmse_best)]
+            cells.append(NOT_SIMULATED if both == [NOT_SIMULATED] * 2 else " → ".join(both))
         held_out = " (held out)" if flight.split == "holdout" else ""
         table.add_row(flight.name + held_out, *cells)
     return table
@@ -217,7 +220,9 @@ def _predictions(result: RunResult) -> Table:
         held_out = " (held out)" if flight.split == "holdout" else ""
         for before, after in zip(flight.predicted_initial, flight.predicted_best, strict=True):
             cells = [
-                f"{_number(getattr(before, name))} → {_number(getattr(after, name))}"
+                NOT_SIMULATED
+                if getattr(before, name) is None and getattr(after, name) is None
+                else f"{_number(getattr(before, name))} → {_number(getattr(after, name))}"
                 for name in PREDICTED
             ]
             table.add_row(flight.name + held_out, f"{after.seconds:g} s", *cells)
@@ -229,8 +234,7 @@ def folds_table(folds: Sequence[Fold]) -> Table:
     table = _rmse_table("RMSE of each flight with the fit to the others", "left out")
     for fold in folds:
         cells = [
-            "impossible" if fold.rmse is None else _number(getattr(fold.rmse, axis))
-            for axis in RMSE_UNITS
+            "impossible" if fold.rmse is None else _axis(fold.rmse, axis) for axis in RMSE_UNITS
         ]
         table.add_row(fold.left_out, *cells)
     return table
@@ -242,6 +246,13 @@ def _rmse_table(title: str, first: str) -> Table:
     for axis, unit in RMSE_UNITS.items():
         table.add_column(f"{axis} {unit}", justify="right")
     return table
+
+
+def _axis(rmse: AxesRmse, axis: str) -> str:
+    """Return an axis' RMSE; of a flight whose attitude is followed three axes are not simulated."""
+    flown = any(getattr(rmse, each) is not None for each in RMSE_UNITS)
+    value = getattr(rmse, axis)
+    return NOT_SIMULATED if flown and value is None else _number(value)
 
 
 def _number(value: float | None) -> str:

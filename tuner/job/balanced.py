@@ -1,11 +1,12 @@
-"""Coefficients at which recorded motion and measured rotor speeds balance, unless they mislead.
+"""Inertia at which recorded motion and measured rotor speeds balance, unless it misleads.
 
 Least squares on simulations that are fed noisy rotor speeds finds what predicts these flights best
 with that noise, and takes inertia for larger than it is: the slower a flight, the more. What the
-balance finds (`tuner.objective.balance`) is not biased by it, and holds for other flights as well;
-but where a drift of the measured speeds is much larger than what flies, it predicts badly. So
-every flight is left out in turn, and the balance is taken unless what was left out is predicted
-much worse.
+balance finds (`tuner.objective.balance`) is not biased by it, and holds for other flights as well.
+All of the balance predicts badly where the measured speeds drift: nothing then damps what the drift
+drives. So the balance settles how strongly rotors turn the vehicle, `TURNS`, and all else is fitted
+again to what flies, drag of the turning above all. Every flight is left out in turn, and that is
+taken unless what was left out is predicted much worse than by least squares alone.
 """
 
 from __future__ import annotations
@@ -45,11 +46,13 @@ SETTLED = 1e-4
 """Step of a coordinate below which it has arrived."""
 ROBUST = 3.0
 """Standard deviations beyond which a residual counts linearly."""
-TOLERATED = 0.5
-"""Share by which the loss of what was left out may be larger, a fifth in its residuals: least
+TURNS = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
+"""Coefficients that the balance settles."""
+TOLERATED = 0.2
+"""Share by which the loss of what was left out may be larger, a tenth in its residuals: least
 squares gains so much from flights that are like each other, and loses it on others."""
-LEFT_OUT = Stage("left out", 0, 1.0, True, False, 4, 1e-3, False, False)
-"""From the fit to all, a fit to the others is a few steps away."""
+LEFT_OUT = Stage("left out", 0, 1.0, True, False, 8, 1e-3, False, False)
+"""From the fit to all, a fit to the others is a few steps away, or with other inertia."""
 TOLD = 0.1
 """Share by which an inertia changes from which it is said."""
 
@@ -83,6 +86,12 @@ class _Settling:
             if np.abs(step).max(initial=0.0) < SETTLED:
                 break
         return vector
+
+    def refitted(self, inside: Mask, balanced: Vector) -> Vector:
+        """Return the search vector (K,) that meets some windows best with a balance's `TURNS`."""
+        settled = np.isin(self.fitted.objective.space.names, TURNS)
+        begin = np.where(settled, balanced, np.asarray(self.fitted.point.coefficients))
+        return _fitted_to(self.fitted, inside, begin=begin, settled=settled)
 
     def _normal_equations(
         self, vector: Vector, residuals: Vector, columns: Vector, inside: Mask
@@ -154,7 +163,7 @@ def with_inputs_balanced(
     *,
     in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination, tuple[Finding, ...]]:
-    """Return the fit at which recorded motion and rotor speeds balance, or as it is; what to say.
+    """Return the fit whose inertia balances motion and rotor speeds, or as it is; what to say.
 
     With it the examination of what is returned; ``in_doubt`` is as for `examine`.
 
@@ -169,8 +178,9 @@ def with_inputs_balanced(
     on_message("Balancing the recorded motion and the rotor speeds.")
     balance = balance_of(objective, fitted.point, job.fitted)
     settling = _Settling(fitted, balance, objective.tunable)
-    vector = settling.at(np.ones(segments.count, bool), fitted.point.coefficients)
-    as_fitted, as_balanced = _losses_left_out(settling, vector)
+    balanced = settling.at(np.ones(segments.count, bool), fitted.point.coefficients)
+    vector = settling.refitted(np.ones(segments.count, bool), balanced)
+    as_fitted, as_balanced = _losses_left_out(settling, balanced)
     point = Point(jnp.asarray(vector), fitted.point.offsets)
     taken = as_balanced <= (1.0 + TOLERATED) * as_fitted
     findings = _findings(fitted, point, as_balanced / as_fitted, taken=taken)
@@ -197,7 +207,10 @@ def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, floa
     vectors = np.stack(
         [
             *(_fitted_to(fitted, fold != number) for number in numbers),
-            *(settling.at(fold != number, balanced) for number in numbers),
+            *(
+                settling.refitted(fold != number, settling.at(fold != number, balanced))
+                for number in numbers
+            ),
         ]
     )
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
@@ -208,8 +221,17 @@ def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, floa
     return float(as_fitted), float(as_balanced)
 
 
-def _fitted_to(fitted: Fitted, inside: Mask) -> Vector:
-    """Return where a few steps lead from the fit, if only some windows (F,) are fitted."""
+def _fitted_to(
+    fitted: Fitted,
+    inside: Mask,
+    *,
+    begin: Vector | None = None,
+    settled: Mask | None = None,
+) -> Vector:
+    """Return where a few steps lead from the fit, if only some windows (F,) are fitted.
+
+    ``begin`` (K,) is another place to begin, ``settled`` (K,) what stays as it is there.
+    """
     objective = fitted.objective
     weights = {
         name: eqx.tree_at(
@@ -219,11 +241,14 @@ def _fitted_to(fitted: Fitted, inside: Mask) -> Vector:
     }
     some = eqx.tree_at(lambda o: o.segments.measured, objective, weights)
     held = np.isin(objective.space.names, list(set(fitted.held.values())))
+    if settled is not None:
+        held |= settled
+    start = fitted.point.coefficients if begin is None else jnp.asarray(begin)
     problem = StageProblem(
         objective=some,
         criterion=fitted.criterion,
         stage=LEFT_OUT,
-        points=Point(fitted.point.coefficients[None], fitted.point.offsets[None]),
+        points=Point(start[None], fitted.point.offsets[None]),
         losses=np.array([np.inf]),
         free=Free(~held, np.zeros(fitted.point.offsets.shape, bool)),
         seed=0,

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.control.mixer import ROTORS
+from sim_jax.numeric import GRAVITY
 from tuner.coefficients import COEFFICIENTS
+from tuner.config import VehicleFile
 from tuner.findings import Code, Finding
-from tuner.flights.flight import Flight
+from tuner.flights.flight import Array, Flight
 from tuner.job.prepare import Job
-from tuner.objective.inlets import INLETS
+from tuner.objective.explained import Source, squared_speed
+from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.motor_order import order_findings
 from tuner.objective.recorded_inputs import sparse
 from tuner.objective.setpoints import setpoint_findings
@@ -33,6 +38,11 @@ TURNS = 0.5
 """rad/s of yaw rate below which yaw is not excited."""
 NAMED = 3
 """Flights that a finding names one by one, at most."""
+FOREIGN = 3.0
+"""Times that a vehicle file's lift and weight may differ: commands lift more on a full battery, and
+scaling laws know thrust to a few tens of percent."""
+IDLE = 0.7
+"""Share of the weight from which a vehicle that idles cannot descend."""
 GAP = 0.25
 """s without a pose inside a mission that a user should know of."""
 
@@ -59,6 +69,7 @@ def check_recordings(job: Job) -> tuple[Finding, ...]:
                 *_controllers(job),
             )
         ),
+        *_wrong_vehicle(job),
         *_excitation(job),
         *_bounds(job),
         *_starts_on_bounds(job),
@@ -90,7 +101,8 @@ def _recordings(job: Job) -> Iterator[Finding]:
             numbers = {name: value for name, value in vars(damage).items() if _is_number(value)}
             names = (damage.cause.value, damage.subject)
             yield Finding(Code.SALVAGED, "warning", flight.name, numbers, names)
-        missing = [name for name in ("body_rate", "rotor_speed", "command") if not flight.has(name)]
+        rotors = () if flight.has("rotor_speed") else ("rotor_speed", "command")
+        missing = [name for name in ("body_rate", *rotors) if not flight.has(name)]
         if missing:
             yield Finding(Code.MISSING_SIGNALS, "warning", flight.name, names=tuple(missing))
         gap = float(np.max(np.diff(flight.series["position"].time), initial=0.0))
@@ -117,6 +129,38 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
             recorded = round(1.0 / float(np.median(np.diff(flight.series[signal].time))))
             numbers = {"recorded": recorded, "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
+
+
+def _wrong_vehicle(job: Job) -> Iterator[Finding]:
+    """Warn of a vehicle file whose rotors, turning as recorded, lift many times what it weighs.
+
+    Or a small part of it: over a flight the mean lift is the weight. A default vehicle that is not
+    the one that flew does so, and from there no search arrives.
+    """
+    vehicle = job.settings.vehicle
+    weight, lifts = vehicle.mass * GRAVITY, [_lift(flight, vehicle) for flight in job.fitted]
+    lift = float(np.median(lifts))
+    numbers = {"lift": lift, "weight": weight, "mass": vehicle.mass}
+    if not weight / FOREIGN < lift < FOREIGN * weight:
+        yield Finding(Code.WRONG_VEHICLE, "warning", vehicle.name, numbers)
+    elif "input_scaling" not in bypassed_by(job.inlets, job.fitted):
+        idle, full = (_lift_of(np.full((1, ROTORS), u), vehicle, "command") for u in (0.0, 1.0))
+        if idle > IDLE * weight or full < weight:
+            numbers = {"idle": idle, "full": full, "weight": weight, "mass": vehicle.mass}
+            yield Finding(Code.CANNOT_HOVER, "warning", vehicle.name, numbers)
+
+
+def _lift(flight: Flight, vehicle: VehicleFile) -> float:
+    """Return the mean lift in N of rotors that turn as recorded; the weight if none was."""
+    for source in get_args(Source):
+        if flight.has(source):
+            return _lift_of(flight.signals[source], vehicle, source)
+    return vehicle.mass * GRAVITY
+
+
+def _lift_of(recorded: Array, vehicle: VehicleFile, source: Source) -> float:
+    squares = squared_speed(vehicle, source, recorded).sum(axis=1)
+    return float(np.nanmean(squares)) * vehicle.aerodynamics.motor_constant
 
 
 def _motor_orders(job: Job) -> Iterator[Finding]:

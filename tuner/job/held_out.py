@@ -63,11 +63,10 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         predicted_initial=_errors(_predictions(job, fitted, initial)),
         predicted_best=_errors(predictions),
         turning_explained={
-            recording.flight.name: _turning_explained(
-                recording.flight, predictions[recording.flight.name]
-            )
+            recording.flight.name: _turning_explained(recording.flight, predicted)
             for recording in job.recordings
-            if recording.flight.name in predictions
+            if (predicted := predictions.get(recording.flight.name))
+            and "body_rate" in predicted.errors
         },
     )
 

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.bench.combine import combine
+from tuner.bench.combine import Combination, combine
 from tuner.bench.measurement import Measurement
-from tuner.config import Settings, values_of
+from tuner.bench.scales import value_of
+from tuner.config import Settings, VehicleFile, values_of, with_values
 from tuner.errors import ConfigError, RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.inertial import InertialFlight, read_inertial
@@ -93,7 +94,7 @@ def fit_without_pose(
     except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
         measurements = tuple(_without_yaw(m) for m in measurements)
         combination = combine(measurements, known)
-        vehicle = vehicle_of(path, start, combination)
+        vehicle = vehicle_of(path, _as_flat(start, combination), combination)
     return written(
         folder,
         start,
@@ -106,6 +107,23 @@ def fit_without_pose(
         header=f"From flights without a pose; the rest as in {start.name}.",
         began=began,
     )
+
+
+def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
+    """Return a vehicle of the size that was found: its yaw inertia in the file's proportion.
+
+    What the flights say of roll and pitch says how large the vehicle is, of which the file knows
+    nothing where another vehicle flew.
+    """
+    before = values_of(vehicle)
+    changes = [
+        value_of(name, float(scaled)) / before[name]
+        for name, scaled in zip(combination.names, combination.scaled, strict=True)
+        if name in ("inertia_xx", "inertia_yy")
+    ]
+    size = float(np.exp(np.mean(np.log(changes)))) if changes else 1.0
+    others = {name: size * before[name] for name in ("inertia_xx", "inertia_yy", "inertia_zz")}
+    return with_values(vehicle, others)
 
 
 def _without_yaw(measurement: Measurement) -> Measurement:

@@ -24,6 +24,7 @@ from tuner.flights.flight import Array, Flight
 from tuner.flights.states import States, states_at
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.battery import with_reference_voltage
+from tuner.objective.inlets import INLETS
 from tuner.objective.markers import markers_of
 from tuner.objective.residuals import simulate_segments
 from tuner.objective.segments import Segments, window_segments
@@ -52,7 +53,8 @@ class Predictions:
         (S,) s after that at which they are compared.
     errors
         Quantity of `UNITS` -> (S, n): Euclidean distance from the recorded one, for an attitude the
-        angle of the rotation between both.
+        angle of the rotation between both; what the inlet follows, and does not predict, is left
+        out.
     """
 
     begins: Array
@@ -60,9 +62,10 @@ class Predictions:
     errors: Mapping[str, Array]
 
     def mean(self, seconds: float) -> dict[str, float]:
-        """Return each quantity's mean error so many s ahead."""
+        """Return each quantity's mean error so many s ahead, NaN of what is not predicted."""
         (step,) = np.flatnonzero(np.isclose(self.ahead, seconds, atol=1e-6))
-        return {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
+        means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
+        return dict.fromkeys(UNITS, np.nan) | means
 
 
 def predict(
@@ -109,7 +112,10 @@ def predict(
     ahead = np.arange(1, steps + 1) / flight.rate
     reached = _simulated(model, segments, schedule_of(controller), ahead)
     recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
-    return Predictions(begins, ahead, errors_of(reached, recorded, (steps, len(begins))))
+    errors = errors_of(reached, recorded, (steps, len(begins)))
+    followed = INLETS[inlet].silences
+    predicted = {name: distances for name, distances in errors.items() if name not in followed}
+    return Predictions(begins, ahead, predicted)
 
 
 def starts_of(

@@ -12,6 +12,11 @@ from tuner.wording.damage import damage_sentence
 from tuner.wording.notes import note_in_words
 from tuner.wording.phrases import as_sentence, listed, percent
 
+GIVE_VEHICLE = (
+    "Give the vehicle with --vehicle and what it weighs with --mass; tune new-vehicle writes a "
+    "starting file from its mass, size and propellers."
+)
+
 #: Code -> what was noticed and what to do about it: text with the finding's numbers in braces,
 #: ``names`` for its names, ``first`` and ``second`` for one of them, ``subject`` for its subject.
 TEXTS: Mapping[Code, tuple[str, str]] = {
@@ -23,8 +28,25 @@ TEXTS: Mapping[Code, tuple[str, str]] = {
         "Look at its figures and at inspect: it may have been flown, or recorded, otherwise.",
     ),
     Code.MISSING_SIGNALS: (
-        "The recording holds no {names}, and position alone says little about the rotors.",
-        "Record them.",
+        (
+            "The recording holds no {names}, without which the flight says less about the motors, "
+            "and about inertia."
+        ),
+        "Log that too, if you can.",
+    ),
+    Code.WRONG_VEHICLE: (
+        (
+            "This is not the vehicle that flew: turning as recorded its rotors would lift "
+            "{lift:.3g} N on average, and {mass:g} kg weigh {weight:.3g} N."
+        ),
+        GIVE_VEHICLE,
+    ),
+    Code.CANNOT_HOVER: (
+        (
+            "This is not the vehicle that flew: {mass:g} kg weigh {weight:.3g} N, and its rotors "
+            "lift {idle:.3g} N idling, {full:.3g} N at full command."
+        ),
+        GIVE_VEHICLE,
     ),
     Code.POSE_GAP: (
         "No pose was recorded for {seconds:.2f} s during the mission.",
@@ -322,9 +344,10 @@ def _inertia_balanced(finding: Finding) -> str:
     error = finding.numbers["error"]
     if finding.code is Code.INERTIA_BALANCED:
         return (
-            "Errors in the measured rotor speeds would pass for inertia and damping, so that the "
-            f"coefficients are those at which recorded motion and rotor speeds balance: {values}. "
-            f"Flights that are left out are predicted with {error:.2f} times the error."
+            "Errors in the measured rotor speeds would pass for inertia, so that it is the one at "
+            f"which recorded motion and rotor speeds balance: {values}. All else is fitted to what "
+            "flies, with drag that stands in for what the errors drive. Flights that are left out "
+            f"are predicted with {error:.2f} times the error."
         )
     return (
         "Errors in the measured rotor speeds pass for inertia and damping: recorded motion and "

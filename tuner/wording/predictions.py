@@ -58,10 +58,6 @@ def _clocks(flights: Sequence[FlightResult]) -> str:
 
 def _axes(flight: FlightResult) -> str:
     assert flight.rmse_fitted_starts is not None
-    values = (
-        (axis, getattr(flight.rmse_fitted_starts, axis), unit) for axis, unit in RMSE_UNITS.items()
-    )
-    return ", ".join(
-        f"{axis} {'crash' if value is None else f'{value:.3g}'} {unit}"
-        for axis, value, unit in values
-    )
+    values = {axis: getattr(flight.rmse_fitted_starts, axis) for axis in RMSE_UNITS}
+    known = {axis: value for axis, value in values.items() if value is not None}
+    return ", ".join(f"{axis} {value:.3g} {RMSE_UNITS[axis]}" for axis, value in known.items())

@@ -84,6 +84,16 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
     assert again["inertia_xx"] == result["inertia_xx"].best
 
 
+def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tmp_path):
+    truth = values_of(flown)
+    wrong = {name: 9.0 * truth[name] for name in ("inertia_xx", "inertia_yy", "inertia_zz")}
+    settings = settings_for(log_file(simulation, tmp_path / "log00"), with_values(flown, wrong))
+    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
+    assert best["inertia_xx"] == pytest.approx(truth["inertia_xx"], rel=0.1)
+    assert best["inertia_zz"] == pytest.approx(truth["inertia_zz"], rel=0.1)  # the proportion's
+
+
 @pytest.mark.slow
 def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(simulation, flown, tmp_path):
     path = log_file(simulation, tmp_path / "log00")

@@ -81,6 +81,18 @@ def plan_of(job):
     return plan("gradient", job.objective.samples, 400.0, windows=True, robust=False, steps=5)
 
 
+def test_another_vehicle_than_the_one_that_flew_is_named(full_flight, full_bag, updated):
+    only_speeds = {name: s for name, s in full_flight.series.items() if name != "command"}
+    signals = {name: s for name, s in full_flight.signals.items() if name != "command"}
+    bare = replace(full_flight, series=only_speeds, signals=signals)
+    own = {finding.code for finding in check(job_through("rotor_speed", bare, full_bag, updated))}
+    assert not own & {Code.MISSING_SIGNALS, Code.WRONG_VEHICLE}  # speeds say more than commands
+    light = job_through("rotor_speed", bare, full_bag, updated.replace(mass=0.034))
+    (wrong,) = (finding for finding in check(light) if finding.code == Code.WRONG_VEHICLE)
+    assert wrong.numbers["weight"] == pytest.approx(0.034 * 9.81, rel=1e-2)
+    assert wrong.numbers["lift"] == pytest.approx(updated.mass * 9.81, rel=0.2)
+
+
 @pytest.mark.slow
 def test_windows_are_compared_from_their_likeliest_starts(full_flight, full_bag, updated):
     job = job_through("actuator", full_flight, full_bag, updated)

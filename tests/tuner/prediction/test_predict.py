@@ -54,6 +54,14 @@ def test_a_wrong_vehicle_predicts_worse_and_a_late_input_is_put_right(truth, ful
     assert right.mean(0.5) == pytest.approx(truth.mean(0.5), rel=0.02)
 
 
+def test_what_is_followed_is_not_called_predicted(full_flight, updated):
+    followed = predict(updated, ControllerFile(), full_flight, "attitude", stride=1.0)
+    assert set(followed.errors) == {"position", "velocity"}
+    means = followed.mean(0.5)
+    assert means["position"] < 0.05
+    assert np.isnan(means["attitude"])
+
+
 def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
     position = full_flight.series["position"]
     moved = position.values + np.where(position.time > truth.begins[5] + 0.1, 1.0, 0.0)[:, None]

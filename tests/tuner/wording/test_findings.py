@@ -26,6 +26,15 @@ MADE = {
     Code.MISSING_SIGNALS: Finding(
         Code.MISSING_SIGNALS, "warning", "a", names=("rotor_speed", "command")
     ),
+    Code.WRONG_VEHICLE: Finding(
+        Code.WRONG_VEHICLE, "warning", "quad", {"lift": 98.0, "weight": 0.33, "mass": 0.034}
+    ),
+    Code.CANNOT_HOVER: Finding(
+        Code.CANNOT_HOVER,
+        "warning",
+        "quad",
+        {"idle": 0.34, "full": 41.0, "weight": 0.33, "mass": 0.034},
+    ),
     Code.POSE_GAP: Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.4}),
     Code.SPARSE_INPUT: Finding(
         Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
