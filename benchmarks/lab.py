@@ -10,12 +10,13 @@ import os
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.lab_flights import Lab, drawn, write
+from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import Options, settle, values_of
@@ -25,7 +26,8 @@ from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
 from tuner.job.terms import search_with_terms
 from tuner.recordings import read_usable
-from tuner.uncertainty.estimates import Estimate
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.estimates import Estimate, Uncertainty
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
 WORKERS = int(os.environ.get("TUNE_LAB_WORKERS", "0")) or None
@@ -43,6 +45,8 @@ class Trial:
         Groups of terms in the fit.
     estimates
         Coefficient -> estimate, of those that are free and not held.
+    oracle
+        Coefficient -> what an oracle would quote, in the estimate's standard errors.
     seconds
         Of processor time.
     """
@@ -50,6 +54,7 @@ class Trial:
     lab: Lab
     found: tuple[str, ...]
     estimates: Mapping[str, Estimate]
+    oracle: Mapping[str, float]
     seconds: float
 
     def true(self, name: str) -> float:
@@ -75,10 +80,21 @@ def measure() -> Section:
         f"given. Of {flown} groups of terms that were flown {flown - len(missed)} are found"
         f"{_named('; missed', missed)}; {len(false)} are found that were not flown"
         f"{_named('', false)}. Errors are shares of the truth, or, of what may be zero, of the "
-        "coefficient's usual size; the interval's half-width likewise. "
+        "coefficient's usual size; the interval's half-width likewise, its median over the fits. "
+        "An oracle knows the truth and the law of the gusts: it flies the fit's model at the truth "
+        "again, in other gusts and other noise, and quotes how far linear fits to those flights "
+        "scatter; beside it the median of how many times as wide the quoted interval is. "
         f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
     )
-    head = ["coefficient", "fits", "mean error", "RMS error", "95 % interval ±", "hold the truth"]
+    head = [
+        "coefficient",
+        "fits",
+        "mean error",
+        "RMS error",
+        "95 % interval ±",
+        "of an oracle's",
+        "hold the truth",
+    ]
     return Section("Simulated lab flights", text, head, list(_rows(trials)))
 
 
@@ -115,7 +131,23 @@ def trial_of(seed: int) -> Trial:
         if name not in fitted.held
     }
     found = tuple(row.group for row in selected.rows if row.kept)
-    return Trial(lab, found, free, seconds)
+    trial = Trial(lab, found, free, {}, seconds)
+    return replace(trial, oracle=_oracle(trial, fitted, examination.uncertainty, seed))
+
+
+def _oracle(trial: Trial, fitted: Fitted, quoted: Uncertainty, seed: int) -> dict[str, float]:
+    """Return coefficient -> what an oracle would quote, in quoted standard errors.
+
+    The oracle's vehicle has the terms that were found; those that it lacks do not scatter.
+    """
+    space = fitted.objective.space
+    truth = space.vector_of(
+        {parameter.name: trial.true(parameter.name) for parameter in space.parameters}
+    )
+    random = np.random.default_rng([seed, 2])
+    errors = oracle_error(fitted, truth, gusts=trial.lab.gusts, random=random)
+    own = dict(zip(quoted.names, quoted.covariance.error, strict=True))
+    return {name: error / own[name] for name, error in errors.items() if name in trial.estimates}
 
 
 def _line(seed: int, trial: Trial) -> str:
@@ -137,7 +169,8 @@ def _rows(trials: Sequence[Trial]) -> list[list[str]]:
     for name in names:
         having = [trial for trial in trials if name in trial.estimates]
         errors = np.array([_error(trial, name) for trial in having])
-        half = np.mean([_half_width(trial, name) for trial in having])
+        half = np.median([_half_width(trial, name) for trial in having])
+        wider = [1.0 / trial.oracle[name] for trial in having if name in trial.oracle]
         held = sum(_holds(trial, name) for trial in having)
         rows.append(
             [
@@ -146,6 +179,7 @@ def _rows(trials: Sequence[Trial]) -> list[list[str]]:
                 f"{100 * errors.mean():+.2f} %",
                 f"{figure(100 * np.sqrt(np.mean(errors**2)))} %",
                 f"{figure(100 * half)} %",
+                f"{figure(np.median(wider))} ×" if wider else "",
                 f"{held} of {len(having)}",
             ]
         )

@@ -41,7 +41,7 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     def trial(error, half):
         value = true * (1.0 + error)
         estimate = SimpleNamespace(value=value, ci95=(value - half * true, value + half * true))
-        return Trial(lab, (), {"motor_constant": estimate}, 1.0)
+        return Trial(lab, (), {"motor_constant": estimate}, {"motor_constant": 0.5}, 1.0)
 
     (row,) = _rows([trial(0.02, 0.03), trial(0.04, 0.01)])
-    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "1 of 2"]
+    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "2 ×", "1 of 2"]

@@ -15,7 +15,7 @@ from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.local import LocalSensitivity, local_sensitivity
-from tuner.uncertainty.estimates import Uncertainty, references, uncertainty_at
+from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 from tuner.uncertainty.information import FisherInformation, information_from_jacobian
 from tuner.uncertainty.residual import Residual
@@ -69,6 +69,7 @@ def examine(
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
     in_doubt: Mapping[str, float] = MappingProxyType({}),
     predictor: Predictor | None = None,
+    at_minimum: bool = True,
 ) -> Examination:
     """Examine a fit, or a point where nothing was fitted.
 
@@ -89,6 +90,8 @@ def examine(
         out of the model; empty where none was tried.
     predictor
         Whose innovations say how well coefficients are known, rather than residuals.
+    at_minimum
+        Whether a search led to the point: how far it is from the minimum is then part of the error.
     """
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
@@ -120,6 +123,8 @@ def examine(
     if in_doubt:
         moves = [in_doubt.get(name, 0.0) for name in objective.space.names]
         information = replace(information, in_doubt=np.array(moves))
+    searched = set(full_problem.fitted) - set(fitted.held.values()) if at_minimum else set[str]()
+    information = information.resting(at_rest(objective.space, point, searched))
     return Examination(
         uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
         freed={
@@ -142,22 +147,7 @@ def _uncertainty_of(
 ) -> Uncertainty:
     space, indices = full_problem.subspace(names)
     vector = np.asarray(full_problem.point.coefficients)[indices]
-    return uncertainty_at(space, vector, _restricted(information, indices), flights)
-
-
-def _restricted(information: FisherInformation, indices: NDArray[np.intp]) -> FisherInformation:
-    """Return the information about some coefficients while the others are fixed."""
-    square = np.ix_(indices, indices)
-    return replace(
-        information,
-        blocks=information.blocks[..., indices, :][..., indices],
-        score=information.score[..., indices],
-        nuisance_prior=information.nuisance_prior[square],
-        prior=information.prior[square],
-        ground=None if information.ground is None else information.ground[square],
-        changes={name: change[:, indices] for name, change in information.changes.items()},
-        in_doubt=None if information.in_doubt is None else information.in_doubt[indices],
-    )
+    return uncertainty_at(space, vector, information.about(indices), flights)
 
 
 def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:

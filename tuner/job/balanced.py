@@ -192,7 +192,8 @@ def with_inputs_balanced(
     )
     fitted = replace(fitted, point=point, loss_best=float(loss))
     otherwise = alternatives_of(fitted.objective)
-    return fitted, examine(fitted, otherwise=otherwise, in_doubt=in_doubt), findings
+    examination = examine(fitted, otherwise=otherwise, in_doubt=in_doubt, at_minimum=False)
+    return fitted, examination, findings
 
 
 def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, float]:

@@ -111,7 +111,7 @@ def examine_vehicle(
     make_folder(out)
     fitted = unfitted(job)
     on_message("simulating, and differentiating by every coefficient")
-    examination = examine(fitted, otherwise=alternatives_of(fitted.objective))
+    examination = examine(fitted, otherwise=alternatives_of(fitted.objective), at_minimum=False)
     knowledge = write_knowledge(out, job, examination, fitted)
     on_message("simulating what could be flown next")
     proposals = write_next_flight(out, job, examination, fitted, arena)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.inverse import Inverse
-from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.stretches import Stretches, stretches_of
 
 Array = NDArray[np.float64]
@@ -18,9 +18,6 @@ WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""
 MAX_LEVERAGE = 0.95
 """Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
-
-ROUNDING = 1e-9
-"""Share of a variance that the flights must have in it to say anything of it."""
 
 
 @dataclass(frozen=True)
@@ -83,28 +80,23 @@ def covariance_of(information: FisherInformation) -> Covariance:
 
     With independent residuals the covariance is H⁻¹ B H⁻¹, B each channel's information times its
     residuals' mean square. Gusts and model error are no white noise: stretches of time are summed
-    up and their scores' spread takes the place of B (the sandwich estimate), each score corrected
-    for the stretch's own leverage on the fit (Bell and McCaffrey, "Bias reduction in standard
-    errors for linear regression with multi-stage samples", 2002). Few stretches make that estimate
+    up and their scores' spread takes the place of B (the sandwich estimate). A score is corrected
+    for the stretch's own leverage on the fit, in full as the jackknife has it (CV3): half of that,
+    which is exact for white noise, is too little for what wanders slowly, for a fit of many
+    coefficients takes much of it out (MacKinnon, Nielsen and Webb, "Fast and reliable jackknife and
+    bootstrap methods for cluster-robust inference", 2023). Few stretches make that estimate
     erratic: what is allowed for is weighed against what independent residuals would say, by the
-    degrees of freedom that the stretches amount to (`allowed_for`).
+    degrees of freedom that the stretches amount to (`allowed_for`; Bell and McCaffrey, "Bias
+    reduction in standard errors for linear regression with multi-stage samples", 2002).
     """
-    total = information.total
-    inverse = Inverse.of(total, information.given)
-    white = np.einsum("cf,cfbpq->pq", information.spread, information.blocks)
-    independent = inverse.sandwiched(white, information.given)
-    meat, freedom = _scatter(stretches_of(information), total)
-    nothing = np.zeros_like(total)
-    of_noise, observed = (np.diag(inverse.sandwiched(inside, nothing)) for inside in (white, meat))
-    # where the prior alone speaks, what is left of the flights' share is rounding, of either sign
-    speaks = of_noise > ROUNDING * np.diag(independent)
-    ratio = np.where(speaks, observed / np.where(speaks, of_noise, 1.0), 1.0)
-    allowed = allowed_for(ratio, freedom)
-    from_flights = np.where(speaks, of_noise * (allowed**2 - 1.0), 0.0)
-    inflation = np.sqrt(1.0 + from_flights / np.diag(independent))
+    independent = IndependentErrors.of(information)
+    inverse, matrix = independent.inverse, independent.matrix
+    meat, freedom = _scatter(stretches_of(information), information.total)
+    observed = np.diag(inverse.sandwiched(meat, np.zeros_like(meat)))
+    inflation = independent.widened(observed, freedom) / np.sqrt(np.diag(matrix))
     data = information.data + information.prior / WIDE**2
     data_inverse = Inverse.of(data, information.prior / WIDE**2).matrix
-    matrix = independent * np.outer(inflation, inflation)
+    matrix = matrix * np.outer(inflation, inflation)
     beyond_noise = np.sqrt(np.diag(matrix) / np.diag(inverse.matrix))
     return Covariance(
         matrix=matrix,
@@ -127,7 +119,7 @@ def _scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     white = np.linalg.inv(factor)
     leverage = white @ (stretches.information * scale) @ white.T
     values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.transpose(0, 2, 1)))
-    correct = (vectors / np.sqrt(1.0 - np.clip(values, 0.0, MAX_LEVERAGE))[:, None]) @ (
+    correct = (vectors / (1.0 - np.clip(values, 0.0, MAX_LEVERAGE))[:, None]) @ (
         vectors.transpose(0, 2, 1)
     )
     corrected = np.einsum("nij,nj->ni", correct, (stretches.score * unit) @ white.T) @ factor.T

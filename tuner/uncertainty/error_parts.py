@@ -25,6 +25,8 @@ class ErrorParts(Part):
     step
         Its move when the physics step is halved, and for a rotor's lag half of the finest step in
         which simulators take it; None where that was not asked.
+    search
+        How far one more linear step would move it: a search ends where its steps gain nothing.
     """
 
     noise: FiniteOrNone
@@ -32,3 +34,4 @@ class ErrorParts(Part):
     left_out: FiniteOrNone = None
     terms: FiniteOrNone = None
     step: FiniteOrNone = None
+    search: FiniteOrNone = None

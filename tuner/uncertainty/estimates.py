@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.coefficients.space import Parameter, Space
+from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.directions import Direction, weakest
@@ -106,8 +107,23 @@ def uncertainty_of(
     information = information_at(
         fitted.objective, fitted.point, fitted.criterion, offsets_fitted=offsets_fitted
     )
+    space = fitted.objective.space
+    searched = set(space.names) - set(fitted.held.values())
+    information = information.resting(at_rest(space, fitted.point, searched))
     vector = np.asarray(fitted.point.coefficients)
-    return uncertainty_at(fitted.objective.space, vector, information, tuple(fitted.scales))
+    return uncertainty_at(space, vector, information, tuple(fitted.scales))
+
+
+def at_rest(space: Space, point: Point, searched: Collection[str]) -> NDArray[np.bool_]:
+    """Return which parameters (K,) no search moves: those not searched, and those at a bound."""
+    scaled = np.asarray(space.scaled(point.coefficients))
+    return np.array(
+        [
+            parameter.name not in searched or _bound(parameter, x) is not None
+            for parameter, x in zip(space.parameters, scaled, strict=True)
+        ],
+        bool,
+    )
 
 
 def uncertainty_at(

@@ -8,12 +8,13 @@ concerns the coefficients alone and can be added up over any part of the data.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.coefficients.space import Space
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 
@@ -55,6 +56,9 @@ class FisherInformation:
         What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
     in_doubt
         (K,) how far the estimates would move with terms that were left out; None if none was tried.
+    pull, nuisance_pull
+        (K,) slopes of the priors' losses at the point, of the coefficients' own and of the
+        nuisances'; None where those of all scores add up to zero with them.
     """
 
     channels: tuple[str, ...]
@@ -70,6 +74,8 @@ class FisherInformation:
     ground: Array | None = None
     changes: Mapping[str, Array] = field(default_factory=dict)
     in_doubt: Array | None = None
+    pull: Array | None = None
+    nuisance_pull: Array | None = None
 
     @staticmethod
     def joined(parts: Sequence[FisherInformation]) -> FisherInformation:
@@ -94,7 +100,42 @@ class FisherInformation:
                 name: np.concatenate([part.changes[name] for part in parts])
                 for name in first.changes
             },
+            pull=first.pull,
+            nuisance_pull=_summed([part.nuisance_pull for part in parts]),
         )
+
+    def resting(self, where: NDArray[np.bool_]) -> FisherInformation:
+        """Return the same where some coefficients (K,) are held by what is no part of the loss."""
+        if self.pull is None:
+            return self
+        return replace(self, pull=np.where(where, self.pull - self.slope, self.pull))
+
+    def about(self, indices: NDArray[np.intp]) -> FisherInformation:
+        """Return the information about some coefficients while the others are fixed."""
+        square = np.ix_(indices, indices)
+
+        def some(values: Array | None) -> Array | None:
+            return None if values is None else values[indices]
+
+        return replace(
+            self,
+            blocks=self.blocks[..., indices, :][..., indices],
+            score=self.score[..., indices],
+            nuisance_prior=self.nuisance_prior[square],
+            prior=self.prior[square],
+            ground=None if self.ground is None else self.ground[square],
+            changes={name: change[:, indices] for name, change in self.changes.items()},
+            in_doubt=some(self.in_doubt),
+            pull=some(self.pull),
+            nuisance_pull=some(self.nuisance_pull),
+        )
+
+    @property
+    def slope(self) -> Array:
+        """The slope (K,) of the whole loss at the point, zero where a fit has converged."""
+        if self.pull is None or self.nuisance_pull is None:
+            return np.zeros(self.score.shape[-1])
+        return np.asarray(self.score.sum(axis=(0, 1, 2)) + self.pull + self.nuisance_pull)
 
     @property
     def data(self) -> Array:
@@ -112,6 +153,11 @@ class FisherInformation:
         """The part (K, K) of the total that is no sum over flights: its noise is as it says."""
         priors = self.prior + self.nuisance_prior
         return np.asarray(priors if self.ground is None else priors + self.ground)
+
+
+def _summed(parts: Sequence[Array | None]) -> Array | None:
+    known = [part for part in parts if part is not None]
+    return np.asarray(np.sum(known, axis=0)) if len(known) == len(parts) else None
 
 
 def information_at(
@@ -234,7 +280,8 @@ def _without_nuisances(
     score = sums.score * stretch
     flight = np.asarray(objective.segments.flight)
     eliminate = np.zeros((segments, count, len(stretch)))
-    nuisance_prior = np.zeros((count, count))
+    nuisance_prior, nuisance_pull = np.zeros((count, count)), np.zeros(count)
+    offsets, states = np.asarray(point.offsets), criterion.states
     for number in range(int(flight.max()) + 1):
         segments_of = np.flatnonzero(flight == number)
         first, whole = {}, np.zeros((count + kinds, count + kinds))
@@ -244,10 +291,13 @@ def _without_nuisances(
         projection = _projection(whole, offsets_fitted[:, number], count)
         second = np.hstack([np.eye(count), projection])
         nuisance_prior += projection @ projection.T / OFFSET_SD**2
+        nuisance_pull += projection @ offsets[:, number] / OFFSET_SD**2
         for segment in segments_of:
             eliminate[segment] = second @ first[segment]
             follow = second @ first[segment][:, count + kinds :]
             nuisance_prior += follow @ follow.T
+            if states is not None:
+                nuisance_pull += follow @ np.asarray(states)[:, segment]
     reduced = np.einsum("lap,clbpq,ldq->clbad", eliminate, blocks, eliminate, optimize=True)
     return FisherInformation(
         channels=sums.channels,
@@ -267,7 +317,18 @@ def _without_nuisances(
         ground=None
         if space.joint_rows is None
         else float(criterion.prior) ** 2 * space.joint_rows.T @ space.joint_rows,
+        pull=_pull(space, point, criterion),
+        nuisance_pull=nuisance_pull,
     )
+
+
+def _pull(space: Space, point: Point, criterion: Criterion) -> Array:
+    """Return the slope (K,) of the loss of the priors and of ground measurements."""
+    scaled = np.asarray(space.scaled(point.coefficients))
+    slope = (scaled - space.prior_mean) / space.prior_sd**2
+    if space.joint_rows is not None and space.joint_offset is not None:
+        slope = slope + space.joint_rows.T @ (space.joint_rows @ scaled + space.joint_offset)
+    return np.asarray(float(criterion.prior) ** 2 * slope)
 
 
 def _without_start(whole: Array, kept: int) -> Array:

@@ -1,4 +1,4 @@
-"""How much larger than noise says an error may be, from few stretches of time or few flights."""
+"""How much larger than noise says errors may be, from few stretches of time or few flights."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ Array = NDArray[np.float64]
 
 QUARTILE = 2.0
 """Of the logarithm of τ, a priori: half of all are between a seventh and seven."""
-GRID = 400
+APART = float(np.log(2.0))
+"""Quartile of how far the logarithms of the τ of one fit's coefficients are from their centre: half
+of them within a factor of two."""
+GRID = 200
 SMALLEST, BEYOND = 1e-3, 1e3
 """Of the τ that are looked at, and times the observed one."""
 FREEDOM = (1.0, 200.0)
@@ -18,14 +21,16 @@ FREEDOM = (1.0, 200.0)
 HALVINGS = 40
 
 
-def allowed_for(ratio: Array, freedom: Array) -> Array:
+def allowed_for(ratio: Array, freedom: Array, correlation: Array) -> Array:
     """Return the factors (K,) on the standard errors that noise says.
 
     With them, 1.96 standard errors are 95 % intervals of errors whose variance is 1 + τ² times the
-    noise's, log τ being Cauchy a priori: τ is as likely small as large, and as large as it must be
-    where the observation says so. A normal distribution would trust the observed scatter as it is,
-    and few flights scatter less than they should half of the time; Student's t, which knows nothing
-    of τ, makes intervals of noise alone twice as wide as they need be where two flights speak.
+    noise's. A priori log τ is Cauchy about a centre that the coefficients of a fit share, for what
+    disturbs flights disturbs all of them, and so is that centre about 1: τ is as likely small as
+    large, and as large as it must be where observations say so. A normal distribution would trust
+    the observed scatter as it is, and few flights scatter less than they should half of the time;
+    Student's t, which knows nothing of τ, makes intervals of noise alone twice as wide as they need
+    be where two flights speak.
 
     Parameters
     ----------
@@ -33,26 +38,35 @@ def allowed_for(ratio: Array, freedom: Array) -> Array:
         (K,) observed variance over the noise's.
     freedom
         (K,) degrees of freedom of the χ² that the observation is.
+    correlation
+        (K, K) of the estimates: observations that go together are counted once.
 
     Notes
     -----
     After Gelman, "Prior distributions for variance parameters in hierarchical models", 2006, whose
     half-Cauchy leaves intervals too narrow where τ is large: its logarithm has the longer tail.
-    Intervals hold 90 to 99 % with two degrees of freedom, 93 to 97 % from eight on, whatever τ is.
+    Each coefficient's evidence of the centre is tempered to the share of all that is its own; the
+    squares of two errors are correlated as the square of the errors' correlation.
     """
     freedom = np.clip(freedom, *FREEDOM)
-    largest = BEYOND * np.sqrt(np.maximum(ratio, 1.0))
-    excess = np.geomspace(SMALLEST, largest, GRID)
-    variance = 1.0 + excess**2
-    log_weight = -np.log1p((np.log(excess) / QUARTILE) ** 2)  # of steps in log τ, all alike
-    log_weight -= 0.5 * freedom * (np.log(variance) + ratio / variance)
-    weight = np.exp(log_weight - log_weight.max(axis=0))
-    weight /= weight.sum(axis=0)
+    largest = BEYOND * np.sqrt(max(float(ratio.max()), 1.0))
+    log_excess = np.linspace(np.log(SMALLEST), np.log(largest), GRID)
+    variance = 1.0 + np.exp(2.0 * log_excess)
+    likelihood = -0.5 * freedom[:, None] * (np.log(variance) + ratio[:, None] / variance)
+    likelihood = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
+    about = 1.0 / (1.0 + ((log_excess[:, None] - log_excess) / APART) ** 2)
+    about /= about.sum(axis=0)  # of an excess, given each centre
+    of_centre = np.log(likelihood @ about)
+    own = 1.0 / np.square(correlation).sum(axis=1)
+    centre = -np.log1p((log_excess / QUARTILE) ** 2) + own @ of_centre
+    centre = np.exp(centre - centre.max())
+    weight = likelihood * (about @ centre)
+    weight /= weight.sum(axis=1, keepdims=True)
     sd, half = np.sqrt(variance), stats.norm.ppf(0.975)
-    low, high = np.zeros_like(ratio), np.log(sd[-1])
+    low, high = np.zeros_like(ratio), np.full_like(ratio, np.log(sd[-1]))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        outside = 2.0 * (weight * special.ndtr(-half * np.exp(middle) / sd)).sum(axis=0)
-        too_narrow = outside > 0.05
+        tails = special.ndtr(-half * np.exp(middle)[:, None] / sd)
+        too_narrow = 2.0 * (weight * tails).sum(axis=1) > 0.05
         low, high = np.where(too_narrow, middle, low), np.where(too_narrow, high, middle)
     return np.asarray(np.exp(0.5 * (low + high)))

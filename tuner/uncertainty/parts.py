@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from tuner.objective.alternatives import STEP
 from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.inverse import Inverse
-from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.stretches import parts_of
 
 Array = NDArray[np.float64]
@@ -27,26 +27,32 @@ TELLS = 1e-3
 
 @dataclass(frozen=True)
 class Spread:
-    """The parts of K standard errors in the scaled coordinates, each (K,); None where unknown."""
+    """The parts of K standard errors in the scaled coordinates, each (K,); None where unknown.
+
+    See `ErrorParts`.
+    """
 
     noise: Array
     residuals: Array
     left_out: Array | None
     terms: Array | None
     step: Array | None
+    search: Array
 
     @property
     def quoted(self) -> Array:
         """The honest standard error (K,).
 
         Noise, residuals, left-out flights and left-out terms show the same errors in four ways, of
-        which the largest counts; what steps do comes on top.
+        which the largest counts; what steps do comes on top, those of the simulation and those that
+        the search did not take.
         """
         error = np.maximum(self.noise, self.residuals)
         for part in (self.left_out, self.terms):
             if part is not None:
                 error = np.maximum(error, part)
-        return error if self.step is None else np.hypot(error, self.step)
+        error = np.hypot(error, self.search)
+        return np.asarray(error if self.step is None else np.hypot(error, self.step))
 
     def of(self, index: int, slope: float) -> ErrorParts:
         """Return the parts of one parameter's coefficient, which changes by a slope with it."""
@@ -82,6 +88,7 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
         left_out=left_out(information),
         terms=information.in_doubt,
         step=moved.get(STEP),
+        search=np.abs(inverse.matrix @ information.slope),
     )
 
 
@@ -105,8 +112,8 @@ def left_out(information: FisherInformation) -> Array | None:
     parts = parts_of(information)
     if parts.count < FEWEST:
         return None
-    total = information.total
-    inverse = Inverse.of(total, information.given)
+    total, independent = information.total, IndependentErrors.of(information)
+    inverse = independent.inverse
     known = np.diag(inverse.matrix)
     weights, squares = np.zeros_like(parts.score), np.zeros_like(parts.score)
     for number in range(parts.count):
@@ -119,6 +126,6 @@ def left_out(information: FisherInformation) -> Array | None:
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
     beyond = (weights * squares).sum(axis=0) / of_all
     alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
-    allowed = allowed_for(beyond, alike - 1.0)  # one degree of freedom is the estimate's own
     given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
-    return np.asarray(np.sqrt(np.maximum(known - given, 0.0) * allowed**2 + given))
+    # one degree of freedom is the estimate's own
+    return independent.widened(beyond * np.maximum(known - given, 0.0), alike - 1.0)

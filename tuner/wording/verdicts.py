@@ -8,6 +8,9 @@ from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.verdict import QUANTILE, Reason, ReasonCode, Verdict
 from tuner.wording.phrases import listed, percent, quantity
 
+NEGLIGIBLE = 0.01
+"""Share of the largest part of an error below which another is not worth a word."""
+
 
 def verdict_in_words(verdict: Verdict) -> str:
     """Return a verdict as it stands in a table."""
@@ -55,12 +58,14 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "left-out flights": parts.left_out,
         "left-out terms": parts.terms,
         "step": parts.step,
+        "rest of the search": parts.search,
     }
+    least = NEGLIGIBLE * max(error or 0.0 for error in named.values())
     size = 1.0 if unit is not None else max(abs(value), 1e-300)
     return ", ".join(
         f"{cause} ±{quantity(QUANTILE * error / size, unit)}"
         for cause, error in named.items()
-        if error
+        if error and (cause == "noise alone" or error >= least)
     )
 
 

@@ -16,18 +16,25 @@ COUNT, FLIGHTS, LENGTH = 3, 4, 80
 
 
 def regression(
-    generator: np.random.Generator, *, apart: float, one_tells: bool = False
+    generator: np.random.Generator,
+    *,
+    apart: float,
+    one_tells: bool = False,
+    short_of: float = 0.0,
 ) -> tuple[FisherInformation, np.ndarray]:
     """Return the information of a fit to flights whose own truths lie apart, and the fit.
 
-    The truth is zero. Where ``one_tells``, the first flight alone tells of the first coefficient.
+    The truth is zero. Where ``one_tells``, the first flight alone tells of the first coefficient,
+    and a hundred times more loudly than any. The search stopped ``short_of`` the minimum.
     """
     design = generator.normal(size=(FLIGHTS, LENGTH, COUNT))
     if one_tells:
         design[1:, :, 0] = 0.0
+        design[0, :, 0] *= 100.0
     own = apart * generator.normal(size=(FLIGHTS, COUNT))
     measured = np.einsum("fnp,fp->fn", design, own) + generator.normal(size=(FLIGHTS, LENGTH))
     fit, *_ = np.linalg.lstsq(design.reshape(-1, COUNT), measured.ravel())
+    fit = fit + short_of
     left = design @ fit - measured
     information = FisherInformation(
         channels=("only",),
@@ -40,6 +47,8 @@ def regression(
         crashed=np.zeros(FLIGHTS, bool),
         begins=np.zeros(FLIGHTS),
         scale=np.ones((1, FLIGHTS)),
+        pull=1e-9 * fit,
+        nuisance_pull=np.zeros(COUNT),
     )
     return information, fit
 
@@ -66,10 +75,33 @@ def test_the_error_of_left_out_flights_covers_however_far_they_lie_apart(apart):
     assert 1.0 < np.median(widths) / spread < 0.85 * 3.18 / 1.96
 
 
-def test_what_one_flight_alone_tells_it_is_not_asked_to_contradict():
-    noise, found = errors(regression(np.random.default_rng(1), apart=0.5, one_tells=True)[0])
-    assert found[0] < 2.0 * noise[0]
-    assert found[1] > 3.0 * noise[1]
+@pytest.mark.parametrize("apart", [0.0, 0.5])
+def test_what_one_flight_alone_tells_is_as_doubtful_as_what_all_tell(apart):
+    """It cannot contradict itself; how flights disagree elsewhere is all that is known of it."""
+    noise, found = errors(regression(np.random.default_rng(1), apart=apart, one_tells=True)[0])
+    wider = found / noise
+    assert wider[0] < wider[1:].max()
+    assert bool(wider[0] < 1.5) is (apart == 0.0)
+    assert bool(wider[1] > 3.0) is (apart > 0.0)
+
+
+@pytest.mark.parametrize("one_tells", [False, True])
+def test_flights_do_not_disagree_because_the_search_stopped_short(one_tells):
+    """The last of a step is seen by the flight that tells most, and by it alone."""
+    made = [
+        regression(np.random.default_rng(8), apart=0.0, one_tells=one_tells, short_of=short)[0]
+        for short in (0.0, 0.02)
+    ]
+    (_, exact), (_, short) = (errors(information) for information in made)
+    assert short == pytest.approx(exact, rel=1e-6)
+    lags = np.zeros(COUNT)
+    at_minimum, off = (spread_of(each, exact, lags) for each in made)
+    assert at_minimum.search == pytest.approx(0.0, abs=1e-9)
+    assert off.search == pytest.approx(0.02)
+    assert off.quoted == pytest.approx(np.hypot(at_minimum.quoted, 0.02))
+    where = np.array([True, False, False])
+    assert made[1].resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
+    assert made[1].resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
 
 
 def test_one_flight_is_left_out_in_parts_if_it_is_long():
@@ -126,9 +158,42 @@ def test_what_is_allowed_for_covers_whatever_adds_to_noise(freedom, excess):
     generator = np.random.default_rng(6)
     variance = 1.0 + excess**2
     ratio = variance * generator.chisquare(freedom, 2000) / freedom
-    factor = allowed_for(ratio, np.full(2000, float(freedom)))
-    covered = np.abs(np.sqrt(variance) * generator.normal(size=2000)) < 1.96 * factor
+    factor = np.concatenate(
+        [allowed_for(one[None], np.array([float(freedom)]), np.ones((1, 1))) for one in ratio[:300]]
+    )
+    covered = np.abs(np.sqrt(variance) * generator.normal(size=len(factor))) < 1.96 * factor
     assert covered.mean() > 0.88
     students = stats.t.ppf(0.975, freedom) / 1.96
     assert np.median(factor) / np.sqrt(variance) < 0.9 * students + 0.1
     assert factor.min() >= 1.0
+
+
+@pytest.mark.parametrize(("excess", "width"), [(0.0, 1.1), (1.0, 1.15), (30.0, 1.45)])
+def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
+    """Three degrees of freedom each, twelve coefficients: narrower than alone, and they cover."""
+    generator, own = np.random.default_rng(7), np.eye(12)
+    covered, shared, alone = [], [], []
+    for _ in range(100):
+        sd = np.sqrt(1.0 + (excess * np.exp(0.5 * generator.normal(size=12))) ** 2)
+        ratio, freedom = sd**2 * generator.chisquare(3, 12) / 3.0, np.full(12, 3.0)
+        factor = allowed_for(ratio, freedom, own)
+        covered.append(np.abs(sd * generator.normal(size=12)) < 1.96 * factor)
+        shared.append(factor / sd)
+        alone.append(allowed_for(ratio[:1], freedom[:1], own[:1, :1]) / sd[:1])
+    assert 0.91 < np.mean(covered) < 0.99
+    assert np.median(shared) < width
+    assert np.median(shared) < np.median(alone) + 0.1
+
+
+def test_one_coefficient_that_scatters_is_not_lost_among_others():
+    ratio = np.append(np.ones(11), 400.0)
+    factor = allowed_for(ratio, np.full(12, 3.0), np.eye(12))
+    assert factor[-1] > 15.0
+    assert factor[:-1].max() < 1.4
+
+
+def test_coefficients_that_go_together_are_one_observation():
+    ratio, freedom = np.full(6, 0.5), np.full(6, 3.0)
+    as_one, apart = (allowed_for(ratio, freedom, c)[0] for c in (np.ones((6, 6)), np.eye(6)))
+    assert as_one == pytest.approx(allowed_for(ratio[:1], freedom[:1], np.ones((1, 1)))[0])
+    assert apart < as_one

@@ -46,6 +46,10 @@ def test_the_parts_of_an_interval() -> None:
         "noise alone ±0.039 %, residuals ±0.29 %, left-out flights ±0.15 %, left-out terms ±0.2 %"
     )
     assert parts_in_words(parts, "s", 0.02).startswith("noise alone ±0.0078 ms")
+    tiny = parts.model_copy(update={"search": 1e-7})
+    assert parts_in_words(tiny, None, 0.02) == parts_in_words(parts, None, 0.02)
+    stopped_short = parts.model_copy(update={"search": 1e-5})
+    assert parts_in_words(stopped_short, None, 0.02).endswith("rest of the search ±0.098 %")
 
 
 def test_an_interval_in_its_unit() -> None:

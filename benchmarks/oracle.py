@@ -1,0 +1,56 @@
+"""What someone would quote who knows the truth and the law of what disturbed the flights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.simulated_recordings import recorded
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.information import information_at
+from tuner.uncertainty.inverse import Inverse
+
+Array = NDArray[np.float64]
+
+DRAWS = 12
+"""Of noise and gusts: their spread is then known to a fifth."""
+
+
+def oracle_error(
+    fitted: Fitted, truth: Array, *, gusts: bool, random: np.random.Generator
+) -> dict[str, float]:
+    """Return parameter -> standard error of a fit's estimate, in the scaled coordinate.
+
+    The flights are flown again at the truth, each time in other noise and other gusts, and one
+    linear step in the fit's weights leads from the truth to what would have been estimated. What is
+    held is known.
+
+    Parameters
+    ----------
+    fitted
+        The fit.
+    truth
+        (K,) its search vector.
+    gusts, random
+        As of `recorded`.
+    """
+    names = fitted.objective.space.names
+    held = set(fitted.held.values())
+    free = np.flatnonzero([name not in held for name in names])
+    moved = np.asarray(fitted.point.offsets) != 0.0
+    still = jnp.zeros_like(fitted.criterion.reference_offset)
+    criterion = replace(fitted.criterion, reference_offset=still)
+    steps: list[Array] = []
+    while len(steps) < DRAWS:
+        flown = recorded(fitted.objective, truth, random, gusts=gusts)
+        if flown is None:
+            continue
+        at_truth = flown.start(truth)
+        found = information_at(flown, at_truth, criterion, offsets_fitted=moved).about(free)
+        score = found.score.sum(axis=(0, 1, 2))
+        steps.append(Inverse.of(found.total, found.given).matrix @ score)
+    errors = np.sqrt(np.mean(np.square(steps), axis=0))
+    return {names[index]: float(error) for index, error in zip(free, errors, strict=True)}
