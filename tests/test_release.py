@@ -61,6 +61,16 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "dist"
 
 
+SHIPPED = """
+from tuner.config import configs_folder, find_config, read_job, read_vehicle
+from tuner.flights.topics import load_topic_map
+
+print(read_vehicle(find_config("vehicles", "hovergames", configs_folder())).name)
+print(read_job(configs_folder() / "tune.yaml").mass)
+print(load_topic_map("thesis_lab").name)
+"""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["whl", "tar.gz"])
 def test_it_is_installed_and_works_in_a_clean_environment(
@@ -92,6 +102,11 @@ def test_it_is_installed_and_works_in_a_clean_environment(
     run(*pip, *offline, str(package))
     where = run(str(python), "-c", "import tuner, sim_jax; print(tuner.__file__, sim_jax.__file__)")
     assert where.count(str(site)) == 2
+    for folder in ("tuner", "sim_jax"):
+        for file in (ROOT / folder).rglob("*"):
+            if file.is_file() and file.suffix != ".pyc":
+                assert (site / file.relative_to(ROOT)).exists(), file
+    assert run(str(python), "-c", SHIPPED).split() == ["hovergames", "2.243", "thesis_lab"]
     assert run(tune, "--version").strip() == VERSION
     flown = ("--trajectory", "circle", "--duration", "2", "--out", "c.csv", "--forces", "f.csv")
     assert "written to" in run(tune, "simulate", *flown)

@@ -145,7 +145,8 @@ def test_rate_control_at_rest_and_in_flight() -> None:
 def test_integrator_at_its_limit_at_the_fade_and_when_saturated() -> None:
     limit = vec(0.3, -0.3, 0.3)
     INTEGRATOR.hold(STILL, STILL, limit, kink=True)
-    fading = vec(rate.INTEGRAL_FADE, -rate.INTEGRAL_FADE, rate.INTEGRAL_FADE)
+    edge = rate.INTEGRAL_FADE * (1.0 - 1e-10)  # at the kink, but no rounding chooses the side
+    fading = vec(edge, -edge, edge)
     INTEGRATOR.hold(fading, STILL, STILL, kink=True)
     INTEGRATOR.hold(fading * 1.5, STILL, STILL)
 

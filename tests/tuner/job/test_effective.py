@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.tuner.selection.making import job_with
+from tests.tuner.selection.making import unfitted_with
 from tests.tuner.uncertainty.making import problem, vehicle_file, with_data
 from tuner.config import JobFile, values_of
 from tuner.job.effective import (
@@ -30,8 +30,8 @@ def axes(*values):
 
 @pytest.fixture(scope="module")
 def fit():
-    """A base fit of flights that lack nothing, and its job."""
-    return job_with(0.0, seed=0, job=JobFile())
+    """A base fit of flights that lack nothing, where it begins, and its job."""
+    return unfitted_with(0.0, seed=0, job=JobFile())
 
 
 def test_a_vehicle_of_which_gazebo_lacks_nothing_has_one_answer(fit):
@@ -87,7 +87,7 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays():
     values |= {"linear_drag_x": 0.3, "linear_drag_y": 0.3, "estimate_latency": 0.01}
     start = flown.space.vector_of(values)
     flown = with_data(flown, flown.start(start), noise=np.random.default_rng(0))
-    job, base = job_with(0.0, seed=0, job=JobFile())
+    job, base = unfitted_with(0.0, seed=0, job=JobFile())
     job = replace(job, space=flown.space, objective=flown)
     fitted = replace(base, objective=flown, point=flown.start(start))
     vehicle = vehicle_file().replace(

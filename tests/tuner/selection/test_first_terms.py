@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.tuner.selection.making import BASE, hovering, job_with
+from tests.tuner.selection.making import BASE, hovering, unfitted_with
 from tuner.config import JobFile
 from tuner.job.first_terms import hover_tilt, with_first_terms
 from tuner.job.terms import with_terms_selected
@@ -34,7 +34,7 @@ def with_file(job, file):
 
 @pytest.fixture(scope="module")
 def jobs():
-    return {tilt: job_with(0.0, seed=0, job=None, tilt=tilt) for tilt in (TILT, (0.0, 0.001))}
+    return {tilt: unfitted_with(0.0, seed=0, tilt=tilt) for tilt in (TILT, (0.0, 0.001))}
 
 
 def test_markers_are_free_from_the_start_where_hover_is_not_level(jobs):
