@@ -33,6 +33,9 @@ from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
+AHEAD = "ahead"
+"""How the names of threads begin that compile what a run may need later."""
+
 #: Releases of jaxlib (major.minor) known to accept all flags below: an unknown one is fatal.
 _RELEASES_KNOWN = ("0.10",)
 _LARGER_THAN_ANY_LOOP = 10**15

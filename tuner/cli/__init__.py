@@ -1,5 +1,5 @@
 """Arguments in, exit status out; no logic."""
 
-from tuner.cli.run import main
+from tuner.cli.run import main, program
 
-__all__ = ["main"]
+__all__ = ["main", "program"]

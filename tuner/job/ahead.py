@@ -23,6 +23,7 @@ from tuner.job.selection import Selection
 from tuner.job.terms import candidates_of
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.flight_batches import portions
+from tuner.runtime import AHEAD
 from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
@@ -39,7 +40,7 @@ class ProgramsAhead:
     """
 
     def __init__(self, job: Job) -> None:
-        self._executor = ThreadPoolExecutor(max_workers=1)
+        self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=AHEAD)
         fitted = _not_fitted(job)
         full = full_problem_of(fitted.objective, fitted.point)
         together = len(list(portions(full.objective, full.point, fitted.criterion))) == 1
@@ -57,7 +58,7 @@ class ProgramsAhead:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Begin no further program; one that is being compiled ends on its own."""
+        """Begin no further program; one that is being compiled ends on its own, or the process."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def await_selection(self) -> None:
