@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom, norm
 
+from benchmarks.oracle import oracle_error
 from benchmarks.simulated_recordings import recorded
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
@@ -95,12 +96,15 @@ class Ranked:
         Coefficient -> estimate minus truth, in quoted standard errors.
     error
         Coefficient -> the quoted standard error, of the scaled coordinate.
+    oracle
+        Coefficient -> what someone would quote who knows the truth and the gusts' law.
     seconds
         Of processor time.
     """
 
     off: dict[str, float]
     error: dict[str, float]
+    oracle: dict[str, float]
     seconds: float
 
 
@@ -133,9 +137,13 @@ def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
         "scatter from set to set; of each, beside it the range in which the share of so many sets "
         "would lie 19 times of 20, were the intervals what they say. Estimate minus truth is in "
         "quoted standard errors: its root mean square is 1 where these are exact, less where they "
-        f"are too large. {np.mean(seconds):.0f} s of processor time a set."
+        "are too large. An oracle knows the truth and the law of the gusts, flies the set again "
+        "and again, and quotes how far linear fits to those flights scatter; beside it the median "
+        "of how many times as large the quoted error is. "
+        f"{np.mean(seconds):.0f} s of processor time a set."
     )
-    head = ["flights", "coefficient", "sets", *(f"{level} %" for level in LEVELS), "mean", "RMS"]
+    head = ["flights", "coefficient", "sets", *(f"{level} %" for level in LEVELS)]
+    head += ["mean", "RMS", "of an oracle's"]
     return Section("Calibration of the intervals", text, head, rows)
 
 
@@ -158,7 +166,13 @@ def ranked_set(kind: Kind, seed: int) -> Ranked:
     true, best = (np.asarray(space.scaled(jnp.asarray(v))) for v in (truth, _vector(found)))
     off = dict(zip(space.names, ((best - true) / error).tolist(), strict=True))
     errors = dict(zip(space.names, error.tolist(), strict=True))
-    return Ranked(off, errors, time.process_time() - clock)
+    oracle = oracle_error(
+        found,
+        truth,
+        gusts=kind.gusts,
+        random=np.random.default_rng([seed, KINDS.index(kind), 1]),
+    )
+    return Ranked(off, errors, oracle, time.process_time() - clock)
 
 
 @lru_cache(maxsize=1)
@@ -283,9 +297,8 @@ def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
         f"{_percent(_share_of_all(sets, level))} ± {figure(200 * scatter(sets, level))} %"
         for level in LEVELS
     ]
-    rows = [
-        [name, "all", str(len(sets)), *together, *_moments(o for r in sets for o in r.off.values())]
-    ]
+    moments = _moments(off for ranked in sets for off in ranked.off.values())
+    rows = [[name, "all", str(len(sets)), *together, *moments, _wider(sets, list(sets[0].off))]]
     for coefficient in sets[0].off:
         off = [ranked.off[coefficient] for ranked in sets]
         shares = []
@@ -294,8 +307,15 @@ def _rows(name: str, sets: Sequence[Ranked]) -> list[list[str]]:
             shares.append(
                 f"{_percent(share_within(off, level))} ({100 * low:.0f}–{100 * high:.0f})"
             )
-        rows.append([name, coefficient, str(len(sets)), *shares, *_moments(off)])
+        wider = _wider(sets, [coefficient])
+        rows.append([name, coefficient, str(len(sets)), *shares, *_moments(off), wider])
     return rows
+
+
+def _wider(sets: Sequence[Ranked], names: Sequence[str]) -> str:
+    """Return how many times as large as an oracle's the quoted errors are, in the median."""
+    times = [r.error[name] / r.oracle[name] for r in sets for name in names if name in r.oracle]
+    return f"{figure(float(np.median(times)))} ×" if times else ""
 
 
 def _moments(off: Iterable[float]) -> list[str]:

@@ -15,8 +15,8 @@ from tuner.uncertainty.inverse import Inverse
 
 Array = NDArray[np.float64]
 
-DRAWS = 12
-"""Of noise and gusts: their spread is then known to a fifth."""
+DRAWS = 8
+"""Of noise and gusts: their spread is then known to a quarter."""
 
 
 def oracle_error(

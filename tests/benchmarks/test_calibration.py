@@ -14,7 +14,9 @@ NOISE, GUSTS, *_ = cal.KINDS
 
 
 def ranked(*off):
-    return cal.Ranked({f"c{i}": o for i, o in enumerate(off)}, {}, 1.0)
+    names = [f"c{i}" for i in range(len(off))]
+    quoted, oracle = dict.fromkeys(names, 3.0), dict.fromkeys(names, 2.0)
+    return cal.Ranked(dict(zip(names, off, strict=True)), quoted, oracle, 1.0)
 
 
 def test_of_truths_that_are_where_the_interval_says_the_level_lies_inside():
@@ -38,6 +40,7 @@ def test_the_table_says_what_was_found_of_all_and_of_each():
     assert [row[5].split(" (")[0] for row in rows[1:]] == ["100 %", "50 %"]
     assert [row[6] for row in rows] == ["+1.00", "+0.00", "+2.00"]
     assert rows[2][7] == f"{np.sqrt(5):.3g}"
+    assert [row[8] for row in rows] == ["1.5 ×"] * 3
 
 
 def test_what_wanders_has_its_size_and_forgets_in_its_time():
