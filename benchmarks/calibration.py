@@ -184,17 +184,19 @@ def reference_job() -> Job:
 
 
 @lru_cache(maxsize=2)
-def problem(*, terms: bool) -> Objective:
+def problem(*, terms: bool, more: tuple[str, ...] = ()) -> Objective:
     """Return the reference flights' problem with the prior of the truths.
 
-    A spin is held level: nothing else holds a vehicle in gusts.
+    With terms, these are `TERMS` and ``more``. A spin is held level: nothing else holds a vehicle
+    in gusts.
     """
     job = reference_job()
     objective = job.objective
     if terms:
-        objective = replace(objective, model=with_terms_computed(objective.model, TERMS))
+        names = [*TERMS, *more]
+        objective = replace(objective, model=with_terms_computed(objective.model, names))
         start = objective.start(objective.space.initial)
-        objective, _ = with_terms(objective, start, list(TERMS), job.settings.job)
+        objective, _ = with_terms(objective, start, names, job.settings.job)
     parameters = [replace(p, prior_sd=NARROWED * p.prior_sd) for p in objective.space.parameters]
     inlet = objective.segments.inlet
     held = replace(inlet, level_held=inlet.spins)

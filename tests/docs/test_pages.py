@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.__main__ import NO_SPEED, PARTS
+from benchmarks.__main__ import BY_NAME, PARTS
 from docs.generate.messages import known_messages, sites
 from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
@@ -98,7 +98,7 @@ def test_programs_that_are_named_exist():
     for module, example, test, arguments in named:
         if module:
             assert find_spec(module), module
-            assert module != "benchmarks" or set(arguments.split()) <= {*PARTS, *NO_SPEED}, (
+            assert module != "benchmarks" or set(arguments.split()) <= {*PARTS, *BY_NAME}, (
                 arguments
             )
         else:

@@ -1,6 +1,9 @@
 """Reverse mode against the gradient that forward mode gives, and what it remembers."""
 
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,13 +38,19 @@ def test_reverse_mode_gives_forward_modes_gradient(fit):
         )
 
 
-def test_a_smaller_memory_gives_the_same_sums(fit):
-    criterion = criterion_of(fit)
-    point = fit.start(np.asarray(fit.space.initial))
-    small = type(fit)(**{**vars(fit), "memory": 1})
-    data = small.data(point.offsets, criterion)
-    assert small.simulator.segments_at_once(data, len(fit.space)) == 1
-    assert fit.simulator.segments_at_once(data, len(fit.space)) > 1
-    want, got = fit.sums(point, criterion), small.sums(point, criterion)
+def test_segments_give_the_same_sums_one_at_a_time_as_many_at_once(fit):
+    """Few fly one at a time, and so do those that the memory does not hold at once."""
+    which = np.arange(8 * len(jax.devices())) % fit.segments.count
+    segments = jax.tree.map(lambda leaf: np.asarray(leaf)[..., which], fit.segments)
+    many = replace(fit, segments=replace(segments, flight=np.arange(len(which))))
+    small = replace(many, memory=1)
+    point = many.start(np.asarray(many.space.initial))
+    data = many.data(point.offsets, criterion_of(many))
+    few = fit.data(fit.start(fit.space.initial).offsets, criterion_of(fit))
+    assert many.simulator.segments_at_once(data, len(FREE)) > 1
+    assert small.simulator.segments_at_once(data, len(FREE)) == 1
+    assert fit.simulator.segments_at_once(few, len(FREE)) == 1
+    want = many.sums(point, criterion_of(many))
+    got = small.sums(point, criterion_of(small))
     np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
     np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)
