@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 
+from benchmarks.contestants import fit
 from benchmarks.contestants.derivatives import FLIGHTS, FORWARD, GRADIENT, JACOBIAN, SAMPLES
 from benchmarks.table import Bar, Section, figure, seconds
 from benchmarks.timing import Contestant, Spread, compete
@@ -25,6 +26,16 @@ def measure() -> Section:
             ROUNDS,
         )
     }
+    loss, jacobian = (
+        _time(contestant.rate)
+        for contestant in compete(
+            [
+                Contestant(what, (sys.executable, "-m", "benchmarks.contestants.fit", what), {})
+                for what in (fit.LOSS, fit.JACOBIAN)
+            ],
+            ROUNDS,
+        )
+    )
     times = {name: _time(contestant.rate) for name, contestant in measured.items()}
     memory = {
         name: [float(word) for word in contestant.remark.split()]
@@ -40,6 +51,15 @@ def measure() -> Section:
             figure(memory[name][1] / 1e6),
         ]
         for name in measured
+    ] + [
+        ["reference flights: loss", seconds(loss), "1", "", ""],
+        [
+            "reference flights: jacobian",
+            seconds(jacobian),
+            figure(jacobian.median / loss.median),
+            "",
+            "",
+        ],
     ]
     temporary, output = memory[JACOBIAN]
     return Section(
@@ -47,14 +67,22 @@ def measure() -> Section:
         f"{FLIGHTS} flights of {SAMPLES / 100:g} s at 1 kHz, 13 states logged at 100 Hz, float64, "
         "all devices. The Jacobian is by 12 coefficients that all flights share, forward mode; the "
         "gradient by 12 coefficients of each flight, reverse mode. Memory as XLA states it, a "
-        "device.",
+        "device. Below, the four reference flights as a search has them, latencies, filters and "
+        "clocks included: their loss, and with it gradient and Hessian by 12 coefficients.",
         ["", "s", "forward runs", "temporary MB", "output MB"],
         rows,
         [
             Bar(
                 "Jacobian of 12 coefficients over 64 flights",
                 times[JACOBIAN].median / base,
-                14,
+                9,
+                "at most",
+                " forward runs",
+            ),
+            Bar(
+                "Jacobian of the four reference flights",
+                jacobian.median / loss.median,
+                9,
                 "at most",
                 " forward runs",
             ),

@@ -98,9 +98,7 @@ def test_programs_that_are_named_exist():
     for module, example, test, arguments in named:
         if module:
             assert find_spec(module), module
-            assert module != "benchmarks" or set(arguments.split()) <= {*PARTS, *BY_NAME}, (
-                arguments
-            )
+            assert module != "benchmarks" or set(arguments.split()) <= {*PARTS, *BY_NAME}, arguments
         else:
             assert (ROOT / (example or test)).exists(), example or test
 
