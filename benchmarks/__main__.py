@@ -14,12 +14,12 @@ import argparse
 import datetime
 import importlib
 import time
-from importlib.metadata import version
+import tomllib
 from pathlib import Path
 
 from benchmarks.history import remembered
 from benchmarks.table import Section, sections_of, table, updated, with_bars
-from benchmarks.timing import machine
+from benchmarks.timing import ROOT, machine
 from tuner import runtime
 
 PARTS = (
@@ -53,6 +53,12 @@ def page(sections: list[Section], where: str, minutes: float, before: str = "") 
     return "\n\n".join([*parts, *measured.values(), *kept.values()])
 
 
+def version() -> str:
+    """Return the version of what is measured: of this source, whatever is installed."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    return str(tomllib.loads(text)["project"]["version"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS, *BY_NAME])
@@ -76,7 +82,7 @@ def main() -> None:
             before,
             [bar for section in sections for bar in section.bars],
             when=datetime.datetime.now(datetime.UTC),
-            version=version("multirotor-tune"),
+            version=version(),
             whole=not arguments.parts,
         )
         if arguments.update:
