@@ -78,8 +78,9 @@ def test_a_cancelled_task_ends_at_its_next_report(two_workers, tmp_path):
 
 
 def test_one_error_ends_the_other_tasks(two_workers, tmp_path):
-    ended = tmp_path / "ended"
-    running = two_workers.submit(tasks.until_stopped, str(ended))
+    ended, heard = tmp_path / "ended", []
+    running = two_workers.submit(tasks.until_stopped, str(ended), heard.append)
+    wait_for(lambda: heard)  # one that has not begun has nothing to leave behind
     with pytest.raises(RecordingError):
         two_workers.map(tasks.refused, ["a.bag", "b.bag"])
     assert not running.done(), "only those of the same call"
