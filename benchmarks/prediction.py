@@ -9,43 +9,30 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from benchmarks.regression import Regression
+import numpy as np
+
+from benchmarks import builds, without_pose
+from benchmarks.contest import STEPS, STRIDE, Contest, simple
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import ControllerFile, Options, read_vehicle, settle
 from tuner.errors import InputError
-from tuner.flights.flight import Flight
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
-from tuner.prediction.predict import UNITS, Predictions, hold, predict, summary
-from tuner.recordings import Recording, read_usable
+from tuner.prediction.predict import UNITS, Predictions, predict, summary
+from tuner.recordings import read_usable
 from tuner.result import BEST_FIT_FILE, RunResult
 
 FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
-STEPS = (10, 50)
-"""Samples of 10 ms after which predictions are compared."""
-STRIDE = 0.02
-"""s from one prediction to the next."""
 JOBS: Mapping[str, str] = {"nanobench": "crazyflie"}
 """Set -> shipped job file, where it holds no ``tune.yaml`` of its own."""
 HELD_OUT: Mapping[str, tuple[str, ...]] = {
     "nanobench": ("B2_circle_slow_rep1", "B3_figure8_medium_rep1")
 }
 """Set -> flights that are held out; of another set the last two of four or more."""
-
-
-@dataclass(frozen=True)
-class Contest:
-    """A set of recordings, and each predictor's predictions of its held-out flights."""
-
-    held_out: tuple[str, ...]
-    fitted: int
-    seconds: float
-    predictions: Mapping[str, Sequence[Predictions]]
 
 
 def measure() -> Section:
@@ -55,14 +42,14 @@ def measure() -> Section:
     notes = []
     for folder in sorted(path for path in FLIGHTS.glob("*") if path.is_dir()):
         try:
-            contest = contest_of(folder)
+            contest = CONTESTS.get(folder.name, contest_of)(folder)
         except InputError as error:
             notes.append(f"{folder.name} takes no part: {error.what}.")
             continue
         held_out = " and ".join(contest.held_out)
         notes.append(
-            f"{folder.name}: {contest.fitted} flights fitted in {contest.seconds:.0f} s, compiling "
-            f"included; {held_out} held out."
+            f"{folder.name}: {contest.fitted} fitted in {contest.seconds:.0f} s, compiling "
+            f"included; {held_out} held out. {contest.remark}".rstrip()
         )
         rows += list(_rows(folder.name, contest))
     text = (
@@ -80,7 +67,11 @@ def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
     for predictor, predictions in contest.predictions.items():
         for steps in STEPS:
             means = summary(predictions, steps / 100.0)
-            yield [name, predictor, str(steps), *(figure(means[key]) for key in UNITS)]
+            yield [name, predictor, str(steps), *(_cell(means[key]) for key in UNITS)]
+
+
+def _cell(mean: float) -> str:
+    return figure(mean) if np.isfinite(mean) else "–"
 
 
 def contest_of(folder: Path) -> Contest:
@@ -105,6 +96,7 @@ def contest_of(folder: Path) -> Contest:
     settings = settle(options)
     vehicles = {"unfitted": settings.vehicle, "fitted": best}
     late = {flight.name: flight.input_late for flight in result.flights}
+    signal = INLETS[held_out[0].inlet].needs[0]
     predictions: dict[str, list[Predictions]] = {
         vehicle: [
             predict(
@@ -121,26 +113,18 @@ def contest_of(folder: Path) -> Contest:
     }
     return Contest(
         tuple(recording.flight.name for recording in held_out),
-        len(fitted),
+        f"{len(fitted)} flights",
         seconds,
-        {**_simple(fitted, held_out, predictions["fitted"]), **predictions},
+        {**simple(fitted, [r.flight for r in held_out], signal, predictions["fitted"])}
+        | predictions,
     )
 
 
-def _simple(
-    fitted: Sequence[Flight], held_out: Sequence[Recording], like: Sequence[Predictions]
-) -> dict[str, list[Predictions]]:
-    """Return what predictors without physics make of the same starts."""
-    signal = INLETS[held_out[0].inlet].needs[0]
-    regression = Regression.of(fitted, signal)
-    pairs = list(zip(held_out, like, strict=True))
-    return {
-        "hold": [hold(recording.flight, same.begins, same.ahead) for recording, same in pairs],
-        "linear regression": [
-            regression.predict(recording.flight, same.begins, same.ahead)
-            for recording, same in pairs
-        ],
-    }
+CONTESTS: Mapping[str, Callable[[Path], Contest]] = {
+    "arplab": without_pose.contest_of,
+    "crazyswarm": builds.contest_of,
+}
+"""Sets that have no pose, or a build for every flight."""
 
 
 def controller_of(result: RunResult) -> ControllerFile:

@@ -297,7 +297,10 @@ class _Group:
         return segments
 
     def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
-        """Return the likeliest starts (L, F), in the segments' standard deviations."""
+        """Return the likeliest starts (L, F), in the segments' standard deviations.
+
+        By Gauss and Newton's steps from the recorded starts, halved where they overshoot.
+        """
         assert segments.freedom is not None
         names, flights = tuple(self._conditions), len(self._recordings)
         objective = Objective(
@@ -315,19 +318,26 @@ class _Group:
         ]
         none = np.zeros((len(OFFSETS), flights))
         point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
-        states = np.zeros(segments.freedom.shape)
-        for _ in range(ROUNDS):
+        trial = best = np.zeros(segments.freedom.shape)
+        least = np.full(trial.shape[1], np.inf)
+        for _ in range(ROUNDS + 1):  # the last one judges the step before it
             criterion = Criterion(
                 horizon=jnp.asarray(self._samples),
                 scale={name: jnp.full(flights, LOOSE) for name in segments.measured},
                 reference_offset=jnp.zeros((len(CLOCKS), flights)),
                 huber=jnp.asarray(jnp.inf),
                 prior=jnp.asarray(1.0),
-                states=jnp.asarray(states),
+                states=jnp.asarray(trial),
             )
-            asked = np.asarray(objective.sums(point, criterion, derivatives=False).states)
-            states = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
-        return states
+            sums = objective.sums(point, criterion, derivatives=False)
+            squares = np.sum([np.asarray(each) for each in sums.squares.values()], axis=0)
+            misfit = np.nan_to_num(squares / LOOSE**2 + (trial**2).sum(axis=0), nan=np.inf)
+            better = misfit <= least
+            best, least = np.where(better, trial, best), np.where(better, misfit, least)
+            asked = np.asarray(sums.states)
+            asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
+            trial = np.where(better, asked, 0.5 * (best + trial))
+        return best
 
 
 @eqx.filter_jit

@@ -165,7 +165,8 @@ def with_inputs_balanced(
 ) -> tuple[Fitted, Examination, tuple[Finding, ...]]:
     """Return the fit whose inertia balances motion and rotor speeds, or as it is; what to say.
 
-    With it the examination of what is returned; ``in_doubt`` is as for `examine`.
+    With it the examination of what is returned, whose intervals reach as far as the balance where
+    that is not taken; ``in_doubt`` is as for `examine`.
 
     Only where rotor speeds are fed in: how commands turn into them would have to be known first.
     """
@@ -178,20 +179,26 @@ def with_inputs_balanced(
     on_message("Balancing the recorded motion and the rotor speeds.")
     balance = balance_of(objective, fitted.point, job.fitted)
     settling = _Settling(fitted, balance, objective.tunable)
-    balanced = settling.at(np.ones(segments.count, bool), fitted.point.coefficients)
+    begin = np.asarray(fitted.point.coefficients)
+    balanced = settling.at(np.ones(segments.count, bool), begin)
     vector = settling.refitted(np.ones(segments.count, bool), balanced)
     as_fitted, as_balanced = _losses_left_out(settling, balanced)
     point = Point(jnp.asarray(vector), fitted.point.offsets)
     taken = as_balanced <= (1.0 + TOLERATED) * as_fitted
     findings = _findings(fitted, point, as_balanced / as_fitted, taken=taken)
+    otherwise = alternatives_of(objective)
     if not taken:
-        return fitted, examination, findings
+        space = objective.space
+        here, there = (np.asarray(space.scaled(jnp.asarray(v))) for v in (begin, balanced))
+        moves = dict(zip(space.names, np.abs(there - here).tolist(), strict=True))
+        doubt = {n: max(moves[n], in_doubt.get(n, 0.0)) for n in moves if n in TURNS}
+        kept = examine(fitted, otherwise=otherwise, in_doubt={**in_doubt, **doubt})
+        return fitted, kept, findings
     scores = objective.sums(point, fitted.criterion, derivatives=False)
     loss, _, _ = normal_equations(
         objective.space, np.asarray(segments.flight), point, fitted.criterion, scores
     )
     fitted = replace(fitted, point=point, loss_best=float(loss))
-    otherwise = alternatives_of(fitted.objective)
     examination = examine(fitted, otherwise=otherwise, in_doubt=in_doubt, at_minimum=False)
     return fitted, examination, findings
 

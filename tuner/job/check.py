@@ -164,12 +164,13 @@ def _lift_of(recorded: Array, vehicle: VehicleFile, source: Source) -> float:
 
 
 def _motor_orders(job: Job) -> Iterator[Finding]:
-    """Warn of commands that turn the vehicle as those of other rotors would."""
-    for flight in job.fitted:
-        if not {"command", "body_rate"} <= set(flight.series):
+    """Warn of commands or rotor speeds that turn the vehicle as those of other rotors would."""
+    for flight, inlet in zip(job.fitted, job.inlets, strict=True):
+        source: Source = "rotor_speed" if inlet == "rotor_speed" else "command"
+        if not {source, "body_rate"} <= set(flight.series):
             continue
         span = (0.0, flight.duration)
-        yield from order_findings(flight.name, flight.series, job.settings.vehicle, span)
+        yield from order_findings(flight.name, flight.series, job.settings.vehicle, span, source)
 
 
 def _controllers(job: Job) -> Iterator[Finding]:

@@ -45,7 +45,7 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
         series={**flight.series, "command": series},
         signals={**flight.signals, "command": on_clock},
         initial=replace(flight.initial, command=nearest),
-        notes=(*flight.notes, Note(NoteCode.COMMAND_DERIVED, count=len(command))),
+        notes=(*flight.notes, Note(NoteCode.COMMAND_DERIVED)),
     )
 
 

@@ -105,10 +105,14 @@ def motor_order(
 
 
 def order_findings(
-    name: str, series: Mapping[str, Series], vehicle: VehicleFile, span: tuple[float, float]
+    name: str,
+    series: Mapping[str, Series],
+    vehicle: VehicleFile,
+    span: tuple[float, float],
+    source: Source = "command",
 ) -> tuple[Finding, ...]:
-    """Return what is wrong with the order of a flight's commands, and with the spins."""
-    order = motor_order(series, vehicle, "command", span)
+    """Return what is wrong with the order of a flight's commands or speeds, and with the spins."""
+    order = motor_order(series, vehicle, source, span)
     if order is None or order.is_right:
         return ()
     if order.fields != tuple(sorted(order.fields)):

@@ -21,7 +21,8 @@ class ErrorParts(Part):
         As the estimate moves when flights are left out in turn (parts of them where they are few);
         None where there are no three.
     terms
-        As it would move with terms that were tried and not kept; None where none was tried.
+        As it would move with terms that were tried and not kept, and where errors of measured
+        rotor speeds pass for inertia; None where neither was tried.
     step
         Its move when the physics step is halved, and for a rotor's lag half of the finest step in
         which simulators take it; None where that was not asked.

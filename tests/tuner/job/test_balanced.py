@@ -81,9 +81,11 @@ def test_noise_passes_for_inertia_and_the_balance_takes_it_out(job, fitted, upda
 def test_a_balance_that_predicts_badly_is_said_and_not_taken(job, fitted, monkeypatch):
     monkeypatch.setattr(balanced, "TOLERATED", -0.9)
     examination = examine(fitted)
-    kept, same, (finding,) = with_inputs_balanced(job, fitted, examination, lambda _: None)
+    kept, wider, (finding,) = with_inputs_balanced(job, fitted, examination, lambda _: None)
     assert kept is fitted
-    assert same is examination
+    before, after = (e.uncertainty.estimates["inertia_xx"] for e in (examination, wider))
+    assert after.std_error > before.std_error
+    assert after.ci95[0] < finding.numbers["inertia_xx_balanced"] < after.value
     assert finding.code is Code.INERTIA_NOT_BALANCED
     assert finding.level == "warning"
 

@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from benchmarks.builds import cut, weighed_mass
 from benchmarks.prediction import HELD_OUT, options_of
 from benchmarks.regression import Regression
+from benchmarks.without_pose import posed
 from tuner.errors import InputError
+from tuner.flights.inertial import InertialFlight
 from tuner.prediction.predict import hold
 
 
@@ -38,3 +42,40 @@ def test_a_set_brings_its_own_job_or_two_flights_are_held_out(tmp_path):
     (known / "tune.yaml").unlink()
     assert options_of(known).config.endswith("configs/jobs/crazyflie.yaml")
     assert options_of(known).holdout == list(HELD_OUT["nanobench"])
+
+
+def test_the_second_half_of_a_flight_is_that_half(full_flight):
+    half = cut(full_flight, 0.5, 1.0)
+    assert half.duration == pytest.approx(full_flight.duration / 2, abs=0.02)
+    shift = full_flight.time[-1] - half.time[-1]
+    there = np.searchsorted(full_flight.time, shift + half.time[10] - 1e-9)
+    np.testing.assert_array_equal(
+        half.signals["position"][10], full_flight.signals["position"][there]
+    )
+    begin = full_flight.signals["position"][there - 10]
+    np.testing.assert_allclose(half.initial.position, begin, atol=0.01)
+    last = full_flight.series["rotor_speed"].time[-1] - shift
+    assert half.series["rotor_speed"].time[-1] == pytest.approx(last)
+
+
+def test_the_mass_beside_a_flight_is_read(tmp_path):
+    path = tmp_path / "info1.yaml"
+    path.write_text("motors: upgraded\nmass: 0.0375\n")
+    assert weighed_mass(path) == 0.0375
+    path.write_text("motors: upgraded\n")
+    with pytest.raises(InputError, match="no mass"):
+        weighed_mass(path)
+
+
+def test_the_attitude_of_a_flight_without_a_pose_is_that_of_its_gyro(full_flight):
+    series = {name: full_flight.series[name] for name in ("body_rate", "command")}
+    begin, end = 1.0, full_flight.duration - 1.0
+    flight = posed(InertialFlight("a", "a", series, ((begin, end),), ()))
+    assert flight.duration == pytest.approx(end - begin, abs=0.02)
+    recorded = full_flight.signals["attitude"]
+    turned = Rotation.from_quat(
+        recorded[np.searchsorted(full_flight.time, [begin, begin + 2.0])], scalar_first=True
+    )
+    there = Rotation.from_quat(flight.signals["attitude"][200], scalar_first=True)
+    error = (turned[0].inv() * turned[1]).inv() * there
+    assert error.magnitude() < 0.02

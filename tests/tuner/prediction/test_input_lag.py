@@ -7,8 +7,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from tuner.findings import Code
 from tuner.flights.flight import Flight, Series
 from tuner.flights.initial import initial_state
+from tuner.objective.motor_order import order_findings
 from tuner.prediction.input_lag import input_lag, with_inputs_on_time
 from tuner.recordings import Recording
 
@@ -110,3 +112,12 @@ def test_what_commands_are_late_by_together_is_the_vehicles_own_lag(broadband, u
     first, second = with_inputs_on_time([moved(0.0, "a"), moved(0.012, "b")], updated)
     assert first.input_late == pytest.approx(-second.input_late)
     assert second.input_late - first.input_late == pytest.approx(0.012, abs=0.002)
+
+
+def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broadband, updated):
+    speed, span = broadband.series["rotor_speed"], (0.0, broadband.duration)
+    assert order_findings("a", broadband.series, updated, span, "rotor_speed") == ()
+    swapped = Series(speed.time, speed.values[:, [0, 2, 1, 3]])
+    series = dict(broadband.series) | {"rotor_speed": swapped}
+    (finding,) = order_findings("a", series, updated, span, "rotor_speed")
+    assert (finding.code, finding.names) == (Code.MOTOR_ORDER, ("1", "3", "2", "4"))

@@ -84,3 +84,12 @@ def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(ful
     met = comparison.fly_from_fitted_starts(wrong)[full_flight.name].rmse
     assert predicted.roll > 3 * met.roll  # a trim in each window hides what is wrong
     assert comparison.fly(updated)[full_flight.name].rmse.roll < 0.1 * predicted.roll
+
+
+def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, updated):
+    # rotors that lift half as much: steps towards the likeliest start overshoot
+    wrong = with_values(updated, {"angular_drag_x": -0.2, "torque_trim_x": 0.3})
+    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    predicted = comparison.fly(wrong)[full_flight.name]
+    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name]
+    assert met.length("attitude") < predicted.length("attitude")

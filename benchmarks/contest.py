@@ -1,0 +1,64 @@
+"""Predictors without physics, and what all predictors of a set are held against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from benchmarks.regression import Regression
+from tuner.flights.flight import Flight
+from tuner.prediction.predict import Predictions, hold
+
+STEPS = (10, 50)
+"""Samples of 10 ms after which predictions are compared."""
+STRIDE = 0.02
+"""s from one prediction to the next."""
+
+
+@dataclass(frozen=True)
+class Contest:
+    """A set of recordings, and each predictor's predictions of its held-out flights.
+
+    Attributes
+    ----------
+    held_out
+        Names of what was predicted.
+    fitted
+        What was fitted, in words.
+    seconds
+        Of the fit.
+    predictions
+        Predictor -> its predictions, one a held-out flight.
+    remark
+        A sentence that a reader needs.
+    """
+
+    held_out: tuple[str, ...]
+    fitted: str
+    seconds: float
+    predictions: Mapping[str, Sequence[Predictions]]
+    remark: str = ""
+
+
+def simple(
+    fitted: Sequence[Flight], held_out: Sequence[Flight], signal: str, like: Sequence[Predictions]
+) -> dict[str, list[Predictions]]:
+    """Return what predictors without physics make of the same starts.
+
+    Parameters
+    ----------
+    fitted, held_out
+        Flights.
+    signal
+        What is fed in.
+    like
+        Predictions whose starts are taken, one a held-out flight.
+    """
+    regression = Regression.of(fitted, signal)
+    pairs = list(zip(held_out, like, strict=True))
+    return {
+        "hold": [hold(flight, same.begins, same.ahead) for flight, same in pairs],
+        "linear regression": [
+            regression.predict(flight, same.begins, same.ahead) for flight, same in pairs
+        ],
+    }
