@@ -107,8 +107,9 @@ def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(
     ends = [np.asarray(space.scaled(v)) for v in (result.fitted.point.coefficients, space.initial)]
     wrong = np.abs(ends[0] - ends[1])
     doubt = np.array([result.in_doubt[name] for name in space.names])
-    known = uncertainty_of(result.fitted).covariance.error
-    assert np.any(wrong > 1.96 * known)
+    covariance = uncertainty_of(result.fitted).covariance
+    known = covariance.error
+    assert np.any(wrong > 1.96 * known / covariance.beyond_noise)  # what noise would say
     assert np.all(wrong < 1.96 * np.maximum(doubt, known)), (wrong, doubt, known)
 
 
