@@ -64,8 +64,8 @@ def measure() -> Section:
             ["tune inspect", seconds(inspects), ""],
         ],
         [
-            Bar("tune on four flights, warm", warm.median, 30, "at most", " s"),
-            Bar("tune on four flights, cold", cold, 75, "at most", " s"),
+            Bar("tune on four flights, warm", warm.median, 12, "at most", " s"),
+            Bar("tune on four flights, cold", cold, 35, "at most", " s"),
             Bar("peak memory", memory / gib, 2, "at most", " GiB"),
             Bar("peak memory, ten times as many flights", many_memory / gib, 4, "at most", " GiB"),
             Bar("tune --help", answers.median, 0.3, "at most", " s"),

@@ -46,9 +46,9 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-MOST_MEMORY = 1500 * 2**20
+MOST_MEMORY = 900 * 2**20
 """bytes of a test process at the end of a module beyond which its compiled programs are dropped."""
-MOST_IN_A_MODULE = 2000 * 2**20
+MOST_IN_A_MODULE = 1300 * 2**20
 """The same at the end of a test that others of its module follow."""
 GROWTH = 150 * 2**20
 """bytes by which a process grows beyond what it could not give back before it tries again."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
@@ -22,31 +23,33 @@ from tuner.job.prepare import Job
 from tuner.job.selection import Selection
 from tuner.job.terms import candidates_of
 from tuner.objective.alternatives import alternatives_of
+from tuner.objective.criterion import Criterion
 from tuner.objective.flight_batches import portions
 from tuner.runtime import AHEAD
 from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import Stage
-from tuner.uncertainty.full_problem import full_problem_of
+from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 
 logger = logging.getLogger(__name__)
+
+MOST = 2**28
+"""bytes of a Jacobian beyond which nothing is made ready: the search needs its memory, too."""
 
 
 class ProgramsAhead:
     """Makes the programs of a job's selection and examination ready, one after the other.
 
-    Nothing is made ready where flights take turns: what is computed beside the search would need as
-    much memory again. What fails here fails, and is said, where it is needed.
+    Nothing is made ready for many flights. What fails here fails, and is said, where it is needed.
     """
 
     def __init__(self, job: Job) -> None:
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=AHEAD)
         fitted = _not_fitted(job)
-        full = full_problem_of(fitted.objective, fitted.point)
-        together = len(list(portions(full.objective, full.point, fitted.criterion))) == 1
-        selects = together and bool(candidates_of(job))
+        few = _fits(full_problem_of(fitted.objective, fitted.point), fitted.criterion)
+        selects = few and bool(candidates_of(job))
         self._selection = self._begun(lambda: _select(job, fitted)) if selects else None
-        self._examination = self._begun(lambda: _examine(fitted)) if together else None
+        self._examination = self._begun(lambda: _examine(fitted)) if few else None
 
     def __enter__(self) -> Self:
         """Return itself; at the end of the block no further program is begun."""
@@ -83,6 +86,12 @@ def _await(program: Future[None] | None) -> None:
     """Wait for a program that is being made ready; one that has not been begun is let go."""
     if program is not None and not program.cancel():
         program.result()
+
+
+def _fits(problem: FullProblem, criterion: Criterion) -> bool:
+    """Return whether all flights are differentiated at once in `MOST` bytes."""
+    small = replace(problem.objective, memory=MOST)
+    return len(list(portions(small, problem.point, criterion))) == 1
 
 
 def _not_fitted(job: Job) -> Fitted:

@@ -71,11 +71,11 @@ def test_what_fails_ahead_is_left_to_whoever_needs_it(monkeypatch: pytest.Monkey
         programs.await_examination()
 
 
-def test_flights_that_take_turns_leave_their_memory_to_the_search(
+def test_many_flights_leave_their_memory_to_the_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     few_groups(monkeypatch)
-    monkeypatch.setattr(ahead, "portions", lambda *_: iter([[0], [1]]))
+    monkeypatch.setattr(ahead, "MOST", 10**6)
     monkeypatch.setattr(ahead, "_examine", lambda *_: pytest.fail("it was examined"))
     job, _ = unfitted_with(0.0, seed=0)
     with ProgramsAhead(job) as programs:
