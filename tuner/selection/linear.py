@@ -147,7 +147,8 @@ def linear_at(
 ) -> Linear:
     """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
 
-    Flights whose Jacobian would not fit the objective's memory take turns.
+    Flights whose Jacobian would not fit half of the objective's memory take turns: its columns are
+    put in another order, which copies them.
 
     Parameters
     ----------
@@ -159,7 +160,7 @@ def linear_at(
         Conditions to have columns for, behind those of the coefficients: N for each of them.
     """
     parts, loss = [], 0.0
-    for flights in portions(objective, point, criterion):
+    for flights in portions(replace(objective, memory=objective.memory // 2), point, criterion):
         batch = portion(objective, point, criterion, flights)
         jacobian = batch[0].jacobian(*batch[1:], columns=COLUMNS)
         fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
