@@ -60,4 +60,5 @@ def _axes(flight: FlightResult) -> str:
     assert flight.rmse_fitted_starts is not None
     values = {axis: getattr(flight.rmse_fitted_starts, axis) for axis in RMSE_UNITS}
     known = {axis: value for axis, value in values.items() if value is not None}
-    return ", ".join(f"{axis} {value:.3g} {RMSE_UNITS[axis]}" for axis, value in known.items())
+    named = [f"{axis} {value:.3g} {RMSE_UNITS[axis]}" for axis, value in known.items()]
+    return ", ".join(named) or "crashes"  # a flight whose attitude is followed lacks some, not all

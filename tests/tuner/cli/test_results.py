@@ -3,6 +3,7 @@
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.cli.results import print_run
 from tuner.result import AxesRmse, PredictedErrors
+from tuner.wording.predictions import starts_in_words
 
 
 def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811
@@ -21,11 +22,15 @@ def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811
             "predicted_best": (ahead,),
         }
     )
-    fell = run.result.flights[0].model_copy(update={"name": "fell", "rmse_best": crashed})
+    fell = run.result.flights[0].model_copy(
+        update={"name": "fell", "horizon": 1.0, "rmse_best": crashed, "rmse_fitted_starts": crashed}
+    )
     print_run(run.folder, run.result.model_copy(update={"flights": (followed, fell)}))
     lines = capsys.readouterr().out.splitlines()
     rows = [line.split() for line in lines if line.split()[:1] == ["followed"]]
     assert [row.count("–") for row in rows] == [3, 2]  # attitude; attitude and body rate
-    assert not any("crash" in line for line in lines if "fell" not in line)
+    assert not any("crash" in cell for row in rows for cell in row)
     (row,) = (line for line in lines if line.split()[:1] == ["fell"])
     assert row.count("crash") == 6
+    *_, starts = starts_in_words((followed, fell))
+    assert "followed x 0.01 m, y 0.02 m, z 0.03 m; fell crashes" in starts

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,21 +34,10 @@ from tuner.search.optimiser import Free
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 
 
-def job_with(
-    drag: float,
-    *,
-    seed: int,
-    job: JobFile | None = None,
-    tilt: tuple[float, float] = (0.0, 0.0),
-    around: Mapping[str, Sequence[float]] | None = None,
-) -> tuple[Job, Fitted]:
-    """Return a job whose flights were flown with some drag of the body, and its base fit.
-
-    Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
-    each of them.
-    """
-    made, fitted = unfitted_with(drag, seed=seed, job=job, tilt=tilt, around=around)
-    return made, _fit(made, fitted)
+def job_with(drag: float, **given: Any) -> tuple[Job, Fitted]:
+    """Return the job of `unfitted_with` and its base fit."""
+    job, start = unfitted_with(drag, **given)
+    return job, _fit(job, start)
 
 
 def unfitted_with(
@@ -58,7 +48,11 @@ def unfitted_with(
     tilt: tuple[float, float] = (0.0, 0.0),
     around: Mapping[str, Sequence[float]] | None = None,
 ) -> tuple[Job, Fitted]:
-    """Return the job of `job_with`, and its start as a fit that moved nothing."""
+    """Return a job whose flights were flown with some drag of the body, and its start as a fit.
+
+    Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
+    each of them.
+    """
     truth = problem((*BASE, "fuselage_drag"))
     vector = truth.space.vector_of(
         dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
