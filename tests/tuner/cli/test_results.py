@@ -27,7 +27,7 @@ def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811
     )
     print_run(run.folder, run.result.model_copy(update={"flights": (followed, fell)}))
     lines = capsys.readouterr().out.splitlines()
-    rows = [line.split() for line in lines if line.startswith("followed") and "–" in line]
+    rows = [line.split() for line in lines if line.split()[:1] == ["followed"] and "–" in line]
     assert [row.count("–") for row in rows] == [3, 2]  # attitude; attitude and body rate
     assert not any("crash" in cell for row in rows for cell in row)
     (row,) = (line for line in lines if line.split()[:1] == ["fell"])
