@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
 
 from sim_jax.numeric import GRAVITY
 from tuner.flights.flight import Flight, Series
@@ -129,7 +129,7 @@ def _at_end(hover: _Hover, flight: Flight) -> Array:
     moves = np.zeros(max(rows.stop for rows in ROWS.values()))
     ends, covariances = _filtered(hover)
     square = np.einsum("ap,apq,aq->", ends, np.linalg.inv(covariances), ends)
-    if stats.chi2.sf(square, ends.size) > CHANCE:
+    if chdtrc(ends.size, square) > CHANCE:
         return moves
     (vx, pitch, q), (vy, roll, p) = ends
     moves[ROWS["velocity"]] = [*(np.array([vx, vy]) @ _axes(flight)), 0.0]

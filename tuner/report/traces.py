@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.comparison.errors import FlightErrors
 from tuner.disk import whole_file
 from tuner.files import read_arrays
+
+if TYPE_CHECKING:  # a page is drawn without jax
+    from tuner.comparison.errors import FlightErrors
 
 Array = NDArray[np.float64]
 

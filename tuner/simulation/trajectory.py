@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -36,8 +37,8 @@ class Published:
     @property
     def start(self) -> Vec3:
         """The first point, m."""
-        place = self.inlet.points.position
-        return Vec3(place.x[0], place.y[0], place.z[0])
+        first: Vec3 = jax.tree.map(lambda axis: np.asarray(axis)[0], self.inlet.points.position)
+        return first
 
 
 def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
@@ -60,15 +61,12 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
     count = math.ceil(duration * control_rate) + 1
     seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
     rows = seen.astype(int)
-    points = sent.points
+    points: ReferencePoint = jax.tree.map(  # numpy's indexing, for jax's takes a program each
+        lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), sent.points
+    )
     return Published(
         ReferenceInlet(
-            ReferencePoint(
-                *(
-                    Vec3(part.x[rows], part.y[rows], part.z[rows])
-                    for part in (points.position, points.velocity, points.acceleration)
-                )
-            ),
+            points,
             spins=jnp.asarray(shape.spins),
             yaw_rate=jnp.asarray(settings.yaw_rate if shape.spins else 0.0),
         ),

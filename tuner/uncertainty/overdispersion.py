@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special, stats
+from scipy import special  # scipy.stats takes a quarter of a second to import
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def allowed_for(ratio: Array, freedom: Array, correlation: Array) -> Array:
     centre = np.exp(centre - centre.max())
     weight = likelihood * (about @ centre)
     weight /= weight.sum(axis=1, keepdims=True)
-    sd, half = np.sqrt(variance), stats.norm.ppf(0.975)
+    sd, half = np.sqrt(variance), special.ndtri(0.975)
     low, high = np.zeros_like(ratio), np.full_like(ratio, np.log(sd[-1]))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
