@@ -1,19 +1,34 @@
-"""How far a fit would move with terms that are not in it."""
+"""How far a fit would move with terms that are not in it, by what the flights say of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.selection.linear import Array, Columns, Linear
+from tuner.selection.linear import RIDGE, Array, Columns, Linear
+from tuner.selection.score import long_run
+
+SMALLEST = 0.1
+"""Of a term's usual size (its prior's standard deviation), below which it is as good as absent."""
+SIZES = 25
+"""Sizes that are looked at, from the smallest to the usual one, equally far apart in logarithm."""
+FLAT = 1e-10
+"""Share of a group's information that every direction is taken to have at least: what is less is
+rounding, and leaves it to the prior."""
 
 
 def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array:
-    """Return how far each parameter (P,) would move with what the model lacks.
+    """Return how far each parameter (P,) of the model would move with what it lacks.
 
-    Each group is added by itself, in one linear step; the moves count together as the root of the
-    sum of their squares.
+    Each group is added by itself, to first order, as large as the flights let it be: a priori its
+    coefficients are normal about their neutral values, as likely small as large (the logarithm of
+    their size is uniform, from a tenth of the usual to the usual one), and models with the
+    group in each of these sizes are averaged by what the flights say of them. So a term that
+    chance explains counts for little however much a refit would move with it, and one that the
+    flights call for, but not surely enough to be added, for all of its move. The moves of all
+    groups count together as the root of the sum of their mean squares.
 
     Parameters
     ----------
@@ -23,11 +38,77 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array
         Columns of what is in the model.
     groups
         Columns of each group that is not.
+
+    Notes
+    -----
+    Hoeting, Madigan, Raftery and Volinsky, "Bayesian model averaging: a tutorial", 1999. Its
+    evidence takes errors as large as they are: the group's score scatters from stretch to stretch
+    (`long_run`), gusts included. What a refit would do is no measure where the flights can hardly
+    tell a term from the model: that is chance.
     """
+    square = linear.information() + linear.prior
     everything = np.ones(len(linear.flight), bool)
     alone = linear.step(model, inside=everything)
-    squares = np.zeros_like(alone)
+    squares = np.zeros(len(linear.scaled))
     for group in groups:
-        wider = np.concatenate([model, group])
-        squares += (linear.step(wider, inside=everything) - alone) ** 2
+        evidence = _Evidence.of(linear, square, alone, model, group)
+        squares[model] += evidence.mean_square
     return np.asarray(np.sqrt(squares))
+
+
+@dataclass(frozen=True)
+class _Evidence:
+    """What the flights say of a group's coefficients, in units of their usual sizes.
+
+    Attributes
+    ----------
+    moves
+        (K, L) how far the model's coefficients follow along each axis.
+    value, variance
+        (L,) an estimate along each axis, independent of the others.
+    """
+
+    moves: Array
+    value: Array
+    variance: Array
+
+    @staticmethod
+    def of(
+        linear: Linear, square: Array, alone: Array, model: Columns, group: Columns
+    ) -> _Evidence:
+        """Return the evidence beside a model whose minimum is at ``alone`` (P,)."""
+        usual = linear.prior_sd[group]
+        unit = 1.0 / np.sqrt(np.maximum(np.diag(square)[model], 1e-300))
+        own = square[np.ix_(model, model)] * np.outer(unit, unit) + RIDGE * np.eye(len(model))
+        follow = -unit[:, None] * np.linalg.solve(own, unit[:, None] * square[np.ix_(model, group)])
+        left = square[np.ix_(group, group)] + square[np.ix_(group, model)] @ follow
+        pull = linear.pull + linear.prior @ alone
+        slope = (linear.slopes(alone).sum(axis=0) + pull)[group]
+        step = -np.linalg.solve(left, slope)
+        wider = alone.copy()
+        wider[group] += step
+        wider[model] += follow @ step
+        at = linear.slopes(wider)
+        seen = np.any(linear.diagonals[:, group] > 0.0, axis=1)
+        scores = (at[:, group] + at[:, model] @ follow)[seen] * usual
+        known = left * np.outer(usual, usual) - np.eye(len(group))  # by the flights alone
+        values, vectors = np.linalg.eigh(0.5 * (known + known.T))
+        inverse = (vectors / np.maximum(values, FLAT * values[-1])) @ vectors.T
+        count = max(len(scores), 2)
+        spread = long_run(scores, linear.flight[seen]) * count / (count - 1.0) + known / count
+        covariance = inverse @ spread @ inverse
+        variance, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        value = -axes.T @ inverse @ (slope * usual)
+        return _Evidence(follow * usual @ axes, value, np.maximum(variance, 0.0))
+
+    @property
+    def mean_square(self) -> Array:
+        """Mean squares (K,) of the moves, over all sizes by what the flights say of each."""
+        sizes = np.exp(np.linspace(np.log(SMALLEST), 0.0, SIZES))[:, None] ** 2
+        allowed = sizes + self.variance
+        log_weight = -0.5 * (np.log(allowed) + self.value**2 / allowed).sum(axis=1)
+        weight = np.exp(log_weight - log_weight.max())
+        weight /= weight.sum()
+        centres = (sizes / allowed * self.value) @ self.moves.T
+        scatters = (sizes * self.variance / allowed) @ (self.moves**2).T
+        return np.asarray(weight @ (centres**2 + scatters))

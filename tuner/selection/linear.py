@@ -46,6 +46,8 @@ class Linear:
         (S, L, L) and (S, L).
     prior, pull
         (P, P) information of all priors, and (P,) gradient of those of the coefficients.
+    prior_sd
+        (P,) of each coefficient's own prior.
     flight, section
         (S,) where each stretch belongs.
     loss
@@ -59,6 +61,7 @@ class Linear:
     score: Array
     prior: Array
     pull: Array
+    prior_sd: Array
     flight: NDArray[np.intp]
     section: NDArray[np.intp]
     loss: float
@@ -278,6 +281,7 @@ def linear_of(
         score=information.score.sum(axis=0).reshape(-1, size)[flown],
         prior=prior,
         pull=own * (scaled - mean),
+        prior_sd=1.0 / np.sqrt(own),
         flight=flight,
         section=np.tile(section, segments)[flown],
         loss=loss,

@@ -329,7 +329,7 @@ def _chance(
     if count <= size + 1:
         return 1.0
     sum_of_scores = (without - with_group).sum(axis=0)
-    spread = _long_run(with_group * unit, linear.flight) * count / (count - 1.0)
+    spread = long_run(with_group * unit, linear.flight) * count / (count - 1.0)
     along = sum_of_scores * unit
     hotelling = max(float(along @ np.linalg.solve(spread + RIDGE * np.eye(size), along)), 0.0)
     return float(fdtrc(size, count - size, hotelling * (count - size) / (size * (count - 1.0))))
@@ -345,7 +345,7 @@ def _effective_count(scores: NDArray[np.float64]) -> float:
     return float(shares.sum() ** 2 / max((shares**2).sum(), 1e-300))
 
 
-def _long_run(scores: NDArray[np.float64], flight: NDArray[np.intp]) -> NDArray[np.float64]:
+def long_run(scores: NDArray[np.float64], flight: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the covariance (L, L) of the sum of scores (S, L) that are correlated in a flight."""
     spread = scores.T @ scores
     for apart in range(1, MEMORY + 1):

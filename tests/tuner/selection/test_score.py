@@ -42,6 +42,7 @@ def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS, gusts=False
         score=np.array(score_),
         prior=np.eye(4) * 1e-6,
         pull=np.zeros(4),
+        prior_sd=np.full(4, 1e3),
         flight=flight,
         section=np.tile(np.arange(STRETCHES) * 3 // STRETCHES, FLIGHTS),
         loss=loss,

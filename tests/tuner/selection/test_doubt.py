@@ -1,0 +1,118 @@
+"""What terms that are not in a model may do to it, on losses that are quadratic by construction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuner.selection.doubt import in_doubt
+from tuner.selection.linear import Linear
+
+MODEL, TERM = np.array([0]), np.array([1])
+FLIGHTS, STRETCHES, SAMPLES = 4, 12, 50
+LIKE = 0.95
+"""Correlation of what the term does with what the model does."""
+USUAL = 5.0
+"""Usual size of the term, in standard errors of an estimate of it."""
+DRAWS = 200
+
+
+def flown(random, usual=USUAL):
+    """Return the loss of regressions on two columns that are much alike, the truth at zero.
+
+    Residuals wander with gusts that last for a stretch. The term's unit is the standard error of
+    an estimate of it.
+    """
+    shared = random.normal(size=(FLIGHTS * STRETCHES, SAMPLES, 1))
+    own = random.normal(size=(FLIGHTS * STRETCHES, SAMPLES, 2))
+    columns = np.sqrt(LIKE) * shared + np.sqrt(1.0 - LIKE) * own + 0.5 * random.normal(size=2)
+    hessian = columns.transpose(0, 2, 1) @ columns
+    gust = random.normal(size=FLIGHTS * STRETCHES)
+    residual = random.normal(size=shared.shape[:2]) + gust[:, None]
+    score = np.einsum("sip,si->sp", columns, residual)
+    inverse = np.linalg.inv(hessian.sum(axis=0))
+    meat = np.einsum("sp,sq->pq", columns.sum(axis=1), columns.sum(axis=1)) + hessian.sum(axis=0)
+    errors = np.sqrt(np.diag(inverse @ meat @ inverse))
+    unit = np.array([1.0, errors[1]])
+    linear = Linear(
+        scaled=np.zeros(2),
+        hessian=hessian * np.outer(unit, unit),
+        score=score * unit,
+        prior=np.diag([1e-6, usual**-2]),
+        pull=np.zeros(2),
+        prior_sd=np.array([1e3, usual]),
+        flight=np.repeat(np.arange(FLIGHTS), STRETCHES),
+        section=np.tile(np.arange(STRETCHES) * 3 // STRETCHES, FLIGHTS),
+        loss=0.5 * float(np.sum(residual**2)),
+    )
+    across = columns[..., :1].transpose(0, 2, 1) @ columns[..., :1]
+    alone = np.sqrt((columns[..., 0].sum(axis=1) ** 2).sum() + across.sum()) / across.sum()
+    return linear, alone
+
+
+def with_term(linear, size):
+    """Return the loss of flights that had the term, about the point where the model has none."""
+    return replace(linear, score=linear.score - size * linear.hessian[..., 1])
+
+
+@pytest.fixture(scope="module")
+def fits():
+    random = np.random.default_rng(1)
+    return [flown(random) for _ in range(DRAWS)]
+
+
+def share(fits, size, *, with_part):
+    """Return how often the model's 95 % interval holds the truth while a term is missing."""
+    held = []
+    for linear, alone in fits:
+        fit = with_term(linear, size)
+        off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
+        error = max(alone, in_doubt(fit, MODEL, [TERM])[0] if with_part else 0.0)
+        held.append(abs(off) < 1.96 * error)
+    return np.mean(held)
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0, 2.0, 3.0, 4.0])
+def test_a_term_too_small_to_be_added_is_covered_whatever_its_size(fits, size):
+    assert share(fits, size, with_part=True) > 0.83
+    if size >= 2.0:
+        assert share(fits, size, with_part=False) < 0.2
+
+
+def test_where_flights_say_little_of_a_term_chance_counts_for_less_than_a_refit_would_move():
+    random = np.random.default_rng(2)
+    parts, steps = [], []
+    for linear, _ in (flown(random, usual=1.0) for _ in range(DRAWS)):
+        every = np.ones(len(linear.flight), bool)
+        moved = linear.step(np.array([0, 1]), inside=every) - linear.step(MODEL, inside=every)
+        steps.append(moved[0] ** 2)
+        parts.append(in_doubt(linear, MODEL, [TERM])[0] ** 2)
+    assert np.sqrt(np.mean(parts)) < 0.6 * np.sqrt(np.mean(steps))
+
+
+def test_what_the_flights_call_for_counts_in_full(fits):
+    for linear, _ in fits[:20]:
+        fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
+        every = np.ones(len(fit.flight), bool)
+        moved = fit.step(np.array([0, 1]), inside=every) - fit.step(MODEL, inside=every)
+        assert in_doubt(fit, MODEL, [TERM])[0] == pytest.approx(abs(moved[0]), rel=0.15)
+
+
+def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
+    """The flights leave it to the prior: as likely small as large, up to the usual size."""
+    linear, _ = fits[0]
+    same = replace(
+        linear,
+        hessian=linear.hessian[:, :1, :1] * np.ones((2, 2)),
+        score=linear.score[:, :1] * np.ones(2),
+    )
+    sizes = np.exp(np.linspace(np.log(0.1), 0.0, 25))
+    expected = USUAL * np.sqrt(np.mean(sizes**2))
+    assert in_doubt(same, MODEL, [TERM])[0] == pytest.approx(expected, rel=0.05)
+
+
+def test_groups_add_up_as_squares(fits):
+    linear, _ = fits[1]
+    one, both = in_doubt(linear, MODEL, [TERM])[0], in_doubt(linear, MODEL, [TERM, TERM])[0]
+    assert both == pytest.approx(np.sqrt(2.0) * one)
+    assert in_doubt(linear, MODEL, [])[0] == 0.0
