@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -70,6 +71,11 @@ def measure() -> Section:
         for seed, trial in zip(SEEDS, engine.stream(_task, SEEDS), strict=True):
             trials.append(trial)
             print(_line(seed, trial), flush=True)
+    return section(trials)
+
+
+def section(trials: Sequence[Trial]) -> Section:
+    """Return the page's section about some trials."""
     missed = [group for trial in trials for group in trial.lab.groups if group not in trial.found]
     false = [group for trial in trials for group in trial.found if group not in trial.lab.groups]
     flown = sum(len(trial.lab.groups) for trial in trials)
@@ -80,7 +86,8 @@ def measure() -> Section:
         f"given. Of {flown} groups of terms that were flown {flown - len(missed)} are found"
         f"{_named('; missed', missed)}; {len(false)} are found that were not flown"
         f"{_named('', false)}. Errors are shares of the truth, or, of what may be zero, of the "
-        "coefficient's usual size; the interval's half-width likewise, its median over the fits. "
+        "coefficient's usual size; the interval's half-width likewise, its median over the fits, "
+        "and the part of it that is largest in most of them. "
         "An oracle knows the truth and the law of the gusts: it flies the fit's model at the truth "
         "again, in other gusts and other noise, and quotes how far linear fits to those flights "
         "scatter; beside it the median of how many times as wide the quoted interval is. "
@@ -92,6 +99,7 @@ def measure() -> Section:
         "mean error",
         "RMS error",
         "95 % interval ±",
+        "most of it",
         "of an oracle's",
         "hold the truth",
     ]
@@ -179,6 +187,7 @@ def _rows(trials: Sequence[Trial]) -> list[list[str]]:
                 f"{100 * errors.mean():+.2f} %",
                 f"{figure(100 * np.sqrt(np.mean(errors**2)))} %",
                 f"{figure(100 * half)} %",
+                Counter(_cause(trial, name) for trial in having).most_common(1)[0][0],
                 f"{figure(np.median(wider))} ×" if wider else "",
                 f"{held} of {len(having)}",
             ]
@@ -199,6 +208,12 @@ def _error(trial: Trial, name: str) -> float:
 def _half_width(trial: Trial, name: str) -> float:
     low, high = trial.estimates[name].ci95
     return 0.5 * (high - low) / _size(trial, name)
+
+
+def _cause(trial: Trial, name: str) -> str:
+    """Return the largest part of a coefficient's quoted error."""
+    parts = trial.estimates[name].parts.model_dump()
+    return max(parts, key=lambda part: parts[part] or 0.0).replace("_", " ")
 
 
 def _holds(trial: Trial, name: str) -> bool:

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.lab import Trial, _rows
+from benchmarks.lab import Trial, _rows, section
 from benchmarks.lab_flights import drawn
 from sim_jax.numeric import GRAVITY
 from tuner.coefficients import term_groups
 from tuner.config import values_of
+from tuner.uncertainty.error_parts import ErrorParts
 
 SEEDS = range(8)
 
@@ -39,9 +40,16 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     true = values_of(lab.vehicle)["motor_constant"]
 
     def trial(error, half):
-        value = true * (1.0 + error)
-        estimate = SimpleNamespace(value=value, ci95=(value - half * true, value + half * true))
+        value, off = true * (1.0 + error), half * true
+        parts = ErrorParts(noise=0.1 * off, residuals=0.2 * off, left_out=0.5 * off)
+        estimate = SimpleNamespace(value=value, ci95=(value - off, value + off), parts=parts)
         return Trial(lab, (), {"motor_constant": estimate}, {"motor_constant": 0.5}, 1.0)
 
-    (row,) = _rows([trial(0.02, 0.03), trial(0.04, 0.01)])
-    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "2 ×", "1 of 2"]
+    trials = [trial(0.02, 0.03), trial(0.04, 0.01)]
+    (row,) = _rows(trials)
+    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "left out", "2 ×", "1 of 2"]
+    part = section(trials)
+    assert (part.rows, len(part.head)) == ([row], len(row))
+    flown = 2 * len(lab.groups)
+    assert "2 laboratories (0 with gusts)" in part.text
+    assert f"Of {flown} groups of terms that were flown 0 are found; missed" in part.text
