@@ -16,8 +16,10 @@ Array = NDArray[np.float64]
 
 WIDE = 100.0
 """Factor on the priors' widths that leaves practically the information of the flights alone."""
-MAX_LEVERAGE = 0.95
-"""Leverage of a stretch of time on the fit beyond which its score is corrected no further."""
+FULL_LEVERAGE = 0.5
+"""Leverage of a stretch of time on the fit up to which its score is corrected in full."""
+MAX_LEVERAGE = 0.999
+"""Leverage beyond which it is corrected no further."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,10 @@ def covariance_of(information: FisherInformation) -> Covariance:
     for the stretch's own leverage on the fit, in full as the jackknife has it (CV3): half of that,
     which is exact for white noise, is too little for what wanders slowly, for a fit of many
     coefficients takes much of it out (MacKinnon, Nielsen and Webb, "Fast and reliable jackknife and
-    bootstrap methods for cluster-robust inference", 2023). Few stretches make that estimate
+    bootstrap methods for cluster-robust inference", 2023). What one stretch alone determines the
+    others tell so little of that the jackknife would multiply white noise without bound: beyond a
+    leverage of one half, half of the correction is for it, and white noise counts no more than
+    twice. Few stretches make that estimate
     erratic: what is allowed for is weighed against what independent residuals would say, by the
     degrees of freedom that the stretches amount to (`allowed_for`; Bell and McCaffrey, "Bias
     reduction in standard errors for linear regression with multi-stage samples", 2002).
@@ -119,9 +124,9 @@ def _scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     white = np.linalg.inv(factor)
     leverage = white @ (stretches.information * scale) @ white.T
     values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.transpose(0, 2, 1)))
-    correct = (vectors / (1.0 - np.clip(values, 0.0, MAX_LEVERAGE))[:, None]) @ (
-        vectors.transpose(0, 2, 1)
-    )
+    left = 1.0 - np.clip(values, 0.0, MAX_LEVERAGE)
+    by = np.sqrt(left * np.maximum(left, 1.0 - FULL_LEVERAGE))
+    correct = (vectors / by[:, None]) @ vectors.transpose(0, 2, 1)
     corrected = np.einsum("nij,nj->ni", correct, (stretches.score * unit) @ white.T) @ factor.T
     meat = corrected.T @ corrected / scale
 

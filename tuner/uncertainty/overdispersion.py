@@ -21,12 +21,13 @@ FREEDOM = (1.0, 200.0)
 HALVINGS = 40
 
 
-def allowed_for(ratio: Array, freedom: Array, correlation: Array) -> Array:
+def allowed_for(ratio: Array, freedom: Array, correlation: Array, expected: Array) -> Array:
     """Return the factors (K,) on the standard errors that noise says.
 
     With them, 1.96 standard errors are 95 % intervals of errors whose variance is 1 + τ² times the
     noise's. A priori log τ is Cauchy about a centre that the coefficients of a fit share, for what
-    disturbs flights disturbs all of them, and so is that centre about 1: τ is as likely small as
+    disturbs flights disturbs all of them, though not alike (``expected``): a gust is slow, and a
+    latency is told by what is quick. And so is that centre about 1: τ is as likely small as
     large, and as large as it must be where observations say so. A normal distribution would trust
     the observed scatter as it is, and few flights scatter less than they should half of the time;
     Student's t, which knows nothing of τ, makes intervals of noise alone twice as wide as they need
@@ -40,6 +41,9 @@ def allowed_for(ratio: Array, freedom: Array, correlation: Array) -> Array:
         (K,) degrees of freedom of the χ² that the observation is.
     correlation
         (K, K) of the estimates: observations that go together are counted once.
+    expected
+        (K,) variances over the noise's by how disturbed what determines each coefficient is: by
+        how much they differ, the τ are expected to; their common size does not matter.
 
     Notes
     -----
@@ -54,10 +58,13 @@ def allowed_for(ratio: Array, freedom: Array, correlation: Array) -> Array:
     variance = 1.0 + np.exp(2.0 * log_excess)
     likelihood = -0.5 * freedom[:, None] * (np.log(variance) + ratio[:, None] / variance)
     likelihood = np.exp(likelihood - likelihood.max(axis=1, keepdims=True))
-    about = 1.0 / (1.0 + ((log_excess[:, None] - log_excess) / APART) ** 2)
-    about /= about.sum(axis=0)  # of an excess, given each centre
-    of_centre = np.log(likelihood @ about)
     own = 1.0 / np.square(correlation).sum(axis=1)
+    usual = 0.5 * np.log(expected)
+    usual = usual - own @ usual / own.sum()
+    beside = log_excess[:, None] - log_excess - usual[:, None, None]
+    about = 1.0 / (1.0 + (beside / APART) ** 2)
+    about /= about.sum(axis=1, keepdims=True)  # (K, excess, centre): of an excess, given a centre
+    of_centre = np.log(np.einsum("kx,kxc->kc", likelihood, about))
     centre = -np.log1p((log_excess / QUARTILE) ** 2) + own @ of_centre
     centre = np.exp(centre - centre.max())
     weight = likelihood * (about @ centre)

@@ -13,6 +13,7 @@ from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.parts import left_out, noise_alone, spread_of
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
+ONE, ALIKE = np.ones((1, 1)), np.ones(1)
 
 
 def regression(
@@ -159,7 +160,7 @@ def test_what_is_allowed_for_covers_whatever_adds_to_noise(freedom, excess):
     variance = 1.0 + excess**2
     ratio = variance * generator.chisquare(freedom, 2000) / freedom
     factor = np.concatenate(
-        [allowed_for(one[None], np.array([float(freedom)]), np.ones((1, 1))) for one in ratio[:300]]
+        [allowed_for(one[None], np.array([float(freedom)]), ONE, ALIKE) for one in ratio[:300]]
     )
     covered = np.abs(np.sqrt(variance) * generator.normal(size=len(factor))) < 1.96 * factor
     assert covered.mean() > 0.88
@@ -176,10 +177,10 @@ def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
     for _ in range(100):
         sd = np.sqrt(1.0 + (excess * np.exp(0.5 * generator.normal(size=12))) ** 2)
         ratio, freedom = sd**2 * generator.chisquare(3, 12) / 3.0, np.full(12, 3.0)
-        factor = allowed_for(ratio, freedom, own)
+        factor = allowed_for(ratio, freedom, own, np.ones(12))
         covered.append(np.abs(sd * generator.normal(size=12)) < 1.96 * factor)
         shared.append(factor / sd)
-        alone.append(allowed_for(ratio[:1], freedom[:1], own[:1, :1]) / sd[:1])
+        alone.append(allowed_for(ratio[:1], freedom[:1], ONE, ALIKE) / sd[:1])
     assert 0.91 < np.mean(covered) < 0.99
     assert np.median(shared) < width
     assert np.median(shared) < np.median(alone) + 0.1
@@ -187,13 +188,33 @@ def test_coefficients_share_what_is_known_of_the_disturbance(excess, width):
 
 def test_one_coefficient_that_scatters_is_not_lost_among_others():
     ratio = np.append(np.ones(11), 400.0)
-    factor = allowed_for(ratio, np.full(12, 3.0), np.eye(12))
+    factor = allowed_for(ratio, np.full(12, 3.0), np.eye(12), np.ones(12))
     assert factor[-1] > 15.0
     assert factor[:-1].max() < 1.4
 
 
 def test_coefficients_that_go_together_are_one_observation():
     ratio, freedom = np.full(6, 0.5), np.full(6, 3.0)
-    as_one, apart = (allowed_for(ratio, freedom, c)[0] for c in (np.ones((6, 6)), np.eye(6)))
-    assert as_one == pytest.approx(allowed_for(ratio[:1], freedom[:1], np.ones((1, 1)))[0])
+    as_one, apart = (
+        allowed_for(ratio, freedom, correlation, np.ones(6))[0]
+        for correlation in (np.ones((6, 6)), np.eye(6))
+    )
+    assert as_one == pytest.approx(allowed_for(ratio[:1], freedom[:1], ONE, ALIKE)[0])
     assert apart < as_one
+
+
+def test_how_disturbed_the_channels_are_says_how_the_coefficients_differ():
+    """Every other one is disturbed ten times less: of few degrees of freedom, that is news."""
+    generator, own = np.random.default_rng(8), np.eye(12)
+    sd = np.where(np.arange(12) % 2, 3.0, 30.0)
+    covered, widths = [], {"alike": [], "apart": []}
+    for _ in range(100):
+        ratio, freedom = sd**2 * generator.chisquare(1.5, 12) / 1.5, np.full(12, 1.5)
+        alike = allowed_for(ratio, freedom, own, np.ones(12)) / sd
+        apart = allowed_for(ratio, freedom, own, 0.1 * sd**2) / sd
+        assert apart == pytest.approx(allowed_for(ratio, freedom, own, sd**2) / sd)
+        widths["alike"].append(alike)
+        widths["apart"].append(apart)
+        covered.append(np.abs(generator.normal(size=12)) < 1.96 * apart)
+    assert np.mean(covered) > 0.93
+    assert np.median(widths["apart"]) < 0.85 * np.median(widths["alike"])
