@@ -5,6 +5,64 @@ from __future__ import annotations
 from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
+_OUTSIDE = {"sdf": _OF_SETUP, "px4": _OF_SETUP}
+_AXES = {"x": "forward", "y": "left", "z": "up"}
+_CLOCKS = "clocks of the recording"
+_SMOOTHED = "smoothing error of the motion capture"
+
+
+def _marker(name: str, unit: str, meaning: str) -> Coefficient:
+    """Return the row of one axis of where motion capture's rigid body sits on the vehicle."""
+    return Coefficient(
+        name=name,
+        unit=unit,
+        meaning=meaning,
+        source="the rigid body as defined in the motion capture's software",
+        scope="setup",
+        place=(EFFECTS, name),
+        scale="linear",
+        bounds=(-0.3, 0.3),
+        prior_sd=0.03,
+        step=0.01,
+        neutral=0.0,
+        group=name[:-2],
+        exported_as=_OUTSIDE,
+    )
+
+
+def _of_flight(
+    name: str, unit: str, prior_sd: float, meaning: str, source: str, group: str = ""
+) -> Coefficient:
+    """Return the row of what is constant during a flight, and zero unless that flight says so."""
+    return Coefficient(
+        name=name,
+        unit=unit,
+        meaning=meaning,
+        source=source,
+        scope="flight",
+        scale="linear",
+        prior_sd=prior_sd,
+        neutral=0.0,
+        group=group,
+    )
+
+
+def _of_window(
+    name: str, unit: str, prior_sd: float, meaning: str, source: str, count: int = 3
+) -> Coefficient:
+    """Return the row of what a window's start differs by from the recording."""
+    return Coefficient(
+        name=name,
+        unit=unit,
+        meaning=meaning,
+        source=source,
+        scope="window",
+        scale="linear",
+        prior_sd=prior_sd,
+        neutral=0.0,
+        count=count,
+    )
+
 
 SURROUNDING_ROWS = (
     # what the set-up adds
@@ -21,7 +79,7 @@ SURROUNDING_ROWS = (
         step=0.01,
         free=True,
         neutral=0.0,
-        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        exported_as=_OUTSIDE,
         informed_by="closed loop",
     ),
     Coefficient(
@@ -38,7 +96,7 @@ SURROUNDING_ROWS = (
         free=True,
         hold_rank=3,
         neutral=0.0,
-        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        exported_as=_OUTSIDE,
         informed_by="commands and rotor speed",
     ),
     Coefficient(
@@ -52,106 +110,53 @@ SURROUNDING_ROWS = (
         prior_sd=0.5,
         fallback=("filters", "gyro_cutoff"),
         leaf=("controller", "filters", "gyro_cutoff"),
-        exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        exported_as=_OUTSIDE,
     ),
     *(
-        Coefficient(
-            name=f"marker_offset_{axis}",
-            unit="m",
-            meaning=f"point that motion capture records, {direction} of the centre of mass",
-            source="the rigid body as defined in the motion capture's software",
-            scope="setup",
-            place=(EFFECTS, f"marker_offset_{axis}"),
-            scale="linear",
-            bounds=(-0.3, 0.3),
-            prior_sd=0.03,
-            step=0.01,
-            neutral=0.0,
-            group="marker_offset",
-            exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        _marker(
+            f"marker_offset_{axis}",
+            "m",
+            f"point that motion capture records, {direction} of the centre of mass",
         )
         for axis, direction in (("x", "ahead"), ("y", "left"), ("z", "above"))
     ),
     *(
-        Coefficient(
-            name=f"marker_tilt_{axis}",
-            unit="rad",
-            meaning=f"rotation vector from the body to the motion capture's axes, {direction}",
-            source="the rigid body as defined in the motion capture's software",
-            scope="setup",
-            place=(EFFECTS, f"marker_tilt_{axis}"),
-            scale="linear",
-            bounds=(-0.3, 0.3),
-            prior_sd=0.03,
-            step=0.01,
-            neutral=0.0,
-            group="marker_tilt",
-            exported_as={"sdf": _OF_SETUP, "px4": _OF_SETUP},
+        _marker(
+            f"marker_tilt_{axis}",
+            "rad",
+            f"rotation vector from the body to the motion capture's axes, {direction}",
         )
-        for axis, direction in (("x", "forward"), ("y", "left"), ("z", "up"))
+        for axis, direction in _AXES.items()
     ),
     # what a recording may get wrong by a constant
-    Coefficient(
-        name="pose",
-        unit="s",
-        meaning="lateness of the clock that stamps the motion capture's poses",
-        source="clocks of the recording",
-        scope="flight",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
+    _of_flight(
+        "pose", "s", 0.02, "lateness of the clock that stamps the motion capture's poses", _CLOCKS
     ),
-    Coefficient(
-        name="flight_controller",
-        unit="s",
-        meaning="lateness of the clock that stamps what the flight controller publishes",
-        source="clocks of the recording",
-        scope="flight",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
+    _of_flight(
+        "flight_controller",
+        "s",
+        0.02,
+        "lateness of the clock that stamps what the flight controller publishes",
+        _CLOCKS,
     ),
-    Coefficient(
-        name="gyro_x",
-        unit="rad/s",
-        meaning="bias of the recorded body rate about forward",
-        source="gyro bias",
-        scope="flight",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
-    ),
-    Coefficient(
-        name="gyro_y",
-        unit="rad/s",
-        meaning="bias of the recorded body rate about left",
-        source="gyro bias",
-        scope="flight",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
-    ),
-    Coefficient(
-        name="gyro_z",
-        unit="rad/s",
-        meaning="bias of the recorded body rate about up",
-        source="gyro bias",
-        scope="flight",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
+    *(
+        _of_flight(
+            f"gyro_{axis}",
+            "rad/s",
+            0.02,
+            f"bias of the recorded body rate about {direction}",
+            "gyro bias",
+        )
+        for axis, direction in _AXES.items()
     ),
     # what surrounds a flight
     *(
-        Coefficient(
-            name=f"wind_{axis}",
-            unit="m/s",
-            meaning=f"steady velocity of the air towards world {axis} during a flight",
-            source="air conditioning of the hall; the vehicle's own wash",
-            scope="flight",
-            scale="linear",
-            prior_sd=0.5,
-            neutral=0.0,
+        _of_flight(
+            f"wind_{axis}",
+            "m/s",
+            0.5,
+            f"steady velocity of the air towards world {axis} during a flight",
+            "air conditioning of the hall; the vehicle's own wash",
             group="wind",
         )
         for axis in "xy"
@@ -172,95 +177,65 @@ SURROUNDING_ROWS = (
         },
     ),
     *(
-        Coefficient(
-            name=f"accelerometer_{axis}",
-            unit="m/s²",
-            meaning=f"bias of the recorded specific force along {direction}",
-            source="accelerometer bias, and the tilt of the sensor in the body",
-            scope="flight",
-            scale="linear",
-            prior_sd=0.5,
-            neutral=0.0,
+        _of_flight(
+            f"accelerometer_{axis}",
+            "m/s²",
+            0.5,
+            f"bias of the recorded specific force along {direction}",
+            "accelerometer bias, and the tilt of the sensor in the body",
             group="accelerometer",
         )
-        for axis, direction in (("x", "forward"), ("y", "left"), ("z", "up"))
+        for axis, direction in _AXES.items()
     ),
     # by how much the start of a window differs from the recorded state
-    Coefficient(
-        name="position",
-        unit="m",
-        meaning="position at the start of a window, from the smoothed recording's",
-        source="smoothing error of the motion capture",
-        scope="window",
-        scale="linear",
-        prior_sd=0.01,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "position",
+        "m",
+        0.01,
+        "position at the start of a window, from the smoothed recording's",
+        _SMOOTHED,
     ),
-    Coefficient(
-        name="velocity",
-        unit="m/s",
-        meaning="velocity at the start of a window, from the smoothed recording's",
-        source="smoothing error of the motion capture",
-        scope="window",
-        scale="linear",
-        prior_sd=0.1,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "velocity",
+        "m/s",
+        0.1,
+        "velocity at the start of a window, from the smoothed recording's",
+        _SMOOTHED,
     ),
-    Coefficient(
-        name="attitude",
-        unit="rad",
-        meaning="attitude at the start of a window about the body's axes, from the recording's",
-        source="smoothing error of the motion capture",
-        scope="window",
-        scale="linear",
-        prior_sd=0.03,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "attitude",
+        "rad",
+        0.03,
+        "attitude at the start of a window about the body's axes, from the recording's",
+        _SMOOTHED,
     ),
-    Coefficient(
-        name="body_rate",
-        unit="rad/s",
-        meaning="body rate at the start of a window, from the smoothed recording's",
-        source="smoothing error of the gyro",
-        scope="window",
-        scale="linear",
-        prior_sd=0.3,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "body_rate",
+        "rad/s",
+        0.3,
+        "body rate at the start of a window, from the smoothed recording's",
+        "smoothing error of the gyro",
     ),
-    Coefficient(
-        name="rotor_speed",
-        unit="",
-        meaning="share by which a rotor turns faster at the start of a window than recorded",
-        source="smoothing error of the tachometer, or of the command's lag",
-        scope="window",
-        scale="linear",
-        prior_sd=0.05,
-        neutral=0.0,
+    _of_window(
+        "rotor_speed",
+        "",
+        0.05,
+        "share by which a rotor turns faster at the start of a window than recorded",
+        "smoothing error of the tachometer, or of the command's lag",
         count=4,
     ),
-    Coefficient(
-        name="rate_integral",
-        unit="",
-        meaning="output of the rate controller's integrator at the start of a window",
-        source="no recording holds it",
-        scope="window",
-        scale="linear",
-        prior_sd=0.05,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "rate_integral",
+        "",
+        0.05,
+        "output of the rate controller's integrator at the start of a window",
+        "no recording holds it",
     ),
-    Coefficient(
-        name="trim",
-        unit="",
-        meaning="steady difference between commanded and acting torque during a window",
-        source="uneven rotors and an offset mass; the integrator takes it in closed loop",
-        scope="window",
-        scale="linear",
-        prior_sd=0.02,
-        neutral=0.0,
-        count=3,
+    _of_window(
+        "trim",
+        "",
+        0.02,
+        "steady difference between commanded and acting torque during a window",
+        "uneven rotors and an offset mass; the integrator takes it in closed loop",
     ),
 )
