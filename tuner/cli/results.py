@@ -25,9 +25,7 @@ NOT_SIMULATED = "–"
 
 def print_run(folder: Path, result: RunResult) -> None:
     """Print the coefficients, the RMSE before and after, and where everything lies."""
-    from tuner.wording.predictions import starts_in_words
-    from tuner.wording.refits import refits_in_words
-    from tuner.wording.status import ending_sentence
+    from tuner.wording.result import ending_sentence, refits_in_words, starts_in_words
 
     screen = console()
     screen.print(_coefficients(result))
@@ -160,7 +158,7 @@ def _refits(result: RunResult) -> Table:
 
 def _print_selection(screen: Console, result: RunResult) -> None:
     """Print what each group of terms beyond the base model is worth."""
-    from tuner.wording.selection import gain_in_words, reason_in_words, selection_in_words
+    from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
     table = Table(box=None, title="Terms beyond the motor model", title_justify="left")
     table.add_column("term")
@@ -177,7 +175,7 @@ def _print_selection(screen: Console, result: RunResult) -> None:
 
 def _print_effective(screen: Console, result: RunResult, effective: EffectiveResult) -> None:
     """Print with which coefficients Gazebo flies most like the vehicle, where they differ."""
-    from tuner.wording.effective import effective_in_words, rmse_in_words
+    from tuner.wording.result import effective_in_words, rmse_in_words
 
     table = Table(box=None, title="In Gazebo", title_justify="left")
     table.add_column("coefficient")
@@ -208,7 +206,7 @@ def _errors(result: RunResult) -> Table:
 
 def _predictions(result: RunResult) -> Table:
     """Return the open-loop predictions' errors, before and after the fit."""
-    from tuner.wording.predictions import PREDICTED
+    from tuner.wording.result import PREDICTED
 
     title = "Open-loop predictions from recorded states: mean error, initial → best coefficients"
     table = Table(box=None, title=title, title_justify="left")

@@ -31,7 +31,7 @@ def _marker(name: str, unit: str, meaning: str) -> Coefficient:
 
 
 def _of_flight(
-    name: str, unit: str, prior_sd: float, meaning: str, source: str, group: str = ""
+    name: str, unit: str, prior_sd: float, meaning: str, source: str, *, group: str = ""
 ) -> Coefficient:
     """Return the row of what is constant during a flight, and zero unless that flight says so."""
     return Coefficient(
@@ -48,7 +48,7 @@ def _of_flight(
 
 
 def _of_window(
-    name: str, unit: str, prior_sd: float, meaning: str, source: str, count: int = 3
+    name: str, unit: str, prior_sd: float, meaning: str, source: str, *, count: int = 3
 ) -> Coefficient:
     """Return the row of what a window's start differs by from the recording."""
     return Coefficient(

@@ -20,7 +20,7 @@ from tuner.exporters.target import (
     target_of,
 )
 from tuner.result import Run
-from tuner.wording.effective import what_is_exported, what_is_lost
+from tuner.wording.result import what_is_exported, what_is_lost
 
 FOLDER = "export"
 """Of a result folder, for its exports."""

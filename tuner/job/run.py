@@ -57,9 +57,9 @@ from tuner.search.iteration import Iteration
 from tuner.search.progress import Progress
 from tuner.spans import span
 from tuner.uncertainty.ground import sources_of
-from tuner.wording.exports import export_sentence
 from tuner.wording.findings import one_line, remedy, sentence
 from tuner.wording.phrases import clause
+from tuner.wording.result import export_sentence
 
 
 def run(

@@ -1,6 +1,6 @@
 """The table of a selection, as ``result.json`` holds it: codes and numbers, no prose.
 
-Sentences are made from them in `tuner.wording.selection`.
+Sentences are made from them in `tuner.wording.result`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.cli.results import print_run
 from tuner.result import AxesRmse, PredictedErrors
-from tuner.wording.predictions import starts_in_words
+from tuner.wording.result import starts_in_words
 
 
 def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811

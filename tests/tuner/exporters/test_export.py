@@ -12,7 +12,7 @@ from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export
 from tuner.exporters.gates import check
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
-from tuner.wording.exports import export_sentence
+from tuner.wording.result import export_sentence
 
 TODAY = date(2024, 5, 6)
 

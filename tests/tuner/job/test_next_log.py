@@ -21,7 +21,7 @@ from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import WHOLE, Stage
 from tuner.uncertainty.information import information_at
-from tuner.wording.next_log import next_log_in_words
+from tuner.wording.proposals import next_log_in_words
 
 FREE = ("input_scaling", "zero_position_armed", "motor_constant", "inertia_xx")
 

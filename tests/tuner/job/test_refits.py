@@ -12,7 +12,7 @@ from tuner.job.bootstrap import check_bootstrap
 from tuner.job.cross_validation import Fold, jackknife_errors
 from tuner.job.refits import _counted
 from tuner.report.sections.refits import refits
-from tuner.wording.refits import refits_in_words
+from tuner.wording.result import refits_in_words
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 

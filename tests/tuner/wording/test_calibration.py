@@ -2,7 +2,7 @@
 
 from benchmarks.calibration import KINDS
 from tuner.uncertainty.calibration import LEVELS, Calibration, Held, calibration
-from tuner.wording.calibration import calibration_in_words
+from tuner.wording.result import calibration_in_words
 
 
 def held(flights, share):

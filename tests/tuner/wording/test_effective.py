@@ -1,7 +1,7 @@
 from tests.tuner.exporters.test_export import EFFECTIVE
 from tuner.coefficients import Written
 from tuner.result import PoseRmse
-from tuner.wording.effective import effective_in_words, rmse_in_words, what_is_lost
+from tuner.wording.result import effective_in_words, rmse_in_words, what_is_lost
 
 
 def test_the_second_answer_is_said_with_what_it_costs():

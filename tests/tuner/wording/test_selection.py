@@ -3,7 +3,7 @@
 import pytest
 
 from tuner.selection.table import SelectionCode, SelectionRow
-from tuner.wording.selection import gain_in_words, reason_in_words, selection_in_words
+from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
 
 def row(code, *, kept=False):

@@ -12,7 +12,7 @@ from tuner.report.section import Section
 from tuner.result import CoefficientResult
 from tuner.uncertainty.calibration import calibration
 from tuner.uncertainty.verdict import ReasonCode, Verdict
-from tuner.wording.calibration import calibration_in_words
+from tuner.wording.result import calibration_in_words
 from tuner.wording.verdicts import (
     judgement_in_words,
     parts_in_words,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from tuner.coefficients import COEFFICIENTS
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.wording.effective import effective_in_words, rmse_in_words
 from tuner.wording.phrases import percent
+from tuner.wording.result import effective_in_words, rmse_in_words
 
 
 def effective(contents: Contents) -> Section | None:

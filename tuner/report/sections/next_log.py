@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.wording.next_log import next_log_in_words
+from tuner.wording.proposals import next_log_in_words
 
 
 def next_log(contents: Contents) -> Section | None:

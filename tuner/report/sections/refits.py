@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.wording.refits import refits_in_words
+from tuner.wording.result import refits_in_words
 
 
 def refits(contents: Contents) -> Section | None:

@@ -6,7 +6,7 @@ from tuner.report.chart import FITTED, INITIAL, PALETTE, Chart, Line, Look, Pane
 from tuner.report.contents import Contents
 from tuner.report.record import SearchRecord
 from tuner.report.section import Section
-from tuner.wording.status import ending_sentence
+from tuner.wording.result import ending_sentence
 
 
 def search(contents: Contents) -> Section | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.report.chart import FITTED, GREY, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.wording.selection import gain_in_words, reason_in_words, selection_in_words
+from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
 SMALLEST = 1e-4
 """Share of the loss below which the figure shows a gain as this."""

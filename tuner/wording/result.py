@@ -1,0 +1,235 @@
+"""A run's result as sentences: how it ended, its terms, its second answer, refits, exports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import sqrt
+from pathlib import Path
+
+from tuner.coefficients import REGISTRY, Coefficient, NotCarried, Written
+from tuner.errors import InputError
+from tuner.result import (
+    RMSE_UNITS,
+    EffectiveResult,
+    Ending,
+    FlightResult,
+    LostTerm,
+    PoseRmse,
+    RunResult,
+)
+from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.uncertainty.calibration import Calibration
+from tuner.wording.phrases import listed, percent
+
+APART = 2.0
+"""Times the standard error of a fit beyond which that of refits is called larger."""
+
+
+def refits_in_words(result: RunResult) -> tuple[str, ...]:
+    """Return sentences on the errors by refits, none where there are none.
+
+    An estimate of a standard deviation from n values is known to one part in the square root of
+    2 (n - 1), if they are normal.
+    """
+    fitted = result.coefficients
+    if all(c.jackknife_error is c.bootstrap_error is None for c in fitted.values()):
+        return ()
+    flights = sum(flight.split == "fit" for flight in result.flights)
+    known_to = 100 / sqrt(2 * (flights - 1))
+    precision = (
+        f"With {flights} flights, an error that comes of their differences is itself known to "
+        f"about ±{known_to:.0f} %."
+    )
+    beyond = [
+        name
+        for name, found in fitted.items()
+        if found.std_error is not None
+        and max(found.jackknife_error or 0.0, found.bootstrap_error or 0.0)
+        > APART * found.std_error
+    ]
+    if not beyond:
+        agree = "The flights disagree about no coefficient by more than twice what the fit quotes."
+        return precision, agree
+    disagree = (
+        f"The flights disagree about {listed(beyond)} by more than twice what the fit quotes: "
+        "believe the larger error."
+    )
+    return precision, disagree
+
+
+def ending_sentence(ending: Ending) -> str:
+    """Return why a search stopped."""
+    if ending is Ending.NO_FURTHER_GAIN:
+        return "The search converged: its last steps gained nothing."
+    return "The search stopped at its limit of iterations, before it converged."
+
+
+def calibration_in_words(calibration: Calibration) -> str:
+    """Return how many of the 95 % intervals held the truth, for each kind of flight."""
+    shares = [f"{100 * kind.coverage['95']:.0f} % ({kind.flights})" for kind in calibration.kinds]
+    sets = sorted({kind.sets for kind in calibration.kinds})
+    many = f"{sets[0]}" if len(sets) == 1 else f"{sets[0]} to {sets[-1]}"
+    return (
+        f"Measured in simulation, {many} sets of flights of each kind, with the terms that flew in "
+        f"the model ({calibration.date}): {listed(shares)} of the 95 % intervals held the truth."
+    )
+
+
+def export_sentence(kind: str, outcome: Path | InputError) -> str:
+    """Return where a format was written, or why it was refused."""
+    if isinstance(outcome, Path):
+        return f"The {kind} export was written to {outcome}."
+    return f"The {kind} export was refused: {outcome}."
+
+
+def effective_in_words(effective: EffectiveResult) -> str:
+    """Return what the second answer is and how it flies, in sentences."""
+    lost = listed([term.group for term in effective.lost])
+    text = (
+        f"Gazebo cannot fly {lost}. With its effective coefficients it misses the flights by "
+        f"{rmse_in_words(effective.rmse_effective)}, the physical model by "
+        f"{rmse_in_words(effective.rmse_physical)}; with the physical coefficients and without "
+        f"these terms it would be {rmse_in_words(effective.rmse_unfitted)}."
+    )
+    if effective.carried:
+        text += f" Gazebo has a place for {listed(effective.carried)}."
+    return text
+
+
+def rmse_in_words(rmse: PoseRmse) -> str:
+    """Return an RMSE with units of a readable size."""
+    if rmse.position is None or rmse.attitude is None:
+        return "a crash"
+    return f"{metres(rmse.position)} and {rmse.attitude:.2g}°"
+
+
+def metres(value: float) -> str:
+    """Return a length in m, cm or mm."""
+    if value >= 1.0:
+        return f"{value:.3g} m"
+    return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
+
+
+def what_is_exported(effective: EffectiveResult) -> str:
+    """Return, as a clause, what the numbers of an export are."""
+    lost = listed([term.group for term in effective.lost])
+    return (
+        f"effective coefficients, not physical ones: Gazebo lacks {lost}, and misses the flights "
+        f"by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "
+        f"{rmse_in_words(effective.rmse_physical)}"
+    )
+
+
+def what_is_lost(
+    effective: EffectiveResult, entry: Callable[[Coefficient], Written | NotCarried | None]
+) -> tuple[str, ...]:
+    """Return a clause on each group that is lost: why a target lacks it, and what it is worth."""
+    return tuple(
+        f"{term.group} is not exported: {reason}; without it alone the flights are missed by "
+        f"{rmse_in_words(term.rmse_without)}"
+        for term in effective.lost
+        if (reason := _reason(term, entry))
+    )
+
+
+def _reason(term: LostTerm, entry: Callable[[Coefficient], Written | NotCarried | None]) -> str:
+    held = entry(REGISTRY[term.names[0]])
+    return held.reason if isinstance(held, NotCarried) else ""
+
+
+_REASONS = {
+    SelectionCode.PREDICTS_FLIGHTS: "flights left out of the fit are predicted better with it",
+    SelectionCode.PREDICTS_SECTIONS: "sections of flights left out of the fit are predicted better "
+    "with it; no single flight is by the others",
+    SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
+    "of the fit contradicts it",
+    SelectionCode.ASKED_FOR: "the job file names it",
+    SelectionCode.HOVERS_TILTED: "every recording shows a hover that is not level",
+    SelectionCode.NOT_SIGNIFICANT: "residuals that are correlated in time gain as much from chance",
+    SelectionCode.IMMATERIAL: "it lowers the loss by less than simulators of one vehicle differ",
+    SelectionCode.NOT_PREDICTED: "flights left out of the fit are not predicted better by more "
+    "than the scatter",
+    SelectionCode.NO_INFORMATION: "the flights do not distinguish it from the coefficients in the "
+    "model",
+    SelectionCode.WORSE_AFTER_REFIT: "fitted again with it, flights left out of the fit are not "
+    "predicted better",
+}
+
+
+def reason_in_words(row: SelectionRow) -> str:
+    """Return why a group is in the model or not, as a clause."""
+    return _REASONS[row.reason]
+
+
+def gain_in_words(gain: float | None) -> str:
+    """Return a gain as a share of the loss in percent; a dash where it was not computed."""
+    if gain is None:
+        return "–"
+    return percent(gain) if abs(gain) >= 1e-4 else "0 %"
+
+
+def selection_in_words(rows: Sequence[SelectionRow]) -> str:
+    """Return a sentence on which groups of terms were added; empty where none was asked."""
+    if not rows:
+        return ""
+    kept = [row.group for row in rows if row.kept]
+    if not kept:
+        return "The flights do not call for any term beyond Gazebo's motor model."
+    return f"Added to Gazebo's motor model: {listed(kept)}."
+
+
+PREDICTED: Mapping[str, str] = {
+    "position": "m",
+    "velocity": "m/s",
+    "attitude": "rad",
+    "body_rate": "rad/s",
+}
+"""What predictions are compared by, with its unit."""
+
+
+def starts_in_words(flights: Sequence[FlightResult]) -> tuple[str, ...]:
+    """Return sentences on where the simulations of some flights begin, and what is fitted there."""
+    sentences = []
+    whole = [flight for flight in flights if flight.horizon is None]
+    if whole:
+        sentences.append(
+            f"{_named(whole)}: flown whole in the closed loop from the recorded state at the "
+            f"mission's start{_clocks(whole)}."
+        )
+    for horizon in sorted({flight.horizon for flight in flights if flight.horizon is not None}):
+        cut = [flight for flight in flights if flight.horizon == horizon]
+        sentences.append(
+            f"{_named(cut)}: predicted open loop over {horizon:g} s at a time, from the recorded "
+            f"state each; no start, trim or offset is fitted to a flight."
+        )
+        met = [flight for flight in cut if flight.rmse_fitted_starts is not None]
+        if met:
+            values = "; ".join(f"{flight.name} {_axes(flight)}" for flight in met)
+            sentences.append(
+                f"With fitted starts, one start and trim to each {horizon:g} s, the RMSE would be: "
+                f"{values}."
+            )
+    return tuple(sentences)
+
+
+def _named(flights: Sequence[FlightResult]) -> str:
+    return listed([flight.name for flight in flights])
+
+
+def _clocks(flights: Sequence[FlightResult]) -> str:
+    assumed = [flight.name for flight in flights if flight.clock == "assumed"]
+    fitted = [flight.name for flight in flights if flight.clock == "fitted"]
+    parts = []
+    if fitted:
+        parts.append(f"the clock offset of {listed(fitted)} was fitted")
+    if assumed:
+        parts.append(f"the clock offset of {listed(assumed)} is taken to be zero")
+    return f" ({'; '.join(parts)})" if parts else ""
+
+
+def _axes(flight: FlightResult) -> str:
+    assert flight.rmse_fitted_starts is not None
+    values = {axis: getattr(flight.rmse_fitted_starts, axis) for axis in RMSE_UNITS}
+    known = {axis: value for axis, value in values.items() if value is not None}
+    named = [f"{axis} {value:.3g} {RMSE_UNITS[axis]}" for axis, value in known.items()]
+    return ", ".join(named) or "crashes"  # a flight whose attitude is followed lacks some, not all
