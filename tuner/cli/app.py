@@ -100,12 +100,15 @@ COMMANDS = {
         "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
     ),
 }
+OF_A_SERVER = ("submit", "jobs", "watch", "fetch", "cancel", "watch-folder")
+"""Commands in `tuner.cli.remote`; each of the others has a module of its name."""
 for _name, (_summary, *_examples) in COMMANDS.items():
     if _name == "serve":
         app.command("tuner.cli.serve:serve", name=_name, help=_summary)  # has commands of its own
         continue
+    _function = _name.replace("-", "_")
     app.command(
-        "tuner.cli.{0}:{0}".format(_name.replace("-", "_")),
+        f"tuner.cli.{'remote' if _name in OF_A_SERVER else _function}:{_function}",
         name=_name,
         help=_summary,
         help_epilogue="\n".join(f"Example: {example}" for example in _examples),

@@ -5,9 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter
-
-from tuner.cli.options import ControllerChoice, Flights, JobChoice, Many, Namespace, Quiet, Topics
+from tuner.cli.options import (
+    ControllerChoice,
+    Flights,
+    JobChoice,
+    Many,
+    Namespace,
+    Quiet,
+    Switch,
+    Topics,
+)
 
 
 def compare(
@@ -19,7 +26,7 @@ def compare(
     topics: Topics = None,
     namespace: Namespace = None,
     out: Annotated[list[Path] | None, Many] = None,
-    laps: Annotated[bool, Parameter(negative=())] = False,
+    laps: Switch = False,
     quiet: Quiet = False,
 ) -> None:
     """Simulate the recorded flights with several coefficient sets and tabulate the RMSE.

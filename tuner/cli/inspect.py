@@ -7,14 +7,14 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tuner.cli.options import Namespace, Topics
+from tuner.cli.options import Namespace, Switch, Topics
 
 
 def inspect(
     *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
     topics: Topics = None,
     namespace: Namespace = None,
-    json: Annotated[bool, Parameter(negative=())] = False,
+    json: Switch = False,
 ) -> None:
     """Report what recordings hold and what can be fitted to them, without simulating anything.
 

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import math
 from contextvars import ContextVar
-from typing import Annotated
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from tuner.config import Options
 
 #: The command line as the user typed it, for the record of a run.
 TYPED: ContextVar[str] = ContextVar("TYPED", default="")
 
 #: The option takes all words up to the next option.
 Many = Parameter(consume_multiple=True, negative=())
+#: The option takes no word.
+Switch = Annotated[bool, Parameter(negative=())]
 
 Flights = Annotated[
     list[str],
@@ -73,6 +79,47 @@ Cluster = Annotated[
     ),
 ]
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.", negative=())]
+Method = Annotated[
+    Literal["auto", "gradient", "cma", "hybrid"] | None,
+    Parameter(help="Search with this method. Default: the job file's, else auto."),
+]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """What is fitted to which flights, on this machine or on a server.
+
+    Attributes
+    ----------
+    holdout
+        Evaluate these flights without fitting them.
+    fit
+        Fit exactly these coefficients.
+    fix
+        Fit the usual coefficients except these.
+    seed
+        Start the random numbers from this seed. Default: the job file's, else 0.
+    """
+
+    flights: Flights
+    holdout: Annotated[list[str] | None, Many] = None
+    vehicle: VehicleChoice = None
+    controller: ControllerChoice = None
+    mass: Mass = None
+    config: JobChoice = None
+    topics: Topics = None
+    namespace: Namespace = None
+    fit: Annotated[list[str] | None, Many] = None
+    fix: Annotated[list[str] | None, Many] = None
+    method: Method = None
+    seed: int | None = None
+
+    def options(self, *, bench: str | None = None) -> Options:
+        """Return them as every inlet of the program takes them."""
+        from tuner.config import Options
+
+        return Options(**vars(self), bench=bench)
 
 
 def lengths(option: str, word: str) -> tuple[float, ...]:

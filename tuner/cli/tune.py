@@ -3,67 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
 
-from cyclopts import Parameter
-
-from tuner.cli.options import (
-    TYPED,
-    Cluster,
-    ControllerChoice,
-    Flights,
-    JobChoice,
-    Many,
-    Mass,
-    Namespace,
-    Quiet,
-    Topics,
-    VehicleChoice,
-    Workers,
-)
-
-Method = Annotated[
-    Literal["auto", "gradient", "cma", "hybrid"] | None,
-    Parameter(help="Search with this method. Default: the job file's, else auto."),
-]
+from tuner.cli.options import TYPED, Cluster, FitOptions, Quiet, Switch, Workers
 
 
 def tune(
     *,
-    flights: Flights,
-    holdout: Annotated[list[str] | None, Many] = None,
-    vehicle: VehicleChoice = None,
-    controller: ControllerChoice = None,
-    mass: Mass = None,
-    config: JobChoice = None,
-    topics: Topics = None,
-    namespace: Namespace = None,
-    fit: Annotated[list[str] | None, Many] = None,
-    fix: Annotated[list[str] | None, Many] = None,
-    method: Method = None,
+    fitted: FitOptions,
     bench: str | None = None,
     out: Path | None = None,
-    resume: Annotated[bool, Parameter(negative=())] = False,
-    force: Annotated[bool, Parameter(negative=())] = False,
-    cross_validate: Annotated[bool, Parameter(negative=())] = False,
+    resume: Switch = False,
+    force: Switch = False,
+    cross_validate: Switch = False,
     bootstrap: int | None = None,
-    seed: int | None = None,
     workers: Workers = None,
     cluster: Cluster = None,
-    dry_run: Annotated[bool, Parameter(negative=())] = False,
-    profile: Annotated[bool, Parameter(negative=())] = False,
+    dry_run: Switch = False,
+    profile: Switch = False,
     quiet: Quiet = False,
 ) -> None:
     """Fit the coefficients, validate them on held-out flights, and write the report.
 
     Parameters
     ----------
-    holdout
-        Evaluate these flights without fitting them.
-    fit
-        Fit exactly these coefficients.
-    fix
-        Fit the usual coefficients except these.
     bench
         Start from these ground measurements, a result folder of tune bench, and fit with them as
         prior; conflicts between ground and flights are named.
@@ -79,8 +41,6 @@ def tune(
     bootstrap
         Also fit so many times to flights drawn with replacement, and give the standard errors that
         follow.
-    seed
-        Start the random numbers from this seed. Default: the job file's, else 0.
     dry_run
         Print the job script that would bring the cluster file's workers, and do nothing.
     profile
@@ -102,25 +62,11 @@ def tune(
             from tuner.runtime import configure
 
             configure()
-            from tuner.config import Options, settle
+            from tuner.config import settle
             from tuner.job.inertial import fit_without_pose, without_pose
             from tuner.job.run import run
 
-        options = Options(
-            flights,
-            holdout=holdout,
-            vehicle=vehicle,
-            controller=controller,
-            mass=mass,
-            config=config,
-            topics=topics,
-            namespace=namespace,
-            fit=fit,
-            fix=fix,
-            method=method,
-            seed=seed,
-            bench=bench,
-        )
+        options = fitted.options(bench=bench)
         with span("reading"):
             bare = without_pose(settle(options))
         if bare:

@@ -1,0 +1,280 @@
+"""The commands that talk to a tuning service: jobs are submitted, listed, watched, fetched."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from tuner.cli.options import FitOptions, Quiet, Switch
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from tuner.client.client import Client
+    from tuner.job.listener import Listener
+
+Server = Annotated[
+    str | None,
+    Parameter(
+        help="Ask the server at this address. Default: $TUNE_SERVER, else http://127.0.0.1:8000."
+    ),
+]
+Token = Annotated[
+    str | None,
+    Parameter(
+        help="Show this token to the server. Default: $TUNE_TOKEN, which other users of this "
+        "machine cannot see."
+    ),
+]
+JobName = Annotated[str, Parameter(help="Take this job, by its id.")]
+
+
+@contextmanager
+def client_of(server: str | None, token: str | None) -> Iterator[Client]:
+    """Yield a client of the server that the options name.
+
+    Raises
+    ------
+    InputError
+        The address is none, or an extra is missing.
+    """
+    from tuner.client.client import Client
+    from tuner.client.connection import Connection
+
+    client = Client(Connection(server, token))
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:
+    """Pass what happens to a job on to a listener, as a run on this machine does."""
+    from tuner.search.iteration import Iteration
+
+    for kind, content in events:
+        if kind == "message":
+            listener.on_message(content["text"])
+        elif kind == "iteration":
+            left = content.pop("seconds_left", None)
+            listener.on_iteration(Iteration(**content), float("nan") if left is None else left)
+        elif kind == "folds":
+            listener.on_folds(_folds(content["folds"]))
+
+
+def _folds(rows: list[dict[str, Any]]) -> Any:
+    from tuner.job.cross_validation import Fold  # (jax)
+    from tuner.result import AxesRmse
+
+    return [
+        Fold(row["left_out"], {}, None if row["rmse"] is None else AxesRmse(**row["rmse"]))
+        for row in rows
+    ]
+
+
+def submit(
+    *,
+    fitted: FitOptions,
+    server: Server = None,
+    token: Token = None,
+    wait: Switch = False,
+    out: Path | None = None,
+    name: str = "",
+    force: Switch = False,
+    cross_validate: Switch = False,
+    bootstrap: int | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Send recordings to a server and have it fit them, as tune does on this machine.
+
+    Parameters
+    ----------
+    wait
+        Wait for the end, show what happens, and fetch the result, as tune does.
+    out
+        With --wait, fetch the result into this folder. Default: runs/ and the time.
+    name
+        Call the job so in lists.
+    force
+        Search even where the check before the search reports a failure.
+    cross_validate
+        Also fit without each flight in turn.
+    bootstrap
+        Also fit so many times to flights drawn with replacement.
+    """
+    from tuner.cli.progress import listening
+    from tuner.cli.results import print_run
+    from tuner.client.client import ended_well
+    from tuner.job.folder import folder_for
+
+    with client_of(server, token) as client:
+        folder = folder_for(out) if wait else None
+        job = client.submit(
+            fitted.options(),
+            name=name,
+            force=force,
+            cross_validate=cross_validate,
+            bootstrap=bootstrap,
+        )
+        if folder is None:
+            print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
+            return
+        try:
+            with listening(quiet=quiet) as listener:
+                show(client.follow(job), listener)
+        except KeyboardInterrupt:
+            if not quiet:
+                print(f"Job {job} goes on at the server: tune watch {job}, or tune cancel {job}.")
+            raise
+        ended_well(client.job(job))
+        run = client.fetch(job, folder)
+    if not quiet:
+        print_run(folder, run.result)
+
+
+def jobs(
+    *,
+    server: Server = None,
+    token: Token = None,
+    vehicle: str | None = None,
+    state: Literal["queued", "running", "done", "failed", "cancelled"] | None = None,
+    after: str | None = None,
+    json: Switch = False,
+) -> None:
+    """List the jobs of a server, the newest first, fifty at a time.
+
+    Parameters
+    ----------
+    vehicle
+        List those of this vehicle.
+    state
+        List those in this state.
+    after
+        List those that were submitted before this job.
+    json
+        Print JSON instead of a table.
+    """
+    from rich.table import Table
+
+    from tuner.cli.tables import console
+
+    with client_of(server, token) as client:
+        page = client.jobs(vehicle=vehicle, state=state, after=after)
+    if json:
+        from json import dumps
+
+        print(dumps(page, indent=2))
+        return
+    table = Table(box=None)
+    for column in ("job", "state", "vehicle", "name", "submitted", "RMSE mm", ""):
+        table.add_column(column, justify="right" if column == "RMSE mm" else "left")
+    for job in page["jobs"]:
+        rmse = "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}"
+        about = job["error"] or (job["stage"] if job["state"] == "running" else "") or ""
+        submitted = job["submitted"][:16].replace("T", " ")
+        words = (job["id"], job["state"], job["vehicle"], job["name"], submitted, rmse, about)
+        table.add_row(*(_plain(word) for word in words))
+    screen = console()
+    screen.print(table)
+    if page["next"]:
+        screen.print(f"more with --after {page['next']}")
+
+
+def _plain(word: str) -> str:
+    """Return a server's word so that the terminal takes nothing in it for markup or control."""
+    from rich.markup import escape
+
+    return escape("".join(c if c.isprintable() else "?" for c in word))
+
+
+def watch(
+    job: JobName, /, *, server: Server = None, token: Token = None, quiet: Quiet = False
+) -> None:
+    """Show what a job does until it ends, and end as tune would have ended.
+
+    Parameters
+    ----------
+    job
+        Its id.
+    """
+    from tuner.cli.progress import listening
+    from tuner.client.client import ended_well
+
+    with client_of(server, token) as client:
+        with listening(quiet=quiet) as listener:
+            show(client.follow(job), listener)
+        ended_well(client.job(job))
+    if not quiet:
+        print(f"Job {job} is done; its result comes with: tune fetch {job}")
+
+
+def fetch(
+    job: JobName,
+    /,
+    *,
+    server: Server = None,
+    token: Token = None,
+    out: Path | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Fetch the result folder of a job that is done, and print it as tune does.
+
+    Parameters
+    ----------
+    job
+        Its id.
+    out
+        Write into this folder. Default: runs/ and the time.
+    """
+    from tuner.cli.results import print_run
+
+    with client_of(server, token) as client:
+        run = client.fetch(job, out)
+    if not quiet:
+        print_run(run.folder, run.result)
+
+
+def cancel(job: JobName, /, *, server: Server = None, token: Token = None) -> None:
+    """Cancel a job; what its search has found so far is kept there, for a retry.
+
+    Parameters
+    ----------
+    job
+        Its id.
+    """
+    with client_of(server, token) as client:
+        client.cancel(job)
+    print(f"job {job}: cancelled")
+
+
+def watch_folder(
+    folder: Path,
+    /,
+    *,
+    server: Server = None,
+    token: Token = None,
+    settle: Annotated[
+        float, Parameter(help="Take a recording once it has not changed for s.")
+    ] = 10,
+    once: Switch = False,
+) -> None:
+    """Submit a job whenever new recordings in a folder have settled.
+
+    Recordings that arrive together become one job; a tune.yaml in the folder is its job file. What
+    was submitted is noted in the folder, so that nothing is submitted twice.
+
+    Parameters
+    ----------
+    folder
+        Watch this folder.
+    once
+        Submit what is new there, and end.
+    """
+    from tuner.client.folder import watch
+
+    with client_of(server, token) as client:
+        watch(client, folder, settle=settle, once=once, say=lambda text: print(text, flush=True))
