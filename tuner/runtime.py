@@ -18,21 +18,29 @@ What was measured with jaxlib 0.10 on two cores with AVX-512, on steps of some h
 - Two fifths of the time to trace went into Python's search for garbage: it is made rare.
 - Without the newer emitter of kernels a Jacobian compiles an eighth sooner, and runs as fast; but a
   gradient in reverse mode takes minutes to compile.
+- Compiling a program leaves hundreds of megabytes free that the C library keeps for itself. To give
+  them back takes some milliseconds, and the demo's fit, nothing compiled before, ends with 1.2 GiB
+  in memory rather than 1.8.
 
 Whatever the user has set in the environment stays.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import logging
 import os
 import sys
+from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""What `jax.monitoring` calls the end of compiling, or of reading compiled code from the cache."""
 AHEAD = "ahead"
 """How the names of threads begin that compile what a run may need later."""
 
@@ -44,6 +52,8 @@ _COLLECT_AFTER = (100_000, 20, 100)
 """New objects, and collections of younger ones, after which Python looks for garbage. A program
 that jax traces is hundreds of thousands of objects that stay, which Python's own 700 look through
 again and again."""
+_LONG = 0.5
+"""s of compiling after which memory is given back."""
 
 
 def cache_folder() -> Path:
@@ -110,6 +120,24 @@ def collect_rarely() -> None:
         gc.set_threshold(*_COLLECT_AFTER)
 
 
+def return_memory() -> None:
+    """Give memory that nobody uses back to the system, where the C library can: that of glibc."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+@cache
+def return_memory_after_compiling() -> None:
+    """Have every thread that has compiled a large program give back what that has left free."""
+    from jax import monitoring  # noqa: PLC0415 (takes most of a second)
+
+    def compiled(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == COMPILED and duration_secs > _LONG:
+            return_memory()
+
+    monitoring.register_event_duration_secs_listener(compiled)
+
+
 def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
     """Set jax up for simulation; call it once, before the first computation.
 
@@ -130,6 +158,7 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
     collect_rarely()
     import jax  # noqa: PLC0415 (must come after the environment, and is slow)
 
+    return_memory_after_compiling()
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", float64)
     if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]

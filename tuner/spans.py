@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
-from tuner.runtime import set_environment
+from tuner.runtime import COMPILED, set_environment
 
 TRACING = "tracing"
 LOWERING = "lowering"
@@ -21,7 +21,7 @@ LOADING = "loading compiled code"
 OF_JAX = {
     "/jax/core/compile/jaxpr_trace_duration": TRACING,
     "/jax/core/compile/jaxpr_to_mlir_module_duration": LOWERING,
-    "/jax/core/compile/backend_compile_duration": COMPILING,
+    COMPILED: COMPILING,
     "/jax/compilation_cache/cache_retrieval_time_sec": LOADING,
 }
 """Event of `jax.monitoring` -> what it is called here."""
