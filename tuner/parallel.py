@@ -16,7 +16,6 @@ from jaxtyping import PyTree
 from numpy.typing import NDArray
 
 from tuner.kept_programs import kept
-from tuner.padding import FINE, padded_size
 
 _AXIS = "batch"
 _ROW = 768
@@ -25,6 +24,8 @@ Measured for rollouts in both precisions and for Jacobians of a dozen columns: w
 both are slower, with half as much rollouts are."""
 _FEWEST = 8
 """Members that fill a vector register."""
+FINE = 16
+"""Steps of `padded_size` for what costs time in proportion."""
 
 
 def _last_axis(tree: PyTree[Array]) -> PyTree[PartitionSpec]:
@@ -197,3 +198,13 @@ def piece_that_fits(itemsize: int, columns: int = 1) -> int:
     """
     segments = max(_FEWEST, _ROW // (itemsize * columns))
     return 1 << (segments.bit_length() - 1)
+
+
+def padded_size(count: int, steps: int = 4) -> int:
+    """Return a size that is no smaller, of which there are ``steps`` between two powers of two.
+
+    Compiled code belongs to the shapes it was compiled for. Sizes up to twice ``steps`` stay as
+    they are; others grow by less than one part in ``steps``.
+    """
+    grain = max(1, (1 << (count - 1).bit_length()) // (2 * steps)) if count > 0 else 1
+    return -(-count // grain) * grain

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tuner.padding import FINE, padded_size
+from tuner.parallel import FINE, padded_size
 
 
 @given(st.integers(1, 10**7), st.sampled_from([4, FINE]))

@@ -12,7 +12,7 @@ import numpy as np
 
 from tuner.bench.bifilar import bifilar
 from tuner.bench.columns import open_table, read_columns
-from tuner.bench.flown import attitude_of, is_table, steady_flight
+from tuner.bench.flown import angle_of_attitude, attitude_of, is_table, steady_flight
 from tuner.bench.hovers import hover_weights, yaw_spin
 from tuner.bench.laws import GRAVITY
 from tuner.bench.measurement import Array, Measurement
@@ -33,7 +33,6 @@ from tuner.bench.propeller import propeller, read_static_table
 from tuner.bench.rpm_curve import rpm_curve
 from tuner.bench.stands import thrust_stand, torque_stand
 from tuner.bench.step_response import step_response
-from tuner.bench.tilt import angle_of_attitude
 from tuner.config import VehicleFile
 from tuner.errors import ConfigError, RecordingError
 

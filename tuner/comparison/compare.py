@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tuner.comparison.comparison import Comparison
-from tuner.comparison.table import Table
+from tuner.comparison.table import Table, check_table_file, write_table
 from tuner.comparison.tabulate import table_of
-from tuner.comparison.write import check_table_file, write_table
 from tuner.config import Options, Settings, VehicleFile, find_config, read_vehicle, settle
 from tuner.errors import InputError
 from tuner.recordings import read_recordings

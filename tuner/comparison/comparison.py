@@ -54,7 +54,7 @@ from tuner.objective.segments import (
 )
 from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 from tuner.recordings import Recording
 from tuner.search.continuation import FAR
 from tuner.simulation.forces import Forces, acting, in_order

@@ -24,7 +24,7 @@ from tuner.design.candidates import Candidate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 from tuner.simulation.trajectory import Published, published
 
 Array = NDArray[np.float64]

@@ -11,9 +11,12 @@ import contextlib
 import logging
 import os
 import pickle
+import signal
+import threading
 import uuid
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cloudpickle
@@ -23,7 +26,6 @@ from distributed.comm import CommClosedError
 from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import Engine, Report, Task
-from tuner.engine.interrupts import interrupts_kept_from_children
 from tuner.engine.store import Store
 from tuner.engine.worker import SetUp, Shared, run_task, stop_name
 from tuner.errors import EngineError
@@ -158,3 +160,31 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
             )
         at_once = file.workers if file.address is None else max(1, len(client.nthreads()))
         yield OnDask(client, at_once, store, devices)
+
+
+@contextlib.contextmanager
+def interrupts_kept_from_children() -> Iterator[None]:
+    """Start processes, and threads that will, which Ctrl-C does not reach; hear it afterwards.
+
+    Children inherit that a signal is blocked, but not what a handler of their parent's does. Does
+    nothing where the caller is not the main thread, whose signals these are, or signals cannot be
+    blocked.
+    """
+    handler = signal.getsignal(signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()
+    if not is_main or handler is None or not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    pressed = threading.Event()
+    # which would unblock the signal in the thread that spawns first, and so starts it
+    resource_tracker.ensure_running()
+    # some other thread, of a library, may hear what is blocked in this one
+    signal.signal(signal.SIGINT, lambda *_: pressed.set())
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.signal(signal.SIGINT, handler)
+    if pressed.is_set():
+        signal.raise_signal(signal.SIGINT)

@@ -9,9 +9,8 @@ from pathlib import Path
 from tuner.disk import check_file
 from tuner.errors import ExportError
 from tuner.exporters.draft import write
-from tuner.exporters.effective import in_simulator
 from tuner.exporters.gates import Gate, Refly, check
-from tuner.exporters.provenance import exported_vehicle, provenance
+from tuner.exporters.provenance import exported_vehicle, in_simulator, provenance
 from tuner.exporters.target import (
     Choices,
     Simulator,

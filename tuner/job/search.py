@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.coefficients.space import Parameter
 from tuner.findings import Code, Finding
 from tuner.job.checkpoint import fingerprint, load, save
 from tuner.job.findings import findings_at, unmatched
 from tuner.job.prepare import Job
-from tuner.job.starts import starting_vectors
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
@@ -38,6 +38,8 @@ FAR_OFF = 3.0
 """Multiple of the noise beyond which a flight is not met well enough to be polished at once."""
 AGREE = 0.01
 """Starts whose losses differ by less than this share have reached the same minimum."""
+INSIDE = 0.02
+"""Share of its range by which a start keeps away from a bound."""
 
 OnProgress = Callable[[Job, Progress], None]
 
@@ -269,3 +271,24 @@ def _loss_at(objective: Objective, point: Point, criterion: Criterion) -> float:
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:
     """Return the best coefficients so far."""
     return job.space.numbers(progress.best_point.coefficients)
+
+
+def starting_vectors(job: Job) -> NDArray[np.float64]:
+    """Return S start vectors (S, K): the vehicle file's, then random ones around it.
+
+    A logarithmic coefficient is drawn between the vehicle file's value divided by the job's
+    ``spread`` and that value times it, evenly in the logarithm; a linear one evenly within its
+    usual uncertainty on either side.
+    """
+    settings, space = job.settings.job.search, job.space
+    generator = np.random.default_rng(settings.seed)
+    first = space.initial
+    centre, width = space.share(first), space.width
+    reach = np.array([_reach(p, settings.spread) for p in space.parameters]) / width
+    drawn = generator.uniform(-1.0, 1.0, (settings.starts - 1, len(space)))
+    shares = np.clip(centre + drawn * reach, INSIDE, 1.0 - INSIDE)
+    return np.stack([first, *(space.at_share(share) for share in shares)])
+
+
+def _reach(parameter: Parameter, spread: float) -> float:
+    return float(np.log(spread)) if parameter.scale == "log" else parameter.prior_sd

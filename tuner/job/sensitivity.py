@@ -21,8 +21,7 @@ from tuner.job.unfitted import unfitted
 from tuner.objective.alternatives import alternatives_of
 from tuner.recordings import read_recordings
 from tuner.report import render
-from tuner.report.record import About, Recording
-from tuner.report.traces import write_traces
+from tuner.report.record import About, Recording, write_traces
 from tuner.search.fitted import Fitted
 from tuner.sensitivity_analysis.global_indices import global_sensitivity
 from tuner.sensitivity_analysis.global_sensitivity_json import Method

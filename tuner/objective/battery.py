@@ -16,7 +16,7 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
 from tuner.objective.voltage import VOLTAGE, voltages_of
 from tuner.objective.windows import Window
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 
 
 def with_reference_voltage(vehicle: VehicleFile, flights: Sequence[Flight]) -> VehicleFile:

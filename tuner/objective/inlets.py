@@ -38,7 +38,7 @@ from tuner.objective.recorded_inputs import (
     with_body_rate,
     zeroed,
 )
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 
 OF_MOTORS = (
     "actuator_latency",

@@ -28,8 +28,7 @@ from tuner.objective.criterion import (
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulator import MEMORY, Simulator
 from tuner.objective.tunable import Tunable, tunable_of
-from tuner.padding import padded_size
-from tuner.parallel import in_pieces, over_devices
+from tuner.parallel import in_pieces, over_devices, padded_size
 
 
 class Objective(eqx.Module):

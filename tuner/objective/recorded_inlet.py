@@ -16,7 +16,7 @@ from tuner.config.job import InletName
 from tuner.flights.flight import Flight
 from tuner.flights.resample import without_gaps
 from tuner.objective.recorded_inputs import linear_interpolation, sparse, zero_order_hold
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 
 
 class RecordedInlet(ABC):

@@ -26,7 +26,7 @@ from tuner.objective.inlets import INLETS, inlet_of
 from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = tuple(name for name, row in recording_offsets().items() if row.unit == "s")

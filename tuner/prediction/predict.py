@@ -28,7 +28,7 @@ from tuner.objective.inlets import INLETS
 from tuner.objective.markers import markers_of
 from tuner.objective.residuals import simulate_segments
 from tuner.objective.segments import Segments, window_segments
-from tuner.padding import padded_size
+from tuner.parallel import padded_size
 
 UNITS: Mapping[str, str] = {
     "position": "m",

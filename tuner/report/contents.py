@@ -13,8 +13,7 @@ from tuner.disk import exists
 from tuner.errors import InputError
 from tuner.examination.sensitivity_json import Knowledge
 from tuner.flights.flight import Array
-from tuner.report.record import About, Recording, SearchRecord
-from tuner.report.traces import read_traces
+from tuner.report.record import About, Recording, SearchRecord, read_traces
 from tuner.result import Run, RunResult, read_run
 from tuner.sensitivity_analysis.global_sensitivity_json import GlobalSensitivity
 from tuner.uncertainty.profiles_json import Profiles
@@ -43,7 +42,7 @@ class Contents:
     search, laps
         How the fit went, and how closely laps are met.
     traces
-        Flight -> name -> array, see `tuner.report.traces`.
+        Flight -> name -> array, see `tuner.report.record`.
     """
 
     folder: Path

@@ -15,10 +15,9 @@ from markupsafe import Markup
 from tuner.disk import write_text
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
-from tuner.report.paper import plot_file, write_plots
+from tuner.report.paper import data_uri, plot_file, write_plots
 from tuner.report.section import Section
 from tuner.report.sections import sections_of
-from tuner.report.static import data_uri
 from tuner.report.summary import summary
 from tuner.spans import span
 

@@ -1,18 +1,30 @@
-"""How a search went and what an examination was made of, as files that the page reads."""
+"""Search, flights and what an examination was made of, as files that the page reads."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from tuner.files import FiniteOrNone, Part, ResultFile
+from tuner.disk import whole_file
+from tuner.files import FiniteOrNone, Part, ResultFile, read_arrays
 from tuner.findings import Finding
 from tuner.search.iteration import Iteration
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # a page is drawn without jax
+    from tuner.comparison.errors import FlightErrors
     from tuner.search.fitted import Fitted
+
+Array = NDArray[np.float64]
+TRACES_FILE = "traces.npz"
+POINTS = 1200
+"""Points of a curve: as many as a wide screen has pixels."""
+FORCE_POINTS = 400
+"""Points of a force's curve, of which a flight has dozens."""
 
 
 class Start(Part):
@@ -70,3 +82,45 @@ def write_search(folder: Path, fitted: Fitted) -> None:
             for outcome in fitted.outcomes
         ],
     ).write(folder)
+
+
+def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErrors]]) -> None:
+    """Write ``traces.npz`` of simulation -> flight -> errors, thinned to what a screen can show.
+
+    Per flight: times in s, positions in m, roll, pitch and yaw in degrees; first what was
+    recorded, then, with its name behind, what each simulation had. Of the last simulation also
+    ``acting_time`` and, as ``acting_TERM``, the (n, 6) force and moment of each term.
+    """
+    arrays: dict[str, Array] = {}
+    last: Mapping[str, FlightErrors] = {}
+    for suffix, flights in simulations.items():
+        last = flights
+        for flight, errors in flights.items():
+            for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
+                arrays[f"{flight}/{signal}_time"] = _thinned(of_signal.time)
+                arrays[f"{flight}/{signal}"] = _thinned(of_signal.recorded)
+                arrays[f"{flight}/{signal}_{suffix}"] = _thinned(of_signal.simulated)
+    for flight, errors in last.items():
+        if errors.forces is not None:
+            arrays[f"{flight}/acting_time"] = _thinned(errors.forces.time, FORCE_POINTS)
+            for term, acted in errors.forces.of_term.items():
+                arrays[f"{flight}/acting_{term}"] = _thinned(acted, FORCE_POINTS)
+    with whole_file(folder / TRACES_FILE) as unfinished, unfinished.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
+    """Return flight -> name -> array of what `write_traces` wrote; empty if there is none."""
+    path = folder / TRACES_FILE
+    if not path.exists():
+        return {}
+    traces: dict[str, dict[str, Array]] = {}
+    for key, values in read_arrays(path, remedy="run tune again").items():
+        flight, _, name = key.rpartition("/")
+        traces.setdefault(flight, {})[name] = values
+    return traces
+
+
+def _thinned(values: Array, points: int = POINTS) -> Array:
+    step = max(1, int(np.ceil(len(values) / points)))
+    return values[::step]

@@ -8,6 +8,7 @@ origin is checked).
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from urllib.parse import urlsplit
 
@@ -25,13 +26,13 @@ from tuner.service.errors import (
     TooManyError,
 )
 from tuner.service.metrics import Metrics
-from tuner.service.rates import RateLimit
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 
 COOKIE = "tune_token"
 OPEN_TO_ALL = ("/healthz", "/login", "/static/")
 UPLOADS = ("/api/v1/recordings", "/recordings")
+MOST_VISITORS = 10_000
 #: Pages run the service's own script and style, and load nothing from elsewhere.
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -153,3 +154,31 @@ def _add_headers(headers: MutableHeaders) -> None:
     headers.setdefault("referrer-policy", "same-origin")  # without one, forms have no origin
     headers.setdefault("cache-control", "no-store")
     headers.setdefault("cross-origin-resource-policy", "same-origin")
+
+
+class RateLimit:
+    """A bucket for each visitor.
+
+    Parameters
+    ----------
+    per_second
+        At which a bucket refills.
+    burst
+        That it holds.
+    """
+
+    def __init__(self, per_second: float, burst: float) -> None:
+        self._per_second = per_second
+        self._burst = burst
+        self._buckets: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def allows(self, visitor: str, now: float | None = None) -> bool:
+        """Take one request out of a visitor's bucket, if there is one in it."""
+        now = time.monotonic() if now is None else now
+        left, seen = self._buckets.pop(visitor, (self._burst, now))
+        left = min(self._burst, left + (now - seen) * self._per_second)
+        allowed = left >= 1.0
+        self._buckets[visitor] = (left - float(allowed), now)
+        while len(self._buckets) > MOST_VISITORS:
+            self._buckets.popitem(last=False)
+        return allowed

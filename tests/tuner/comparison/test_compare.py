@@ -10,8 +10,8 @@ from tests.tuner.comparison.test_errors import errors
 from tuner.cli import main
 from tuner.comparison.compare import compare
 from tuner.comparison.comparison import Comparison
+from tuner.comparison.table import write_table
 from tuner.comparison.tabulate import table_of
-from tuner.comparison.write import write_table
 from tuner.config import ControllerFile, Options, configs_folder
 from tuner.errors import ConfigError, InputError
 from tuner.recordings import Recording

@@ -11,7 +11,7 @@ from tuner.errors import ConfigError
 from tuner.job.bootstrap import check_bootstrap
 from tuner.job.cross_validation import Fold, jackknife_errors
 from tuner.job.refits import _counted
-from tuner.report.sections.refits import refits
+from tuner.report.sections.tables import refits
 from tuner.wording.result import refits_in_words
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")

@@ -13,7 +13,7 @@ from tuner.config.job import Search
 from tuner.findings import Code
 from tuner.job import search as module
 from tuner.job.findings import end_findings, finer_than_steps, unmatched
-from tuner.job.starts import starting_vectors
+from tuner.job.search import starting_vectors
 from tuner.search.fitted import Outcome
 from tuner.search.stages import left, plan
 

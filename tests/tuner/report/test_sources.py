@@ -1,6 +1,6 @@
 from types import SimpleNamespace
 
-from tuner.report.sections.sources import sources
+from tuner.report.sections.tables import sources
 from tuner.uncertainty.sources import Sources
 
 

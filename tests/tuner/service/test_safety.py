@@ -14,8 +14,7 @@ from tests.tuner.service.conftest import LIMITS, ended, listening, submit, uploa
 from tuner.errors import InputError
 from tuner.service import tokens
 from tuner.service.naming import file_name
-from tuner.service.rates import RateLimit
-from tuner.service.safety import COOKIE
+from tuner.service.safety import COOKIE, RateLimit
 from tuner.service.serve import is_loopback, serve
 from tuner.service.service import Service
 from tuner.service.web import pages

@@ -12,23 +12,18 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
-from tuner.report.sections.effective import effective
 from tuner.report.sections.effects import effects
 from tuner.report.sections.errors import errors
-from tuner.report.sections.findings import findings
 from tuner.report.sections.flights import flights
 from tuner.report.sections.forces import forces
 from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
-from tuner.report.sections.next_log import next_log
 from tuner.report.sections.profiles import profiles
-from tuner.report.sections.provenance import provenance
-from tuner.report.sections.refits import refits
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 from tuner.report.sections.selection import selection
-from tuner.report.sections.sources import sources
+from tuner.report.sections.tables import effective, findings, next_log, provenance, refits, sources
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
     findings,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -14,7 +15,7 @@ from pydantic import ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 
-from tuner.errors import InputError
+from tuner.errors import ConfigError, InputError
 from tuner.result import RMSE_UNITS
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
@@ -30,8 +31,8 @@ from tuner.service.tables import JobRow, RecordingRow
 from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render
-from tuner.service.web.uploaded import typed_settings
 from tuner.validation import config_error
+from tuner.yaml_files.document import read_yaml
 from tuner.yaml_files.shipped import configs_folder
 
 web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -314,3 +315,25 @@ async def login(request: Request) -> Response:
         max_age=30 * 86400,
     )
     return answer
+
+
+def typed_settings(text: str) -> dict[str, Any]:
+    """Return the keys of a job file that was typed.
+
+    Raises
+    ------
+    ConfigError
+        It is no YAML, or no mapping of keys to values.
+    """
+    if not text.strip():
+        return {}
+    with tempfile.TemporaryDirectory(prefix="tune-settings-") as folder:
+        file = Path(folder) / "tune.yaml"
+        file.write_text(text, encoding="utf-8", errors="replace")
+        try:
+            data = read_yaml(file).data
+        except ConfigError as error:
+            raise ConfigError("settings", error.what, error.remedy) from None
+    if not isinstance(data, dict):
+        raise ConfigError("settings", "are no keys with values", "write them as in tune.yaml")
+    return data
