@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 from tuner.config import ControllerFile, Options, VehicleFile
 from tuner.config.job import Method
 from tuner.engine import engine_for
-from tuner.flights.flight import Array
 from tuner.flights.load import load_flight
 from tuner.result import Run, read_run
 from tuner.runtime import configure
-from tuner.trajectory_settings import TrajectoryName
+from tuner.vehicle_api import Named, export, simulate, text_of
 
 if TYPE_CHECKING:
-    from sim_jax.precision import Precision
     from tuner.client.client import Client
     from tuner.comparison.table import Table
-    from tuner.exporters.export import Exported
-    from tuner.exporters.target import Simulator
     from tuner.job.sensitivity import SensitivityResult
-    from tuner.simulation.simulate import Simulation
-
-Named = str | Path
-T = TypeVar("T")
 
 __all__ = [
     "compare",
@@ -116,7 +107,7 @@ def fit(
     configure()
     from tuner.job.run import run  # noqa: PLC0415 (jax)
 
-    options = _options(
+    options = Options.of(
         flights,
         holdout=holdout,
         vehicle=vehicle,
@@ -129,7 +120,7 @@ def fit(
         seed=seed,
         topics=topics,
         namespace=namespace,
-        bench=None if bench is None else str(bench),
+        bench=bench,
     )
     with engine_for(workers, cluster):
         folder, _ = run(
@@ -180,15 +171,11 @@ def compare(
     configure()
     from tuner.comparison.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
-    options = _options(
-        flights,
-        controller=controller,
-        config=config,
-        topics=topics,
-        namespace=namespace,
+    options = Options.of(
+        flights, controller=controller, config=config, topics=topics, namespace=namespace
     )
     labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
-    sets: dict[str, str | VehicleFile] = {k: _text(v) for k, v in labelled.items()}
+    sets: dict[str, str | VehicleFile] = {k: text_of(v) for k, v in labelled.items()}
     table, _ = compare_vehicles(options, sets, [Path(path) for path in out])
     return table
 
@@ -255,7 +242,7 @@ def sensitivity(
     from tuner.job.folder import folder_for  # noqa: PLC0415
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
-    options = _options(
+    options = Options.of(
         flights,
         vehicle=vehicle,
         controller=controller,
@@ -281,139 +268,6 @@ def sensitivity(
         )
 
 
-def simulate(
-    trajectory: TrajectoryName,
-    *,
-    vehicle: Named | VehicleFile = "hovergames",
-    controller: Named | ControllerFile = "hovergames",
-    radius: float = 2.0,
-    omega: float = 0.7,
-    speed_scale: float = 2.1,
-    speed: float | None = None,
-    yaw_rate: float = 2.0,
-    duration: float = 40.0,
-    rate: float = 100.0,
-    grid: Mapping[str, Array] | None = None,
-    precision: Precision = "float64",
-    forces: bool = False,
-    workers: int | None = None,
-    cluster: str | None = None,
-) -> tuple[Simulation, ...]:
-    """Simulate a trajectory, as ``tune simulate`` does.
-
-    Parameters
-    ----------
-    trajectory
-        Which shape, flown from rest.
-    vehicle, controller
-        What flies: the thing itself, its file, or the name of a shipped one.
-    radius, omega
-        m and rad/s.
-    speed_scale
-        The publisher's velocity scaler.
-    speed
-        m/s at which the reference peaks; instead of ``speed_scale``.
-    yaw_rate
-        rad/s, of the yaw spin.
-    duration
-        s.
-    rate
-        Hz of the result.
-    grid
-        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.sweep.grid_of`
-        makes every combination of several ranges.
-    precision
-        What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
-    forces
-        Whether each simulation has ``forces``: what acted along the flight, term by term.
-    workers, cluster
-        As of `fit`.
-
-    Returns
-    -------
-    tuple
-        One simulation, or B of them; `tuner.simulation.write.write_flights` writes them.
-
-    Raises
-    ------
-    InputError
-        Something cannot be flown.
-    """
-    configure()
-    from tuner.simulation.plan import fly  # noqa: PLC0415 (jax)
-
-    shape = {
-        "name": trajectory,
-        "radius": radius,
-        "omega": omega,
-        "speed_scale": speed_scale,
-        "yaw_rate": yaw_rate,
-    }
-    with engine_for(workers, cluster):
-        return tuple(
-            fly(
-                _text(vehicle),
-                _text(controller),
-                shape,
-                speed=speed,
-                duration=duration,
-                rate=rate,
-                grid=grid,
-                precision=precision,
-                forces=forces,
-            )
-        )
-
-
-def export(
-    run: Run | Named,
-    format: str,  # noqa: A002 (the option's name)
-    *,
-    into: Named | None = None,
-    out: Named | None = None,
-    simulator: Simulator = "gazebo-classic",
-    accept: str = "",
-) -> Exported:
-    """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
-
-    Parameters
-    ----------
-    run
-        A run, or its result folder.
-    format
-        The name of a target, as ``yaml``, ``sdf`` or ``px4``.
-    into
-        With ``sdf``, the model to put them into; None gives the tags alone.
-    out
-        Where to write; None is the model itself, or ``export/`` in the result folder.
-    simulator
-        Whose plugins tags without a model are for.
-    accept
-        A reason to export in spite of conditions that are not met.
-
-    Raises
-    ------
-    ExportError
-        A condition is not met, or the file would not read back.
-    OutputError
-        The file cannot be written.
-    """
-    configure()
-    from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
-    from tuner.exporters.refly import refly  # noqa: PLC0415
-
-    return export_run(
-        run if isinstance(run, Run) else read_run(run),
-        format,
-        refly=refly,
-        today=date.today(),  # the user's own day
-        into=None if into is None else Path(into),
-        out=None if out is None else Path(out),
-        simulator=simulator,
-        accept=accept,
-    )
-
-
 def connect(url: str | None = None, *, token: str | None = None) -> Client:
     """Return a tuning service, whose ``fit`` is `fit` on its machine.
 
@@ -433,13 +287,3 @@ def connect(url: str | None = None, *, token: str | None = None) -> Client:
     from tuner.client.connection import Connection  # noqa: PLC0415
 
     return Client(Connection(url, token))
-
-
-def _options(flights: Sequence[Named], **given: Any) -> Options:
-    settings: dict[str, Any] = {name: _text(value) for name, value in given.items()}
-    return Options([str(path) for path in flights], **settings)
-
-
-def _text(named: Path | T) -> str | T:
-    """Return a path as text, and anything else as it is."""
-    return str(named) if isinstance(named, Path) else named

@@ -1,6 +1,8 @@
 import inspect
 import subprocess
 import sys
+from dataclasses import is_dataclass
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -25,18 +27,29 @@ PEERS = {
 }
 
 
+def options_of(command):
+    """Return a command's options, those of a class of options one by one."""
+    options = {}
+    for name, parameter in inspect.signature(command).parameters.items():
+        shared = get_type_hints(command)[name]
+        options |= (
+            inspect.signature(shared).parameters if is_dataclass(shared) else {name: parameter}
+        )
+    return options
+
+
 @pytest.mark.parametrize("function", PEERS, ids=lambda function: function.__name__)
 def test_functions_take_what_their_commands_take(function):
     command, renamed, alone = PEERS[function]
     ours = {renamed.get(name, name) for name in inspect.signature(function).parameters}
-    theirs = set(inspect.signature(command).parameters) - alone
+    theirs = set(options_of(command)) - alone
     assert ours == theirs
 
 
 @pytest.mark.parametrize("function", PEERS, ids=lambda function: function.__name__)
 def test_defaults_are_those_of_the_commands(function):
     command, renamed, _ = PEERS[function]
-    theirs = inspect.signature(command).parameters
+    theirs = options_of(command)
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.default is not inspect.Parameter.empty and parameter.default != ():
             default = theirs[renamed.get(name, name)].default

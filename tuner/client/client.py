@@ -85,18 +85,18 @@ class Client:
         ServerFaultError
             The server could not finish the job.
         """
-        options = Options(
-            [str(path) for path in flights],
+        options = Options.of(
+            flights,
             holdout=holdout,
-            vehicle=str(vehicle) if isinstance(vehicle, Path) else vehicle,
-            controller=str(controller) if isinstance(controller, Path) else controller,
+            vehicle=vehicle,
+            controller=controller,
             mass=mass,
-            config=None if config is None else str(config),
+            config=config,
             fit=free,
             fix=fixed,
             method=method,
             seed=seed,
-            topics=None if topics is None else str(topics),
+            topics=topics,
             namespace=namespace,
         )
         folder = folder_for(None if out is None else Path(out))

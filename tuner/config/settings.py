@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pydantic import ValidationError
 
@@ -66,6 +66,14 @@ class Options:
     topics: str | None = None
     namespace: str | None = None
     bench: str | None = None
+
+    @classmethod
+    def of(cls, flights: Sequence[str | Path], **given: Any) -> Options:
+        """Return options as a caller from Python gives them: paths may stand for text."""
+        words: dict[str, Any] = {
+            name: str(value) if isinstance(value, Path) else value for name, value in given.items()
+        }
+        return cls([str(path) for path in flights], **words)
 
 
 @dataclass(frozen=True)

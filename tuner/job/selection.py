@@ -130,8 +130,9 @@ class Selection:
         """
         scores = {
             group: found
-            for group, found in self._scores_outside(state).items()
-            if group not in dropped and found.reason in WORTH_FITTING
+            for group in self.candidates
+            if group not in state.added and group not in dropped
+            if (found := self._score(state, group)).reason in WORTH_FITTING
         }
         return scores if any(found.earns_place for found in scores.values()) else {}
 
@@ -325,33 +326,23 @@ class Selection:
         ]
         return np.array([self._space.index(name) for name in wanted], np.intp)
 
-    def _scores_outside(self, state: Standing) -> dict[str, Score]:
-        """Return what each group that is not in the model is worth beside it."""
-        model = self._columns([*self.job.space.names, *_names(state.added)])
-        return {
-            group: score(state.linear, model, self._columns(names), candidates=len(self.candidates))
-            for group, names in self.candidates.items()
-            if group not in state.added
-        }
-
-    def _scores_inside(self, state: Standing) -> dict[str, Score]:
-        """Return what each group in the model is worth beside the others in it."""
-        scores = {}
-        for group, names in state.added.items():
-            others = _names({g: n for g, n in state.added.items() if g != group})
-            scores[group] = score(
-                state.linear,
-                self._columns([*self.job.space.names, *others]),
-                self._columns(names),
-                candidates=len(self.candidates),
-                neutral=self._neutral,
-            )
-        return scores
+    def _score(self, state: Standing, group: str) -> Score:
+        """Return what a group is worth beside the others in the model."""
+        others = {name: names for name, names in state.added.items() if name != group}
+        return score(
+            state.linear,
+            self._columns([*self.job.space.names, *_names(others)]),
+            self._columns(self.candidates[group]),
+            candidates=len(self.candidates),
+            neutral=self._neutral if group in state.added else None,
+        )
 
     def _rows(
         self, state: Standing, dropped: Mapping[str, SelectionCode]
     ) -> tuple[SelectionRow, ...]:
         """Return the table: what is in the model first, by what it predicts."""
+        groups = dict.fromkeys([*state.added, *self.candidates])
+        scores = {group: self._score(state, group) for group in groups}
         rows = [
             SelectionRow(
                 group=group,
@@ -362,10 +353,7 @@ class Selection:
                 kept=group in state.added,
                 reason=found.reason if group in state.added else dropped.get(group, found.reason),
             )
-            for group, found in {
-                **self._scores_inside(state),
-                **self._scores_outside(state),
-            }.items()
+            for group, found in scores.items()
         ]
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
 
