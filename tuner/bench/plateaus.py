@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.ndimage import median_filter
 
 from tuner.bench.measurement import Array
@@ -18,6 +19,8 @@ FEWEST = 8
 """Samples without which a step has no mean."""
 ROBUST = 1.4826
 """Standard deviations of a normal distribution in a median absolute deviation."""
+NORMAL = 1.959964
+"""Standard deviations of a normal distribution that a 95 % interval reaches to either side."""
 
 
 @dataclass(frozen=True)
@@ -103,3 +106,8 @@ def mean_and_error(values: Array) -> tuple[float, float]:
         return float(values.mean()), plain
     means = np.array([block.mean() for block in np.array_split(values, blocks)])
     return float(values.mean()), max(plain, float(means.std(ddof=1)) / np.sqrt(blocks))
+
+
+def student(freedom: int) -> float:
+    """Return by what factor few degrees of freedom widen an interval (Student's t)."""
+    return float(stats.t.ppf(0.975, max(freedom, 1))) / NORMAL

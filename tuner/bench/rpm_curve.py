@@ -6,11 +6,10 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import stats
 from scipy.optimize import least_squares
 
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
-from tuner.bench.plateaus import levels_of, mean_and_error, without_outliers
+from tuner.bench.plateaus import levels_of, mean_and_error, student, without_outliers
 from tuner.errors import RecordingError
 
 SHORTEST = 0.8
@@ -21,7 +20,6 @@ VOLTAGE_RANGE = 1.015
 """Ratio of the highest to the lowest voltage without which its exponent is not asked for."""
 BENT = 3.0
 """Standard errors from which a quadratic term is believed."""
-NORMAL = 1.959964
 TRUSTED = 4
 """Degrees of freedom from which the residuals' own scatter is the only measure of error."""
 
@@ -126,8 +124,7 @@ def _fit(
     scale = 2 * solution.cost / freedom
     if freedom < TRUSTED:
         scale = max(scale, 1.0)
-    student = float(stats.t.ppf(0.975, freedom)) / NORMAL
-    small = np.linalg.pinv(solution.jac.T @ solution.jac) * scale * student**2
+    small = np.linalg.pinv(solution.jac.T @ solution.jac) * scale * student(freedom) ** 2
     values, covariance = np.zeros(4), np.zeros((4, 4))
     values[places] = solution.x
     covariance[np.ix_(places, places)] = small

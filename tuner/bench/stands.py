@@ -8,10 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
-from tuner.bench.plateaus import levels_of, mean_and_error, without_outliers
+from tuner.bench.plateaus import levels_of, mean_and_error, student, without_outliers
 from tuner.errors import RecordingError
 
 SHORTEST = 1.0
@@ -22,7 +21,6 @@ FEWEST = 4
 """Levels without which slope, offset and drift cannot be told apart."""
 SPREAD = 1.3
 """Ratio of the fastest to the slowest level without which an offset looks like another slope."""
-NORMAL = 1.959964
 TRUSTED = 4
 """Degrees of freedom from which the residuals' own scatter is the only measure of error."""
 
@@ -171,8 +169,7 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     scale = float(residual @ (weight * residual)) / max(freedom, 1)
     if freedom < TRUSTED:
         scale = max(scale, 1.0)
-    student = float(stats.t.ppf(0.975, max(freedom, 1))) / NORMAL
-    return solution, inverse * scale * student**2
+    return solution, inverse * scale * student(freedom) ** 2
 
 
 def _curvature(design: Array, measured: Array, levels: list[_Level]) -> tuple[float, float]:

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
-from tuner.bench.plateaus import OUTLIER, ROBUST
+from tuner.bench.plateaus import OUTLIER, ROBUST, student
 from tuner.errors import RecordingError
 
 STEP = 0.02
@@ -24,7 +23,6 @@ SETTLED = 3.0
 """Time constants that a step must last for its level to be known."""
 NOT_FIRST_ORDER = 0.1
 """Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
-NORMAL = 1.959964
 GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """Time constants, s, from the best of which the fit begins."""
 MOST_STEPS = 200
@@ -236,9 +234,8 @@ def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_
     ])  # fmt: skip
     clusters = len(scores)
     sandwich = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 1, 1)
-    student = float(stats.t.ppf(0.975, max(clusters - 1, 1))) / NORMAL
     # few steps make the sandwich erratic: chance alone is taken off before it may widen
     chance = 1.0 + math.sqrt(2.0 / max(clusters - 1, 1))
-    ratio = np.diag(sandwich) * student**2 / np.diag(white) / chance
+    ratio = np.diag(sandwich) * student(clusters - 1) ** 2 / np.diag(white) / chance
     grown = np.sqrt(np.maximum(ratio, 1.0))
     return np.asarray((white * np.outer(grown, grown))[:3, :3])

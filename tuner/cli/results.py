@@ -6,19 +6,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from tuner.cli.tables import console
+from tuner.cli.tables import columns_of, console
 from tuner.result import RMSE_UNITS
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from tuner.job.bench import BenchResult
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import AxesRmse, EffectiveResult, RunResult
 
+RMSE_COLUMNS = [f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()]
 NOT_SIMULATED = "–"
 """Of what a simulation follows as it was recorded, or nobody recorded."""
 
@@ -81,12 +81,9 @@ def print_sensitivity(result: SensitivityResult) -> None:
     from tuner.wording.verdicts import direction_in_words, judgement_in_words
 
     screen = console()
-    table = Table(box=None, title="Coefficients", title_justify="left")
-    table.add_column("coefficient")
-    for name in ("value", "±", "unit"):
-        table.add_column(name, justify="left" if name == "unit" else "right")
-    table.add_column("+1 % moves position by")
-    table.add_column("how well it is known")
+    table = columns_of("Coefficients", left=("coefficient",), right=("value", "±"))
+    for column in ("unit", "+1 % moves position by", "how well it is known"):
+        table.add_column(column)
     for name, known in result.knowledge.coefficients.items():
         error = "" if known.std_error is None else f"{known.std_error:.2g}"
         judgement = judgement_in_words(known.verdict, known.reason)
@@ -126,11 +123,9 @@ def _largest_change(result: SensitivityResult, name: str) -> str:
 def _coefficients(result: RunResult) -> Table:
     from tuner.wording.verdicts import judgement_in_words
 
-    table = Table(box=None, title="Coefficients", title_justify="left")
-    table.add_column("coefficient")
-    for name in ("initial", "best", "±", "unit"):
-        table.add_column(name, justify="left" if name == "unit" else "right")
-    table.add_column("how well it is known")
+    table = columns_of("Coefficients", left=("coefficient",), right=("initial", "best", "±"))
+    for column in ("unit", "how well it is known"):
+        table.add_column(column)
     for name, coefficient in result.coefficients.items():
         table.add_row(
             name,
@@ -145,10 +140,8 @@ def _coefficients(result: RunResult) -> Table:
 
 def _refits(result: RunResult) -> Table:
     """Return the standard errors of the fit beside those of refits to other flights."""
-    table = Table(box=None, title="Standard errors by refits", title_justify="left")
-    table.add_column("coefficient")
-    for name in ("this fit", "jackknife", "bootstrap"):
-        table.add_column(name, justify="right")
+    errors_of = ("this fit", "jackknife", "bootstrap")
+    table = columns_of("Standard errors by refits", left=("coefficient",), right=errors_of)
     for name, found in result.coefficients.items():
         errors = (found.std_error, found.jackknife_error, found.bootstrap_error)
         if found.fitted:
@@ -160,12 +153,10 @@ def _print_selection(screen: Console, result: RunResult) -> None:
     """Print what each group of terms beyond the base model is worth."""
     from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
-    table = Table(box=None, title="Terms beyond the motor model", title_justify="left")
-    table.add_column("term")
-    table.add_column("gain in the fit", justify="right")
-    table.add_column("gain held out", justify="right")
-    table.add_column("in the model")
-    table.add_column("why")
+    gains_in = ("gain in the fit", "gain held out")
+    table = columns_of("Terms beyond the motor model", left=("term",), right=gains_in)
+    for column in ("in the model", "why"):
+        table.add_column(column)
     for row in result.selection:
         gains = gain_in_words(row.gain_fit), gain_in_words(row.gain_holdout)
         table.add_row(row.group, *gains, "yes" if row.kept else "no", reason_in_words(row))
@@ -177,10 +168,8 @@ def _print_effective(screen: Console, result: RunResult, effective: EffectiveRes
     """Print with which coefficients Gazebo flies most like the vehicle, where they differ."""
     from tuner.wording.result import effective_in_words, rmse_in_words
 
-    table = Table(box=None, title="In Gazebo", title_justify="left")
-    table.add_column("coefficient")
-    for name in ("physical", "effective", "unit"):
-        table.add_column(name, justify="left" if name == "unit" else "right")
+    table = columns_of("In Gazebo", left=("coefficient",), right=("physical", "effective"))
+    table.add_column("unit")
     for name, value in effective.coefficients.items():
         row = result.coefficients.get(name)
         if row is not None and value != row.best:
@@ -193,7 +182,8 @@ def _print_effective(screen: Console, result: RunResult, effective: EffectiveRes
 
 
 def _errors(result: RunResult) -> Table:
-    table = _rmse_table("RMSE with the initial → with the best coefficients", "flight")
+    title = "RMSE with the initial → with the best coefficients"
+    table = columns_of(title, left=("flight",), right=RMSE_COLUMNS)
     for flight in result.flights:
         cells = []
         for axis in RMSE_UNITS:
@@ -209,11 +199,8 @@ def _predictions(result: RunResult) -> Table:
     from tuner.wording.result import PREDICTED
 
     title = "Open-loop predictions from recorded states: mean error, initial → best coefficients"
-    table = Table(box=None, title=title, title_justify="left")
-    table.add_column("flight")
-    table.add_column("after", justify="right")
-    for name, unit in PREDICTED.items():
-        table.add_column(f"{name.replace('_', ' ')} {unit}", justify="right")
+    errors = [f"{name.replace('_', ' ')} {unit}" for name, unit in PREDICTED.items()]
+    table = columns_of(title, left=("flight",), right=("after", *errors))
     for flight in result.flights:
         held_out = " (held out)" if flight.split == "holdout" else ""
         for before, after in zip(flight.predicted_initial, flight.predicted_best, strict=True):
@@ -229,20 +216,13 @@ def _predictions(result: RunResult) -> Table:
 
 def folds_table(folds: Sequence[Fold]) -> Table:
     """Return how well each flight is predicted by the fit to the others."""
-    table = _rmse_table("RMSE of each flight with the fit to the others", "left out")
+    title = "RMSE of each flight with the fit to the others"
+    table = columns_of(title, left=("left out",), right=RMSE_COLUMNS)
     for fold in folds:
         cells = [
             "impossible" if fold.rmse is None else _axis(fold.rmse, axis) for axis in RMSE_UNITS
         ]
         table.add_row(fold.left_out, *cells)
-    return table
-
-
-def _rmse_table(title: str, first: str) -> Table:
-    table = Table(box=None, title=title, title_justify="left")
-    table.add_column(first)
-    for axis, unit in RMSE_UNITS.items():
-        table.add_column(f"{axis} {unit}", justify="right")
     return table
 
 

@@ -28,13 +28,20 @@ def console() -> Console:
     return fitting if fitting.width >= WIDTH else Console(highlight=False, width=WIDTH)
 
 
+def columns_of(title: str = "", *, left: Sequence[str] = (), right: Sequence[str] = ()) -> Table:
+    """Return a table without rows: columns of words, then columns of numbers."""
+    table = Table(box=None, title=title or None, title_justify="left")
+    for name in left:
+        table.add_column(name)
+    for name in right:
+        table.add_column(name, justify="right")
+    return table
+
+
 def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     """Print one line a simulated flight, and where they were written."""
-    table = Table(box=None)
-    for name in summaries[0].coefficients:
-        table.add_column(name, justify="right")
-    for name in ("top speed m/s", "off reference x m", "y", "z", "crashed"):
-        table.add_column(name, justify="right")
+    measures = ("top speed m/s", "off reference x m", "y", "z", "crashed")
+    table = columns_of(right=(*summaries[0].coefficients, *measures))
     for summary in summaries:
         crash = "no" if summary.crash_time is None else f"at {summary.crash_time:.2f} s"
         table.add_row(
@@ -93,11 +100,8 @@ def print_comparison(
     """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
     screen = console()
     screen.print(f"controller: {settings.origin['controller']}", markup=False)
-    table = Table(box=None)
-    for name in ("flight", "vehicle"):
-        table.add_column(name)
-    for name in ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg"):
-        table.add_column(name, justify="right")
+    axes = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg")
+    table = columns_of(left=("flight", "vehicle"), right=axes)
     for row in comparison.rows:
         if laps or row.lap is None:
             table.add_row(*_cells(row, comparison))

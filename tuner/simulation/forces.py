@@ -5,11 +5,8 @@ The thesis draws them so (Fig. 8.2), to see which effect matters in which flight
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -26,7 +23,6 @@ from sim_jax.terms.air import Air
 from sim_jax.terms.total import TERMS, wrench_of_each_term
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
-from tuner.disk import whole_file
 from tuner.flights.flight import Array
 
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -137,34 +133,3 @@ def _acting_alone(
 
 def _components(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:
     return vector.x, vector.y, vector.z
-
-
-@contextmanager
-def forces_file(path: Path) -> Iterator[Callable[[Forces, Mapping[str, float]], None]]:
-    """Write a CSV of forces: what is yielded appends a flight, with the coefficients varied for it.
-
-    One column per term and component, as ``thrust_fz``, below ``time`` in s and the varied
-    coefficients. The file appears whole.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    with (
-        whole_file(path) as unfinished,
-        unfinished.open("w", newline="", encoding="utf-8") as file,
-    ):
-        writer = csv.writer(file)
-        begun = False
-
-        def append(forces: Forces, coefficients: Mapping[str, float]) -> None:
-            nonlocal begun
-            if not begun:
-                columns = (f"{term}_{c}" for term in forces.of_term for c in COMPONENTS)
-                writer.writerow([*coefficients, "time", *columns])
-                begun = True
-            table = np.column_stack([forces.time, *forces.of_term.values()])
-            writer.writerows([*coefficients.values(), *row] for row in table.tolist())
-
-        yield append

@@ -1,16 +1,20 @@
-"""Simulated flights as CSV."""
+"""Simulated flights, and what acted along them, as CSV."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from tuner.disk import whole_file
 from tuner.flights.flight import Array
+from tuner.simulation.forces import COMPONENTS
 from tuner.simulation.simulate import Simulation
+
+Append = Callable[[Mapping[str, float], Sequence[str], Sequence[Array]], None]
 
 _XYZ = ("x", "y", "z")
 #: Signal -> the columns that hold it, in the order of the file.
@@ -30,10 +34,41 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
-    """Write flights below each other; of a grid, the varied coefficients are the first columns.
+    """Write flights below each other.
 
     Units: s, m, m/s (world), degrees for roll, pitch, yaw, rad/s (body), rad/s, commands and thrust
-    set-point 0..1; the quaternion is body to world. The file appears whole.
+    set-point 0..1; the quaternion is body to world.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    names = [name for columns in COLUMNS.values() for name in columns]
+    with flights_below_each_other(path) as append:
+        for simulation in simulations:
+            signals = {
+                **simulation.signals,
+                "roll_pitch_yaw": roll_pitch_yaw(simulation.signals["attitude"]),
+            }
+            columns = (simulation.time, *(signals[name] for name in COLUMNS))
+            append(simulation.coefficients, names, columns)
+
+
+def write_forces(simulation: Simulation, append: Append) -> None:
+    """Append what acted along a flight, one column per term and component, as ``thrust_fz``."""
+    if simulation.forces is not None:
+        time, of_term = simulation.forces.time, simulation.forces.of_term
+        names = [f"{term}_{component}" for term in of_term for component in COMPONENTS]
+        append(simulation.coefficients, names, (time, *of_term.values()))
+
+
+@contextmanager
+def flights_below_each_other(path: Path) -> Iterator[Append]:
+    """Write a CSV of flights: what is yielded appends one.
+
+    It takes the coefficients that were varied for the flight, which are the first columns, the
+    names of its columns behind ``time``, and time and columns. The file appears whole.
 
     Raises
     ------
@@ -45,22 +80,19 @@ def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
         unfinished.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file)
-        for number, simulation in enumerate(simulations):
-            if number == 0:
-                names = (name for columns in COLUMNS.values() for name in columns)
-                writer.writerow([*simulation.coefficients, "time", *names])
-            writer.writerows(_rows(simulation))
+        begun = False
 
+        def append(
+            varied: Mapping[str, float], names: Sequence[str], columns: Sequence[Array]
+        ) -> None:
+            nonlocal begun
+            if not begun:
+                writer.writerow([*varied, "time", *names])
+                begun = True
+            rows = np.column_stack(columns).tolist()
+            writer.writerows([*varied.values(), *row] for row in rows)
 
-def _rows(simulation: Simulation) -> Iterator[list[float]]:
-    first = simulation.coefficients.values()
-    signals = {
-        **simulation.signals,
-        "roll_pitch_yaw": roll_pitch_yaw(simulation.signals["attitude"]),
-    }
-    table = np.column_stack([simulation.time, *(signals[name] for name in COLUMNS)])
-    for row in table.tolist():
-        yield [*first, *row]
+        yield append
 
 
 def roll_pitch_yaw(attitude: Array) -> Array:

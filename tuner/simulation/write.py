@@ -12,9 +12,8 @@ import numpy as np
 from tuner.disk import check_file
 from tuner.errors import InputError
 from tuner.simulation.bag import write_bag
-from tuner.simulation.forces import forces_file
 from tuner.simulation.simulate import Simulation
-from tuner.simulation.table import write_csv
+from tuner.simulation.table import flights_below_each_other, write_csv, write_forces
 
 
 @dataclass(frozen=True)
@@ -71,13 +70,13 @@ def write_flights(
             raise InputError(forces, "forces are written as a .csv of their own", "name one")
         check_file(forces)
     summaries: list[Summary] = []
-    with nullcontext() if forces is None else forces_file(forces) as append_forces:
+    with nullcontext() if forces is None else flights_below_each_other(forces) as append:
 
         def passing() -> Iterator[Simulation]:
             for simulation in simulations:
                 summaries.append(summary_of(simulation))
-                if append_forces is not None and simulation.forces is not None:
-                    append_forces(simulation.forces, simulation.coefficients)
+                if append is not None:
+                    write_forces(simulation, append)
                 yield simulation
 
         writers[path.suffix](passing(), path)

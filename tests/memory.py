@@ -1,0 +1,49 @@
+"""What a test process holds in memory, and how it gives back what compiling has left behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+from pathlib import Path
+
+from tuner.runtime import return_memory
+
+MOST_MEMORY = 900 * 2**20
+"""bytes of a process at the end of a module beyond which its compiled programs are dropped."""
+MOST_IN_A_MODULE = 1300 * 2**20
+"""The same at the end of a test that others of its module follow, with which it shares programs."""
+GROWTH = 150 * 2**20
+"""bytes by which a process grows beyond what it could not give back before it tries again."""
+
+grown = 0
+"""bytes that the process had left when it last could not give more back, and `GROWTH`."""
+
+
+def resident() -> int:
+    """Return the bytes that this process has in memory, or 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def give_back(most: int) -> None:
+    """Give back what is free if the process holds more than ``most``, then what jax has compiled.
+
+    It takes a second: a process that stays large does not try after every test.
+    """
+    global grown  # noqa: PLW0603 (of this process)
+    if "jax" not in sys.modules or resident() <= max(most, grown):
+        return
+    _collect()
+    if resident() > min(most, MOST_MEMORY):
+        sys.modules["jax"].clear_caches()
+        _collect()
+    grown = resident() + GROWTH
+
+
+def _collect() -> None:
+    gc.collect()
+    return_memory()
