@@ -28,8 +28,7 @@ from tuner.service.queue import add_event
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
 from tuner.service.settings import GIB, MIB, Limits, ServiceSettings
-from tuner.service.states import State
-from tuner.service.tables import JobRow, RecordingRow
+from tuner.service.tables import JobRow, RecordingRow, State
 
 JOBS = 10_000
 AT_ONCE = 100

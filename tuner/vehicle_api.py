@@ -63,7 +63,7 @@ def simulate(
     rate
         Hz of the result.
     grid
-        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.sweep.grid_of`
+        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.plan.grid_of`
         makes every combination of several ranges.
     precision
         What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.

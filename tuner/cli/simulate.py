@@ -62,8 +62,7 @@ def simulate(
 
     configure()
     from tuner.engine import engine_for
-    from tuner.simulation.plan import fly
-    from tuner.simulation.sweep import grid_of
+    from tuner.simulation.plan import fly, grid_of
     from tuner.simulation.write import write_flights
 
     flights = fly(

@@ -4,8 +4,7 @@ from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import CHANNELS, JobFile, read_job
 from tuner.config.settings import Options, Settings, find_job_file, settle
 from tuner.config.values import check_names, initial_values, values_of, with_values
-from tuner.config.vehicle import VehicleFile, check_mixer, read_vehicle
-from tuner.config.vehicle_writer import vehicle_text, write_vehicle
+from tuner.config.vehicle import VehicleFile, check_mixer, read_vehicle, vehicle_text, write_vehicle
 from tuner.trajectory_settings import TrajectorySettings
 from tuner.yaml_files.shipped import configs_folder, find_config
 

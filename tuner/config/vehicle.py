@@ -8,7 +8,9 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.disk import write_text
 from tuner.errors import ConfigError, did_you_mean
+from tuner.yaml_files.document import commented, dump_yaml
 from tuner.yaml_files.section import (
     NonNegative,
     Number,
@@ -24,6 +26,13 @@ QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))
 
 
 ROTOR_COUNTS = (4, 6, 8)
+UNIT_COLUMN = 44
+#: Of numbers that are not fitted.
+_OTHER_UNITS = {
+    ("", "rotors"): "positions in m from the centre of mass: forward, left, up",
+    ("motor", "max_rotor_velocity"): "rad/s",
+    ("battery", "reference_voltage"): "V",
+}
 
 
 class Inertia(Section):
@@ -246,3 +255,48 @@ def read_vehicle(path: str | Path) -> VehicleFile:
         In one line: the file, the key, its value, what it should be.
     """
     return read_model(VehicleFile, path)
+
+
+def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -> None:
+    """Write a vehicle file that `read_vehicle` reads back to an equal vehicle.
+
+    Parameters
+    ----------
+    vehicle
+        What to write.
+    path
+        The file to make or replace; it appears whole.
+    header
+        Comment lines for the top of the file.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
+    """
+    write_text(Path(path), vehicle_text(vehicle, header=header))
+
+
+def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
+    """Return the text of a vehicle file, as `write_vehicle` writes it."""
+    data = vehicle.model_dump(mode="json", exclude_none=True)
+    for section in ("battery", "effects", "source"):
+        if not data[section]:
+            del data[section]
+    return commented(header) + _with_units(dump_yaml(data))
+
+
+def _with_units(text: str) -> str:
+    """Put a number's unit behind its line."""
+    units = {coefficient.place: coefficient.unit for coefficient in COEFFICIENTS.values()}
+    units |= _OTHER_UNITS
+    section = ""
+    lines = []
+    for line in text.splitlines():
+        key = line.partition(":")[0]
+        inside = line.startswith("  ")
+        if not inside:
+            section = key
+        unit = units.get((section if inside else "", key.strip()))
+        lines.append(f"{line + '  ':<{UNIT_COLUMN}}# {unit}" if unit else line)
+    return "\n".join(lines) + "\n"

@@ -1,13 +1,15 @@
-"""One export from a run to a file: gates, writing, reading back."""
+"""Exports from a run to files, one or all that a job asks for: gates, writing, reading back."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 
+from tuner.config.job import ExportSettings
 from tuner.disk import check_file
-from tuner.errors import ExportError
+from tuner.errors import ExportError, InputError
 from tuner.exporters.draft import write
 from tuner.exporters.gates import Gate, Refly, check
 from tuner.exporters.provenance import exported_vehicle, in_simulator, provenance
@@ -18,7 +20,7 @@ from tuner.exporters.target import (
     not_carried,
     target_of,
 )
-from tuner.result import Run
+from tuner.result import Run, read_run
 from tuner.wording.result import what_is_exported, what_is_lost
 
 FOLDER = "export"
@@ -107,3 +109,34 @@ def export(
         )
     write(draft, path)
     return Exported(path, gates, (*decided, *draft.notes, *not_carried(vehicle, target)))
+
+
+def exports_of_job(
+    folder: Path, wanted: ExportSettings, *, refly: Refly, today: date
+) -> Iterator[tuple[str, Path | InputError]]:
+    """Write every format that a job asks for into its result folder.
+
+    A format that is refused is no failure of the run.
+
+    Parameters
+    ----------
+    folder
+        A finished result folder.
+    wanted
+        Formats, and the model for ``sdf``, which stays as it is.
+    refly, today
+        As of `export`.
+
+    Yields
+    ------
+    tuple
+        Each format with the file that was written, or with the reason why it was not.
+    """
+    run = read_run(folder)
+    for kind in wanted.formats:
+        into = wanted.into if target_of(kind).patches else None
+        out = folder / FOLDER / into.name if into else None
+        try:
+            yield kind, export(run, kind, refly=refly, today=today, into=into, out=out).path
+        except InputError as error:
+            yield kind, error

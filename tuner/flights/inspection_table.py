@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tuner.flights.inspection import Inspection, MissionReport
-from tuner.wording.damage import damage_sentence
-from tuner.wording.notes import note_in_words
+from tuner.wording.notes import damage_sentence, note_in_words
 
 _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 from math import nan
 from pathlib import Path
 
-from tuner.comparison.tabulate import table_of
+from tuner.comparison.compare import table_of
 from tuner.config import Options, Settings, VehicleFile, settle, with_values, write_vehicle
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.examination.examination import Examination
-from tuner.exporters.after_run import exports_of_job
+from tuner.exporters.export import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
 from tuner.job.ahead import ProgramsAhead

@@ -21,8 +21,8 @@ from tuner.result import RunResult
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, Asked
 from tuner.service.settings import Limits
-from tuner.service.states import State
 from tuner.service.store import Store, digest_of, full_disk
+from tuner.service.tables import State
 from tuner.service.worker import RESULT, Assignment
 
 logger = logging.getLogger(__name__)

@@ -21,8 +21,8 @@ from tuner.service.elsewhere import Errand, sent
 from tuner.service.errors import NoSpaceError, UnavailableError
 from tuner.service.queue import Claim, Outcome, Queue
 from tuner.service.settings import ServiceSettings
-from tuner.service.states import State
 from tuner.service.store import Store
+from tuner.service.tables import State
 
 logger = logging.getLogger(__name__)
 

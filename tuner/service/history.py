@@ -9,8 +9,7 @@ from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, shown
 from tuner.service.naming import stems
 from tuner.service.shapes import CoefficientHistory, History, Point, iso
-from tuner.service.states import State
-from tuner.service.tables import JobRow, PointRow
+from tuner.service.tables import JobRow, PointRow, State
 
 MOST_JOBS = 500
 """Of a history, the latest."""

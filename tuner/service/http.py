@@ -36,8 +36,7 @@ from tuner.service.shapes import (
     job_fields,
     recording_answer,
 )
-from tuner.service.states import State
-from tuner.service.tables import FileRow, RecordingRow
+from tuner.service.tables import FileRow, RecordingRow, State
 from tuner.versions import installed
 
 BLOCK = 2**18

@@ -19,8 +19,16 @@ from tuner.service.naming import file_name
 from tuner.service.queue import add_event
 from tuner.service.request import JobRequest, checked
 from tuner.service.settings import Limits
-from tuner.service.states import FINISHED, UNFINISHED, State
-from tuner.service.tables import EventRow, FileRow, FlightRow, JobRow, RecordingRow
+from tuner.service.tables import (
+    FINISHED,
+    UNFINISHED,
+    EventRow,
+    FileRow,
+    FlightRow,
+    JobRow,
+    RecordingRow,
+    State,
+)
 
 PAGE = 50
 """Jobs of one page."""

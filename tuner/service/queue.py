@@ -17,8 +17,7 @@ from sqlalchemy import CursorResult, insert, select, update
 from sqlalchemy.orm import Session, undefer
 
 from tuner.service.database import Database
-from tuner.service.states import State
-from tuner.service.tables import EventRow, FileRow, JobRow, PointRow
+from tuner.service.tables import EventRow, FileRow, JobRow, PointRow, State
 
 MOST_EVENTS = 20_000
 """Of one job; what would come after is not kept."""

@@ -8,8 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, JsonValue
 
-from tuner.service.states import State
-from tuner.service.tables import EventRow, JobRow, RecordingRow
+from tuner.service.tables import EventRow, JobRow, RecordingRow, State
 
 API = "/api/v1"
 

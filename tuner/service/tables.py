@@ -1,19 +1,32 @@
-"""The tables: recordings, jobs with their events, files and points, and tokens.
+"""The tables: recordings, jobs with their states, events, files and points, and tokens.
 
 Times are s since 1970, UTC.
 """
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import Any
 
 from sqlalchemy import JSON, BigInteger, ForeignKey, Index, Integer, MetaData, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship
 
-from tuner.service.states import State
-
 #: An identity that SQLite counts by itself.
 Number = BigInteger().with_variant(Integer(), "sqlite")
+
+
+class State(StrEnum):
+    """Of a job."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+UNFINISHED = (State.QUEUED, State.RUNNING)
+FINISHED = (State.DONE, State.FAILED, State.CANCELLED)
 
 
 class Base(DeclarativeBase):

@@ -8,8 +8,7 @@ from typing import Any
 from tuner.findings import Code, Finding
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.notes import Note, NoteCode
-from tuner.wording.damage import damage_sentence
-from tuner.wording.notes import note_in_words
+from tuner.wording.notes import damage_sentence, note_in_words
 from tuner.wording.phrases import as_sentence, listed, percent
 
 GIVE_VEHICLE = (

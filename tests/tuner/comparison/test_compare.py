@@ -8,10 +8,9 @@ from lxml import html
 
 from tests.tuner.comparison.test_errors import errors
 from tuner.cli import main
-from tuner.comparison.compare import compare
+from tuner.comparison.compare import compare, table_of
 from tuner.comparison.comparison import Comparison
 from tuner.comparison.table import write_table
-from tuner.comparison.tabulate import table_of
 from tuner.config import ControllerFile, Options, configs_folder
 from tuner.errors import ConfigError, InputError
 from tuner.recordings import Recording

@@ -16,7 +16,7 @@ from tuner.flights import Flight, load_flight, load_flights
 from tuner.flights.damage import Cause
 from tuner.flights.notes import Note, NoteCode
 from tuner.trajectory_settings import TrajectorySettings
-from tuner.wording.damage import damage_sentence
+from tuner.wording.notes import damage_sentence
 from tuner.yaml_files.section import build
 
 POSE = "/optitrack/pose"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.comparison.compare import table_of
 from tuner.comparison.errors import FlightErrors, SignalErrors
-from tuner.comparison.tabulate import table_of
 from tuner.config import VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.design.log_proposal import LogProposal
 from tuner.examination.sensitivity_json import (

@@ -27,8 +27,7 @@ from tuner.service.database import Database
 from tuner.service.queue import Outcome, Queue
 from tuner.service.request import JobRequest
 from tuner.service.service import Service
-from tuner.service.states import State
-from tuner.service.tables import Base, RecordingRow
+from tuner.service.tables import Base, RecordingRow, State
 
 KILLS = 20
 STARTING = multiprocessing.get_context("forkserver")

@@ -7,8 +7,7 @@ import pytest
 
 from tuner.errors import InputError
 from tuner.flights.load import load_flight
-from tuner.simulation.plan import fly
-from tuner.simulation.sweep import grid_of
+from tuner.simulation.plan import fly, grid_of
 from tuner.simulation.table import roll_pitch_yaw, write_csv
 from tuner.simulation.write import summary_of, write_flights
 

@@ -13,9 +13,7 @@ from tuner.report.section import Section
 from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
 from tuner.report.sections.effects import effects
-from tuner.report.sections.errors import errors
-from tuner.report.sections.flights import flights
-from tuner.report.sections.forces import forces
+from tuner.report.sections.flights import errors, flights, forces
 from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight

@@ -1,15 +1,28 @@
-"""Recorded, initial and fitted flight over time and from above."""
+"""Each flight: how closely it is met, before and after, its traces, and what acted along it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from tuner.flights.flight import Array
-from tuner.report.chart import FITTED, INITIAL, RECORDED, Chart, Line, Panel, rounded
+from tuner.report.chart import (
+    FITTED,
+    INITIAL,
+    PALETTE,
+    RECORDED,
+    Chart,
+    Dash,
+    Line,
+    Look,
+    Panel,
+    rounded,
+)
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.result import RMSE_UNITS, AxesRmse
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
 CURVES = {
@@ -25,6 +38,12 @@ QUANTITIES = {
 SMALLEST = 1e-6
 """Errors below this are drawn as this on a logarithmic axis."""
 TIME = "time since the mission's start [s]"
+PREFIX = "acting_"
+CLOCK = "time"
+AXES = ("forward", "left", "up")
+FAINTEST = 1e-9
+"""N or N m below which a curve is no more than rounding."""
+DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
 def flights(contents: Contents) -> Section | None:
@@ -95,3 +114,107 @@ def _from_above(name: str, title: str, arrays: Mapping[str, Array]) -> Chart:
     ]
     panel = Panel(curves, y_title="y [m]", equal=True)
     return Chart(f"{name}_top", f"{title}: from above", (panel,), x_title="x [m]", height=460)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A flight or lap; per axis the RMSE before and after, None for a crash."""
+
+    name: str
+    pairs: list[tuple[float | None, float | None]]
+
+
+def errors(contents: Contents) -> Section | None:
+    """Return the RMSE before and after, of flights and of laps."""
+    if contents.run is None or not contents.run.result.flights:
+        return None
+    rows = [
+        Row(
+            flight.name + (" (held out)" if flight.split == "holdout" else ""),
+            _pairs(flight.rmse_initial, flight.rmse_best),
+        )
+        for flight in contents.run.result.flights
+    ]
+    values = {"axes": RMSE_UNITS, "rows": rows, "laps": _laps(contents)}
+    return Section("errors", "RMSE of each flight", values)
+
+
+def _pairs(before: AxesRmse, after: AxesRmse) -> list[tuple[float | None, float | None]]:
+    return [(getattr(before, axis), getattr(after, axis)) for axis in RMSE_UNITS]
+
+
+def _laps(contents: Contents) -> list[Row]:
+    if contents.laps is None:
+        return []
+    by_lap = {(row.flight, row.lap, row.vehicle): row.rmse for row in contents.laps.rows}
+    return [
+        Row(
+            f"{flight}, lap {lap}",
+            _pairs(by_lap[flight, lap, "initial"], by_lap[flight, lap, "best"]),
+        )
+        for flight, lap in dict.fromkeys(
+            (row.flight, row.lap) for row in contents.laps.rows if row.lap is not None
+        )
+    ]
+
+
+def forces(contents: Contents) -> Section | None:
+    """Return two charts: forces and moments of each term, along each body axis.
+
+    Of the flight that accelerates most: the others' curves are much the same.
+    """
+    flights = {name: _of_terms(arrays) for name, arrays in contents.traces.items()}
+    flights = {name: of_term for name, of_term in flights.items() if CLOCK in of_term}
+    if not flights:
+        return None
+    name = max(flights, key=lambda name: _pull(flights[name]))
+    of_term = dict(flights[name])
+    time = of_term.pop(CLOCK)
+    charts = (
+        _chart(name, "forces", "N", time, {n: v[:, :3] for n, v in of_term.items()}),
+        _chart(name, "moments", "N m", time, {n: v[:, 3:] for n, v in of_term.items()}),
+    )
+    return Section("forces", "Forces and moments by term", {"flight": name}, charts)
+
+
+def _of_terms(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    return {
+        name.removeprefix(PREFIX): values
+        for name, values in arrays.items()
+        if name.startswith(PREFIX)
+    }
+
+
+def _pull(of_term: Mapping[str, Array]) -> float:
+    """Return the root mean square of mass times acceleration, N."""
+    total = sum(values[:, :3] for name, values in of_term.items() if name != CLOCK)
+    return float(np.sqrt(np.mean(np.square(total)))) if np.size(total) else 0.0
+
+
+def _chart(
+    flight: str, quantity: str, unit: str, time: Array, of_term: Mapping[str, Array]
+) -> Chart:
+    clock = rounded(time, 3)
+    looks = {name: _look(number) for number, name in enumerate(of_term)}
+    panels = [
+        Panel(
+            [
+                Line(name.replace("_", " "), clock, rounded(values[:, axis], 5), looks[name])
+                for name, values in of_term.items()
+                if np.abs(values[:, axis]).max(initial=0.0) > FAINTEST
+            ],
+            y_title=f"{title} [{unit}]",
+        )
+        for axis, title in enumerate(AXES)
+    ]
+    return Chart(
+        f"{flight}_{quantity}",
+        f"{flight}: {quantity}",
+        panels,
+        x_title="time since the mission's start [s]",
+        height=520,
+    )
+
+
+def _look(number: int) -> Look:
+    return Look(PALETTE[number % len(PALETTE)], dash=DASHES[number // len(PALETTE) % len(DASHES)])

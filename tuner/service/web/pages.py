@@ -26,8 +26,7 @@ from tuner.service.safety import COOKIE
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 from tuner.service.shapes import API
-from tuner.service.states import State
-from tuner.service.tables import JobRow, RecordingRow
+from tuner.service.tables import JobRow, RecordingRow, State
 from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render

@@ -11,7 +11,7 @@ from starlette.responses import HTMLResponse
 
 from tuner.flights.notes import Note
 from tuner.service.shapes import iso
-from tuner.service.states import State
+from tuner.service.tables import State
 from tuner.wording.notes import note_in_words
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
