@@ -48,7 +48,7 @@ def _padded(tree: PyTree[Array], missing: int) -> PyTree[Array]:
 
 
 def over_devices(
-    function: Callable[..., PyTree[Array]], *, devices: int | None = None, name: object = None
+    function: Callable[..., PyTree[Array]], *, name: object = None
 ) -> Callable[..., PyTree[Array]]:
     """Return a function of a batch compiled for all devices, each of which takes its share.
 
@@ -63,8 +63,6 @@ def over_devices(
         Takes a batch, a pytree whose leaves all have the batch as their last axis, then any number
         of pytrees that every device needs whole; returns a pytree whose leaves have the batch last.
         Members of the batch must not depend on each other. It may itself be a Jacobian.
-    devices
-        How many devices to use; all of the default backend by default.
     name
         All that the function depends on beside its arguments and its source, as texts, numbers and
         data classes: what is traced is then kept on disk, see `tuner.kept_programs`.
@@ -79,7 +77,7 @@ def over_devices(
     @wraps(function)
     def shared_out(batch: PyTree[Array], *whole: PyTree[Array]) -> PyTree[Array]:
         size = _size(batch)
-        count = min(len(jax.devices()[:devices]), size)
+        count = min(len(jax.devices()), size)
         missing = count * padded_size(-(-size // count), FINE) - size
         result = compiled(count)(_padded(batch, missing) if missing else batch, *whole)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[..., :size], result)

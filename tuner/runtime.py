@@ -138,9 +138,10 @@ def return_memory_after_compiling() -> None:
     monitoring.register_event_duration_secs_listener(compiled)
 
 
-def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
+def configure(*, keep_compiled: bool = True) -> None:
     """Set jax up for simulation; call it once, before the first computation.
 
+    It computes in double precision unless ``JAX_ENABLE_X64`` says otherwise.
     The environment variables ``NPROC`` and ``XLA_FLAGS`` are read when jax makes its devices, so
     that a program that has already computed with jax keeps the threads and devices it has, at the
     price of speed and of nothing else. On a GPU nothing here has an effect but the precision and
@@ -148,8 +149,6 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
 
     Parameters
     ----------
-    float64
-        Compute in double precision unless ``JAX_ENABLE_X64`` says otherwise.
     keep_compiled
         Keep compiled code in the user's cache folder, so that the same job starts at once the next
         time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
@@ -160,7 +159,7 @@ def configure(*, float64: bool = True, keep_compiled: bool = True) -> None:
 
     return_memory_after_compiling()
     if "JAX_ENABLE_X64" not in os.environ:
-        jax.config.update("jax_enable_x64", float64)
+        jax.config.update("jax_enable_x64", True)
     if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

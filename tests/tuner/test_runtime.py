@@ -5,8 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from jax import monitoring
 
+from tests.memory import resident
 from tuner import runtime
 
 REPORT = """
@@ -92,3 +95,26 @@ def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> 
         assert gc.get_threshold() == (10 * rarely[0], 1, 1)
     finally:
         gc.set_threshold(*before)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="asks glibc")
+def test_free_memory_between_what_is_used_is_given_back():
+    blocks = [np.ones(12_000) for _ in range(2_000)]  # 96 kB each: of the heap, not mapped
+    used = blocks[::50]
+    del blocks
+    before = resident()
+    runtime.return_memory()
+    assert before - resident() > 100 * 2**20
+    assert all(block.sum() == 12_000 for block in used)
+
+
+def test_only_long_compilations_give_memory_back(monkeypatch):
+    given = []
+    monkeypatch.setattr(runtime, "return_memory", lambda: given.append("back"))
+    runtime.return_memory_after_compiling()
+    runtime.return_memory_after_compiling()
+    monitoring.record_event_duration_secs(runtime.COMPILED, 0.1)
+    monitoring.record_event_duration_secs("/jax/core/compile/jaxpr_trace_duration", 10.0)
+    assert not given
+    monitoring.record_event_duration_secs(runtime.COMPILED, 10.0)
+    assert given == ["back"]

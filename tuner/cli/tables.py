@@ -87,9 +87,8 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
 
 
-def print_settings(settings: Settings, screen: Console | None = None) -> None:
+def print_settings(settings: Settings, screen: Console) -> None:
     """Print where each setting comes from."""
-    screen = screen or console()
     for name, origin in settings.origin.items():
         screen.print(f"{name}: {origin}", markup=False)
 
