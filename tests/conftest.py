@@ -32,12 +32,8 @@ from hypothesis import settings
 from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
-from tuner.runtime import (
-    cache_folder,
-    collect_rarely,
-    return_memory_after_compiling,
-    set_environment,
-)
+from tuner.disk import cache_folder
+from tuner.runtime import collect_rarely, return_memory_after_compiling, set_environment
 
 __all__ = ["demo"]
 

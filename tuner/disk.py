@@ -6,7 +6,9 @@ Standard library only, so that a recording seen before is answered before anythi
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -171,3 +173,22 @@ def readable(path: Path) -> Iterator[None]:
     except OSError as error:
         what = f"cannot be read ({error.strerror or error})"
         raise RecordingError(path, what, "check its rights and the disk") from None
+
+
+def cache_folder() -> Path:
+    """Return the folder in which this program may keep what it can make again."""
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        base = Path(chosen)
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path.home() / ".cache"
+    return base / "multirotor-tune"
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

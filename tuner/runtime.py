@@ -31,11 +31,12 @@ import ctypes
 import gc
 import logging
 import os
-import sys
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+
+from tuner.disk import cache_folder
 
 logger = logging.getLogger(__name__)
 
@@ -54,19 +55,6 @@ that jax traces is hundreds of thousands of objects that stay, which Python's ow
 again and again."""
 _LONG = 0.5
 """s of compiling after which memory is given back."""
-
-
-def cache_folder() -> Path:
-    """Return the folder in which this program may keep what it can make again."""
-    if chosen := os.environ.get("XDG_CACHE_HOME"):
-        base = Path(chosen)
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    elif sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    else:
-        base = Path.home() / ".cache"
-    return base / "multirotor-tune"
 
 
 def cores() -> int:

@@ -1,9 +1,10 @@
 import errno
 import os
+import sys
 
 import pytest
 
-from tuner.disk import check_folder, exists, make_folder, whole_file, write_text
+from tuner.disk import cache_folder, check_folder, exists, make_folder, whole_file, write_text
 from tuner.errors import InputError, OutputError
 
 
@@ -66,3 +67,12 @@ def test_looking_for_a_path_may_be_refused(tmp_path):
     assert not exists(tmp_path / "x" / "y")
     with pytest.raises(InputError, match="cannot be read"):
         exists(tmp_path / ("x" * 300))
+
+
+def test_cache_folder_follows_the_platform(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "multirotor-tune"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"

@@ -74,15 +74,6 @@ def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
     assert report["answer"] == 6.0
 
 
-def test_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert runtime.cache_folder() == tmp_path / "multirotor-tune"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert runtime.cache_folder() == tmp_path / "Library" / "Caches" / "multirotor-tune"
-
-
 def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> None:
     before = gc.get_threshold()
     try:

@@ -14,7 +14,7 @@ from typing import Any
 
 from fsspec.core import url_to_fs
 
-from tuner.disk import make_folder, whole_file
+from tuner.disk import digest_of, make_folder, whole_file
 from tuner.errors import InputError
 
 BLOCK = 1 << 20
@@ -149,9 +149,3 @@ class _Arriving:
             self._files.mv(self.name, self._place)
         elif self._files.exists(self.name):
             self._files.rm(self.name)
-
-
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -11,12 +11,11 @@ import hashlib
 import json
 import logging
 import os
-import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from tuner.disk import readable
+from tuner.disk import cache_folder, readable
 
 logger = logging.getLogger(__name__)
 
@@ -26,17 +25,10 @@ LARGE = 256 << 20
 ROOM = 2 << 30
 
 
-def cache_folder() -> Path:
+def own_folder() -> Path:
     """Return the folder of the cache: ``TUNE_CACHE_DIR``, or the user's own for this program."""
-    if named := os.environ.get("TUNE_CACHE_DIR"):
-        return Path(named)
-    if sys.platform == "win32":
-        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
-    elif sys.platform == "darwin":
-        base = Path.home() / "Library" / "Caches"
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return base / "multirotor-tune"
+    named = os.environ.get("TUNE_CACHE_DIR")
+    return Path(named) if named else cache_folder()
 
 
 def digest(path: Path) -> str:
@@ -92,7 +84,7 @@ def readers_version() -> str:
 def cached(kind: str, *key: str) -> Path:
     """Return the file in which something with this key is kept."""
     name = hashlib.sha256("\0".join((readers_version(), kind, *key)).encode()).hexdigest()
-    return cache_folder() / kind / f"{name[:40]}"
+    return own_folder() / kind / f"{name[:40]}"
 
 
 def load(path: Path) -> bytes | None:
@@ -124,7 +116,7 @@ def store(path: Path, content: bytes) -> None:
 
 def _make_room() -> None:
     files = []
-    for file in cache_folder().rglob("*"):
+    for file in own_folder().rglob("*"):
         with contextlib.suppress(OSError):
             if file.is_file():
                 stat = file.stat()

@@ -17,11 +17,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+from tuner.disk import digest_of
 from tuner.result import RunResult
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, Asked
 from tuner.service.settings import Limits
-from tuner.service.store import Store, digest_of, full_disk
+from tuner.service.store import Store, full_disk
 from tuner.service.tables import State
 from tuner.service.worker import RESULT, Assignment
 

@@ -7,7 +7,6 @@ object before it is complete.
 from __future__ import annotations
 
 import errno
-import hashlib
 import os
 import shutil
 from collections.abc import Iterator
@@ -99,12 +98,6 @@ class Store:
     def free_bytes(self) -> int | None:
         """Return what is left on the disk; None where the store does not say."""
         return shutil.disk_usage(self._root).free if self.is_folder else None
-
-
-def digest_of(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import pytest
 from tests.tuner.flights import making
 from tuner.flights import Flight, load_flight
 from tuner.flights import load as loading
-from tuner.flights.cache import cache_folder, digest
+from tuner.flights.cache import digest, own_folder
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ def test_same_content_elsewhere_is_known(bag: Path, reads: list[Path], tmp_path:
 
 def test_damaged_cache_is_read_anew(bag: Path, reads: list[Path]) -> None:
     first = load_flight(bag)
-    (kept,) = (cache_folder() / "flights").iterdir()
+    (kept,) = (own_folder() / "flights").iterdir()
     kept.write_bytes(kept.read_bytes()[:-100])
     assert_equal(first, load_flight(bag))
     assert len(reads) == 2
@@ -107,7 +107,7 @@ def test_concurrent_runs_agree(bag: Path) -> None:
     outputs = {run.communicate()[0] for run in runs}
     assert [run.returncode for run in runs] == [0, 0, 0, 0]
     assert len(outputs) == 1
-    names = [file.name for file in (cache_folder() / "flights").iterdir()]
+    names = [file.name for file in (own_folder() / "flights").iterdir()]
     assert len(names) == 1
     assert not names[0].startswith(".")
 
