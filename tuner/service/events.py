@@ -12,7 +12,7 @@ import anyio.to_thread
 from tuner.service import jobs
 from tuner.service.errors import ServiceError
 from tuner.service.service import Service
-from tuner.service.shapes import JobAnswer, job_fields
+from tuner.service.shapes import JobAnswer
 from tuner.service.tables import EventRow, JobRow
 
 LOOK = 0.5
@@ -37,7 +37,7 @@ async def follow(service: Service, job: str, after: int) -> AsyncIterator[str]:
         for event in new:
             yield _event(event.kind, event.content, event.number)
             after = event.number
-        standing = JobAnswer(**job_fields(row)).model_dump_json()
+        standing = JobAnswer.model_validate(row).model_dump_json()
         if standing != shown:
             yield f"event: job\ndata: {standing}\n\n"
             shown, quiet = standing, 0.0

@@ -33,7 +33,6 @@ from tuner.service.shapes import (
     RecordingAnswer,
     accepted,
     full_job,
-    job_fields,
     recording_answer,
 )
 from tuner.service.tables import FileRow, RecordingRow, State
@@ -195,7 +194,7 @@ def get_jobs(
     )
     shown = rows[: jobs.PAGE]
     return JobPage(
-        jobs=[JobAnswer(**job_fields(row)) for row in shown],
+        jobs=[JobAnswer.model_validate(row) for row in shown],
         next=shown[-1].id if len(rows) > len(shown) else None,
     )
 

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated
 
-from pydantic import BaseModel, Field, JsonValue
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
-from tuner.service.tables import EventRow, JobRow, RecordingRow, State
+from tuner.service.tables import EventRow, FileRow, JobRow, RecordingRow, State
 
 API = "/api/v1"
+
+
+def iso(seconds: float | None) -> str | None:
+    """Return s since 1970 as ISO 8601."""
+    if seconds is None:
+        return None
+    moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+Moment = Annotated[
+    str, BeforeValidator(lambda value: iso(value) if isinstance(value, float) else value)
+]
+"""ISO 8601 of s since 1970."""
 
 
 class Problem(BaseModel):
@@ -52,6 +66,8 @@ class Accepted(BaseModel):
 class JobAnswer(BaseModel):
     """A job; ``rmse`` in m, times as ISO 8601, ``exit_status`` as of the local command."""
 
+    model_config = ConfigDict(from_attributes=True)
+
     id: str
     name: str
     vehicle: str
@@ -60,12 +76,15 @@ class JobAnswer(BaseModel):
     iteration: int | None
     rmse: float | None
     seconds_left: float | None
-    submitted: str
-    started: str | None
-    ended: str | None
+    submitted: Moment
+    started: Moment | None
+    ended: Moment | None
     error: str | None
     exit_status: int | None
-    files: list[str]
+    files: Annotated[
+        list[str],
+        BeforeValidator(lambda files: [f.name if isinstance(f, FileRow) else f for f in files]),
+    ]
 
 
 class FlightAnswer(BaseModel):
@@ -151,43 +170,15 @@ def accepted(row: JobRow) -> Accepted:
     return Accepted(id=row.id, state=State(row.state), links=links(row))
 
 
-def job_fields(row: JobRow) -> dict[str, Any]:
-    """Return a job, whose files are loaded, as JSON."""
-    return {
-        "id": row.id,
-        "name": row.name,
-        "vehicle": row.vehicle,
-        "state": State(row.state),
-        "stage": row.stage,
-        "iteration": row.iteration,
-        "rmse": row.rmse,
-        "seconds_left": row.seconds_left,
-        "submitted": iso(row.submitted),
-        "started": iso(row.started),
-        "ended": iso(row.ended),
-        "error": row.error,
-        "exit_status": row.exit_status,
-        "files": [file.name for file in row.files],
-    }
-
-
 def full_job(row: JobRow, events: Sequence[EventRow]) -> FullJobAnswer:
     """Return a job with what it said."""
-    fields = job_fields(row)
+    answer = JobAnswer.model_validate(row)
     return FullJobAnswer(
-        **fields,
+        **dict(answer),
         flights=[
             FlightAnswer(id=flight.sha256, name=flight.name, holdout=flight.holdout)
             for flight in row.flights
         ],
         log=[str(event.content["text"]) for event in events if event.kind == "message"],
-        links=links(row, fields["files"]),
+        links=links(row, answer.files),
     )
-
-
-def iso(seconds: float | None) -> str | None:
-    """Return s since 1970 as ISO 8601."""
-    if seconds is None:
-        return None
-    moment = datetime.datetime.fromtimestamp(seconds, datetime.UTC)
-    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
