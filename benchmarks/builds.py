@@ -74,7 +74,7 @@ def weighed_mass(path: Path) -> float:
 def _predicted(path: Path, mass: float) -> dict[str, list[Predictions]]:
     """Return each predictor's predictions of a flight's second half."""
     settings = settle(Options([str(path)], vehicle="crazyflie", mass=mass))
-    settings = replace(settings, job=JobFile(inlet=INLET, terms="none"))
+    settings = replace(settings, job=JobFile(inlet=INLET))
     (recording,), _ = read_usable(settings)
     whole = recording.flight
     first, second = cut(whole, 0.0, 0.5), cut(whole, 0.5, 1.0)

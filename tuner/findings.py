@@ -58,6 +58,8 @@ class Code(StrEnum):
     SCALES_WITH_MASS = "scales_with_mass"  # mass (kg); names: the coefficients
     NO_TACHOMETER = "no_tachometer"
     YAW_OPEN = "yaw_open"
+    RATE_WORSE = "rate_worse"  # before, after, hold (rad/s), seconds
+    RATE_NOT_FORETOLD = "rate_not_foretold"  # before, after, hold (rad/s), seconds
     VEHICLE_NOT_GIVEN = "vehicle_not_given"
     BENCH_CONFLICT = "bench_conflict"  # deviation (standard errors); names: the coefficients
 

@@ -15,6 +15,7 @@ from tuner.errors import InputError, RecordingError, did_you_mean
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
+from tuner.flights.stale import is_stale
 from tuner.objective.allocation import with_commands
 from tuner.objective.choice import choose_inlet
 from tuner.objective.inlets import INLETS, window_seconds
@@ -184,6 +185,12 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if flight_settings is not None:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
+    if is_stale(flight):
+        raise RecordingError(
+            flight.path,
+            "its attitude stops changing while the vehicle moves on, too soon for a flight",
+            "look at what stopped: the controller, or the logger",
+        )
     flight = with_commands(flight, settings.vehicle)
     choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     chosen = choice.inlet

@@ -20,6 +20,7 @@ from tuner.flights.mission import Mission, find_missions
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Contents, Recording, Samples
 from tuner.flights.sidecar import Sidecar, sidecar_path
+from tuner.flights.stale import without_stale
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
 
@@ -198,6 +199,12 @@ def read_content(
     topics = signals.topics
     series, shifted = align_pose(signals.series, topics)
     series, turned = correct_frames(series, topics)
+    cut, stale = without_stale(series)
+    missions = _missions(cut, sidecar)
+    if stale and not missions:  # read for inspection; a fit leaves such a flight out
+        missions = _missions(series, sidecar)
+    else:
+        series = cut
     return Content(
         signals.recording,
         signals.topic_map,
@@ -205,8 +212,8 @@ def read_content(
         signals.contents.samples,
         series,
         signals.epoch,
-        _missions(series, sidecar),
-        (*signals.notes, *shifted, *turned, *_unmeasured(series, topics)),
+        missions,
+        (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics)),
         signals.damage,
     )
 

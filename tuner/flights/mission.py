@@ -49,10 +49,13 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
 
     A mission starts where the attitude set-points begin. Where they run from the start, or where
     there are none, it starts where the reference begins to move or, without a reference, in the
-    air. What stands on the ground, take-off's first and landing's last centimetres are cut.
+    air. What stands on the ground, take-off's first and landing's last centimetres are cut, and
+    so is what follows the last attitude.
     """
     pose = series["position"].time
     first, last = float(pose[0]), float(pose[-1])
+    if "attitude" in series and series["attitude"].time[-1] < last - PAUSE:
+        last = float(series["attitude"].time[-1])
     flying = airborne(series)
     setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
     missions = []

@@ -38,6 +38,7 @@ class NoteCode(StrEnum):
     SAMPLES_MISSING = "samples_missing"
     NO_UNIT_QUATERNION = "no_unit_quaternion"
     REPEATED = "repeated"
+    STALE = "stale"  # seconds
     AWAY_AND_BACK = "away_and_back"
     AWAY_FOR_GOOD = "away_for_good"
     OUTLIERS = "outliers"

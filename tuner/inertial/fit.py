@@ -5,12 +5,13 @@ In the band of `tuner.inertial.signals`, with Ω the rotor speeds that follow th
     dω/dt = gain · Σ lever·Ω² + damping · ω + coupling · (ω × ω) + constant       about x, y, z
     f_z   = gain · ΣΩ² + decline · t·ΣΩ² + constant                              along z
 
-about x and y with the moment of drag, which the accelerometer shows and which acts at the height of
-the rotors, about z with the reaction of rotors that speed up. Commands are known exactly, so that
-noise biases no gain. The gains are linear: for given lags their best values are a solve, and the
-search moves three numbers (variable projection, Golub and Pereyra 1973). After Eschmann, Albani and
-Loianno, "Data-Driven System Identification of Quadrotors Subject to Motor Delays", 2024, who take
-the lag for symmetric.
+about x and y with the moment of drag, which the accelerometer shows, less its mean over the flight,
+and which acts at the height of the rotors, so that the constant is the steady moment of rotors that
+differ and of a mass that is not in the middle; about z with the reaction of rotors that speed up.
+Commands are known exactly, so that noise biases no gain. The gains are linear: for given lags their
+best values are a solve, and the search moves three numbers (variable projection, Golub and Pereyra
+1973). After Eschmann, Albani and Loianno, "Data-Driven System Identification of Quadrotors Subject
+to Motor Delays", 2024, who take the lag for symmetric.
 """
 
 from __future__ import annotations
@@ -28,6 +29,10 @@ from tuner.inertial.signals import Stretch, blocks_of, derivative, smoothed
 
 OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 """What is explained: three angular accelerations in rad/s², the specific force along z in m/s²."""
+STEADY = ("steady_roll", "steady_pitch", "steady_yaw")
+"""The constants of the first three, in rad/s²."""
+CONSTANT = 3
+"""The column of a constant among the regressors of an angular acceleration."""
 TAUS = (0.01, 0.02, 0.04, 0.07, 0.12)
 LATENCIES = (0.0, 0.01, 0.02)
 """s from which the search sets out; the likeliest of their pairs."""
@@ -46,11 +51,13 @@ class Response:
         Of the motors.
     gains
         Output -> the response to squared rotor speed: of torque's lever in m, or of thrust.
+    steady
+        Of `STEADY` -> rad/s².
     names
         Of the numbers in ``covariance``: ``up``, ``down`` (logarithms), ``late`` (s), `OUTPUTS`
-        (the gains).
+        (the gains), `STEADY`.
     covariance
-        (7, 7) of those, of blocks rather than samples: residuals are alike from one to the next.
+        (10, 10) of those, of blocks rather than samples: residuals are alike from one to the next.
     explained
         Output -> share of its variance that is explained.
     curves
@@ -61,6 +68,7 @@ class Response:
 
     lags: Lags
     gains: Mapping[str, float]
+    steady: Mapping[str, float]
     names: tuple[str, ...]
     covariance: Array
     explained: Mapping[str, float]
@@ -117,7 +125,11 @@ def fit_response(stretches: tuple[Stretch, ...], motor: Motor, levers: Array) ->
     return Response(
         lags=lags,
         gains={name: float(solution[0]) for name, (_, solution, _) in solved.items()},
-        names=("up", "down", "late", *OUTPUTS),
+        steady={
+            name: float(solved[output][1][CONSTANT])
+            for name, output in zip(STEADY, OUTPUTS, strict=False)
+        },
+        names=("up", "down", "late", *OUTPUTS, *STEADY),
         covariance=_covariance(problem, lags, solved),
         explained={
             name: 1.0 - float(np.var(left) / np.var(measured[name]))
@@ -164,6 +176,7 @@ def _regressors(stretch: Stretch, motor: Motor, levers: Array, lags: Lags) -> di
         for axis, name in enumerate(OUTPUTS[:3])
     }
     across = smoothed(stretch.force[:, :2], step)[inside]
+    across = across - across.mean(axis=0)
     columns["roll"] = np.column_stack([columns["roll"], across[:, 1]])
     columns["pitch"] = np.column_stack([columns["pitch"], across[:, 0]])
     spins = np.sign(levers[:, 2])
@@ -204,7 +217,8 @@ def _covariance(problem: _Problem, lags: Lags, solved: Solved) -> Array:
         np.add.at(meat, blocks, columns * (left / scale)[:, None])
         firsts.append(first)
         first += size
-    return _sandwich(bread, meat, [0, 1, 2, *firsts])
+    constants = [first + CONSTANT for first in firsts[: len(STEADY)]]
+    return _sandwich(bread, meat, [0, 1, 2, *firsts, *constants])
 
 
 def _sandwich(bread: Array, meat: Array, wanted: list[int]) -> Array:

@@ -2,8 +2,9 @@
 
 Thrust over mass and torque over inertia are all that specific force and body rate show. With the
 weighed mass and the vehicle file's curve of rotor speed over command, that is the motor constant
-and two moments of inertia; about z the moment constant over the third. Without a tachometer the
-curve stays as it is, and the motor constant goes with the inverse square of its scale.
+and two moments of inertia; about z the moment constant over the third. The angular acceleration
+that no command asks for is a steady moment over inertia: the vehicle's trim. Without a tachometer
+the curve stays as it is, and the motor constant goes with the inverse square of its scale.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from tuner.config import ControllerFile, VehicleFile
 from tuner.errors import RecordingError
 from tuner.flights.flight import Array
 from tuner.flights.inertial import InertialFlight
-from tuner.inertial.fit import OUTPUTS, Response, fit_response
+from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import SLOWEST, stretches_of
 from tuner.model import model_of
 from tuner.objective.explained import levers
@@ -35,8 +36,13 @@ NUMBERS = (
     ("motor_constant", "inertia_yy"),
     ("motor_constant", "moment_constant", "inertia_zz"),
     ("motor_constant",),
+    ("torque_trim_x",),
+    ("torque_trim_y",),
+    ("torque_trim_z",),
 )
 """The coefficients of each number of a `Response`: inertias divide, the others multiply."""
+TURNED = dict(zip(STEADY, OUTPUTS, strict=False))
+"""The angular acceleration that each constant is of."""
 ENOUGH = 0.1
 """Share of an output's variance below which nothing is taken from it."""
 DIM = 0.5
@@ -91,7 +97,8 @@ def _used(response: Response) -> tuple[str, ...]:
         if response.explained[name] > ENOUGH and error[name] < DIM * abs(response.gains[name])
     }
     lags = {name for name in ("up", "down") if error[name] < DIM} | {"late"}
-    return tuple(name for name in response.names if name in shown | lags)
+    steady = {name for name, output in TURNED.items() if output in shown}
+    return tuple(name for name in response.names if name in shown | lags | steady)
 
 
 def _measurement(
@@ -107,9 +114,15 @@ def _measurement(
         "yaw": math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
         "thrust": math.log(max(gains["thrust"] * vehicle.mass, 1e-300)),
     }
+    thrust = gains["thrust"] * vehicle.mass if "thrust" in used else None
+    constant = vehicle.aerodynamics.motor_constant if thrust is None else thrust
+    inertia = {name: constant / gains[output] for name, output in TURNED.items() if name in used}
+    values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
     places = [response.names.index(number) for number in used]
-    # gains enter by their logarithms
-    slope = np.array([1.0 / gains[number] if number in OUTPUTS else 1.0 for number in used])
+    # gains enter by their logarithms, constants as moments
+    slope = np.array(
+        [1.0 / gains[n] if n in OUTPUTS else inertia[n] if n in STEADY else 1.0 for n in used]
+    )
     covariance = response.covariance[np.ix_(places, places)] * np.outer(slope, slope)
     rows = [
         {c: -1.0 if c.startswith("inertia") else 1.0 for c in NUMBERS[place]} for place in places

@@ -16,7 +16,9 @@ from tuner.config import Settings, VehicleFile, values_of, with_values
 from tuner.errors import ConfigError, RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.inertial import InertialFlight, read_inertial
+from tuner.inertial.ahead import AHEAD, rate_errors
 from tuner.inertial.measurement import agreeing, measure_inertial
+from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.folder import folder_for
 from tuner.job.listener import SILENT, Listener
@@ -101,12 +103,38 @@ def fit_without_pose(
         vehicle.replace(name=f"{start.name}_inertial"),
         measurements,
         combination,
-        findings=(*_left_open(settings, combination.names), *conflicts_of(combination)),
+        findings=(
+            *_left_open(settings, combination.names),
+            *_foretold(flights, start, vehicle),
+            *conflicts_of(combination),
+        ),
         settings={"command": command, "origin": dict(settings.origin)},
         source={"flights": ", ".join(flight.name for flight in flights)},
         header=f"From flights without a pose; the rest as in {start.name}.",
         began=began,
     )
+
+
+def _foretold(
+    flights: Sequence[InertialFlight], start: VehicleFile, vehicle: VehicleFile
+) -> tuple[Finding, ...]:
+    """Return of which flights body rate is foretold worse than before, or than by holding it."""
+    findings = []
+    for flight in flights:
+        errors = rate_errors(stretches_of(flight.series, flight.flying), start, vehicle)
+        if errors is None:
+            continue
+        numbers = {
+            "before": errors.initial,
+            "after": errors.fitted,
+            "hold": errors.hold,
+            "seconds": AHEAD,
+        }
+        if errors.fitted > errors.initial:
+            findings.append(Finding(Code.RATE_WORSE, "warning", flight.name, numbers))
+        elif errors.fitted > errors.hold:
+            findings.append(Finding(Code.RATE_NOT_FORETOLD, "info", flight.name, numbers))
+    return tuple(findings)
 
 
 def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
@@ -128,7 +156,8 @@ def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
 
 def _without_yaw(measurement: Measurement) -> Measurement:
     """Return a measurement without what it says of inertia_zz, which it does not say alone."""
-    kept = [i for i, row in enumerate(measurement.rows) if "inertia_zz" not in row]
+    about_z = {"inertia_zz", "torque_trim_z"}
+    kept = [i for i, row in enumerate(measurement.rows) if not about_z & set(row)]
     return replace(
         measurement,
         rows=tuple(measurement.rows[i] for i in kept),

@@ -322,6 +322,23 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "The flights show moment_constant over inertia_zz, and not each of them.",
         "Measure one of the two: a bifilar pendulum gives inertia_zz (tune bench).",
     ),
+    Code.RATE_WORSE: (
+        (
+            "From its commands alone the fitted coefficients predict the body rate of this flight "
+            "{seconds:g} s ahead to {after:.3g} rad/s, worse than the initial ones did: "
+            "{before:.3g} rad/s."
+        ),
+        "Fit it by itself: another build, battery or propeller turns the vehicle otherwise.",
+    ),
+    Code.RATE_NOT_FORETOLD: (
+        (
+            "From its commands alone the fitted coefficients predict the body rate of this flight "
+            "{seconds:g} s ahead to {after:.3g} rad/s ({before:.3g} rad/s with the initial ones), "
+            "and that it stays as it is would be right to {hold:.3g} rad/s: commands answer "
+            "disturbances that are not recorded, and an open loop adds them up."
+        ),
+        "Predict less far ahead, or simulate the loop that flew.",
+    ),
     Code.VEHICLE_NOT_GIVEN: (
         (
             "No vehicle was given, so that these flights were taken for its own: without a pose "

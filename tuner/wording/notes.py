@@ -45,6 +45,10 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.SAMPLES_MISSING: "{samples} seem to be missing between those recorded",
     NoteCode.NO_UNIT_QUATERNION: "{samples} that are no unit quaternion dropped or normalised",
     NoteCode.REPEATED: "{samples} repeat the one before while the vehicle moves: dropped",
+    NoteCode.STALE: (
+        "{samples} repeat the one before to the bit through the last {seconds:.1f} s, while the "
+        "vehicle moves on: nothing measured them"
+    ),
     NoteCode.AWAY_AND_BACK: "{samples} jump away and back within a second: dropped",
     NoteCode.AWAY_FOR_GOOD: "{samples} leap and do not come back: check the recording",
     NoteCode.OUTLIERS: "{samples} far from their neighbours dropped as outliers",

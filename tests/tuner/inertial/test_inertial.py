@@ -18,6 +18,8 @@ from tuner.config import (
 from tuner.errors import RecordingError
 from tuner.findings import Code
 from tuner.flights.inertial import read_inertial
+from tuner.inertial.ahead import rate_errors
+from tuner.inertial.signals import stretches_of
 from tuner.job.inertial import fit_without_pose, without_pose
 from tuner.result import BEST_FIT_FILE
 from tuner.simulation.simulate import simulate
@@ -52,6 +54,10 @@ def log_file(simulation, path, *, order=ORDER):
         pwm = 65535 * signals["command"][:, rotor]
         columns[f"motor.m{place}"] = ("I", pwm)
     return log_of(simulation.time, dict(sorted(columns.items())), path)
+
+
+TRIM = 0.02
+"""Share of the weight that, at a rotor's place, turns the vehicle steadily."""
 
 
 def settings_for(path, vehicle):
@@ -92,6 +98,37 @@ def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tm
     best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert best["inertia_xx"] == pytest.approx(truth["inertia_xx"], rel=0.1)
     assert best["inertia_zz"] == pytest.approx(truth["inertia_zz"], rel=0.1)  # the proportion's
+
+
+def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
+    x, _, _ = flown.rotors[0].position
+    moment = TRIM * flown.mass * G * abs(x)
+    trimmed = with_values(flown, {"torque_trim_x": moment, "torque_trim_y": -2.0 * moment})
+    shape = TrajectorySettings(name="lemniscate", radius=1.0, omega=1.0, speed_scale=4.0)
+    simulation = next(iter(simulate(trimmed, ControllerFile(), shape, duration=14.0, rate=400.0)))
+    settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
+    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
+    for name, truth in {"torque_trim_x": moment, "torque_trim_y": -2.0 * moment}.items():
+        assert best[name] == pytest.approx(truth, rel=0.1), name
+        assert fitted.result.coefficients[name].fitted
+    # the file that leaves the trims out foretells the body rate worse
+    (flight,) = without_pose(settings)
+    stretches = stretches_of(flight.series, flight.flying)
+    foretold = rate_errors(stretches, flown, read_vehicle(fitted.folder / BEST_FIT_FILE))
+    assert foretold.fitted < 0.5 * foretold.initial
+    codes = {finding.code for finding in fitted.result.findings}
+    assert Code.RATE_WORSE not in codes
+
+
+def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeypatch):
+    settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
+    wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
+    monkeypatch.setattr("tuner.job.inertial.vehicle_of", lambda *_: wrong)
+    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
+    assert worse.level == "warning"
+    assert worse.numbers["after"] > worse.numbers["before"]
 
 
 @pytest.mark.slow

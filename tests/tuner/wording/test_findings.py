@@ -85,6 +85,18 @@ MADE = {
     ),
     Code.NO_TACHOMETER: Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
     Code.YAW_OPEN: Finding(Code.YAW_OPEN, "info", "inertia_zz"),
+    Code.RATE_WORSE: Finding(
+        Code.RATE_WORSE,
+        "warning",
+        "a",
+        {"before": 7.6, "after": 8.2, "hold": 1.8, "seconds": 0.5},
+    ),
+    Code.RATE_NOT_FORETOLD: Finding(
+        Code.RATE_NOT_FORETOLD,
+        "info",
+        "a",
+        {"before": 7.6, "after": 5.2, "hold": 1.8, "seconds": 0.5},
+    ),
     Code.VEHICLE_NOT_GIVEN: Finding(Code.VEHICLE_NOT_GIVEN, "warning", "hovergames"),
     Code.STILL_AXES: Finding(Code.STILL_AXES, "warning", "excitation", names=("x", "roll")),
     Code.NO_YAW: Finding(Code.NO_YAW, "warning", "excitation", {"rate": 0.1}),
