@@ -10,9 +10,10 @@ import numpy as np
 from tuner.selection.linear import RIDGE, Array, Columns, Linear
 from tuner.selection.score import long_run
 
-SMALLEST = 0.1
-"""Of a term's usual size (its prior's standard deviation), below which it is as good as absent."""
-SIZES = 25
+HIDDEN, SMALLEST = 0.4, 0.1
+"""Of the standard error with which the flights tell a term, and of its usual size (its prior's
+standard deviation): below the smaller of the two it is as good as absent."""
+SIZES = 40
 """Sizes that are looked at, from the smallest to the usual one, equally far apart in logarithm."""
 FLAT = 1e-10
 """Share of a group's information that every direction is taken to have at least: what is less is
@@ -24,7 +25,7 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array
 
     Each group is added by itself, to first order, as large as the flights let it be: a priori its
     coefficients are normal about their neutral values, as likely small as large (the logarithm of
-    their size is uniform, from a tenth of the usual to the usual one), and models with the
+    their size is uniform, from what is as good as absent to the usual size), and models with the
     group in each of these sizes are averaged by what the flights say of them. So a term that
     chance explains counts for little however much a refit would move with it, and one that the
     flights call for, but not surely enough to be added, for all of its move. The moves of all
@@ -104,7 +105,9 @@ class _Evidence:
     @property
     def mean_square(self) -> Array:
         """Mean squares (K,) of the moves, over all sizes by what the flights say of each."""
-        sizes = np.exp(np.linspace(np.log(SMALLEST), 0.0, SIZES))[:, None] ** 2
+        told = np.exp(0.5 * np.mean(np.log(np.maximum(self.variance, 1e-300))))
+        smallest = min(SMALLEST, HIDDEN * float(told))
+        sizes = np.exp(np.linspace(np.log(smallest), 0.0, SIZES))[:, None] ** 2
         allowed = sizes + self.variance
         log_weight = -0.5 * (np.log(allowed) + self.value**2 / allowed).sum(axis=1)
         weight = np.exp(log_weight - log_weight.max())
