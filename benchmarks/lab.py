@@ -222,4 +222,6 @@ def _holds(trial: Trial, name: str) -> bool:
 
 
 def _named(what: str, groups: Sequence[str]) -> str:
-    return f"{what} ({', '.join(sorted(groups))})" if groups else ""
+    times = {name: f" {n} ×" if n > 1 else "" for name, n in Counter(groups).items()}
+    named = ", ".join(f"{name}{times[name]}" for name in sorted(times))
+    return f"{what} ({named})" if groups else ""
