@@ -260,6 +260,8 @@ def _fitted_to(
         losses=np.array([np.inf]),
         free=Free(~held, np.zeros(fitted.point.offsets.shape, bool)),
         seed=0,
+        damping=np.ones(1),
+        last=True,
     )
     search = LeastSquares()
     state = search.init(problem)

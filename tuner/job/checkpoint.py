@@ -53,6 +53,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
             offsets=np.asarray(progress.points.offsets),
             scales=np.stack(list(progress.scales.values())),
             losses=progress.losses,
+            damping=progress.damping,
             states=np.zeros(0) if progress.states is None else progress.states,
         )
 
@@ -78,6 +79,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
             points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
             scales=dict(zip(head["channels"], data["scales"], strict=True)),
             losses=data["losses"],
+            damping=data["damping"],
             states=data["states"] if data["states"].size else None,
             iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
             evaluations=head["evaluations"],

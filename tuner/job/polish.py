@@ -66,6 +66,7 @@ def polished(
         losses=np.array([fitted.loss_best]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
+        damping=np.ones(1),
         feedback=feedback_of(fitted.objective),
     )
     return _grown(

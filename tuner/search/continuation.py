@@ -81,7 +81,7 @@ def grow(
             break
         tries_feedback = stage.tries_feedback and clipped
         run = search.run_with_and_without_feedback if tries_feedback else search.run
-        progress = run(stage, progress)
+        progress = run(stage, progress, last=progress.stage + 1 == len(stages))
     return progress
 
 
@@ -94,10 +94,10 @@ class _Search:
     on_progress: OnProgress
     seed: int
 
-    def run(self, stage: Stage, progress: Progress) -> Progress:
+    def run(self, stage: Stage, progress: Progress, *, last: bool) -> Progress:
         """Run one stage to its end for every start at once."""
         optimiser = OPTIMISERS[stage.optimiser]
-        problem = _problem(self, stage, progress)
+        problem = _problem(self, stage, progress, last=last)
         state = optimiser.init(problem)
         converged = False
         while progress.steps < stage.steps and not converged:
@@ -107,7 +107,9 @@ class _Search:
             converged = optimiser.terminate(problem, state)
         return replace(_finished(problem, progress), converged=converged)
 
-    def run_with_and_without_feedback(self, stage: Stage, progress: Progress) -> Progress:
+    def run_with_and_without_feedback(
+        self, stage: Stage, progress: Progress, *, last: bool
+    ) -> Progress:
         """Run one stage with and without the mixer's saturation feedback, and keep the better."""
         switched = replace(progress, feedback=1.0 - progress.feedback)
 
@@ -115,14 +117,14 @@ class _Search:
             # a checkpoint begins with both again
             self.on_progress(replace(rival, feedback=progress.feedback))
 
-        after = self.run(stage, progress)
-        rival = replace(self, on_progress=on_progress_of_rival).run(stage, switched)
+        after = self.run(stage, progress, last=last)
+        rival = replace(self, on_progress=on_progress_of_rival).run(stage, switched, last=last)
         evaluations = after.evaluations + rival.evaluations - progress.evaluations
         better = after if after.losses.min() <= FEEDBACK_GAIN * rival.losses.min() else rival
         return replace(better, evaluations=evaluations)
 
 
-def _problem(search: _Search, stage: Stage, progress: Progress) -> StageProblem:
+def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
     """Return what the stage's optimiser minimises, from where the search stands."""
     (points, kept), free = _offsets_that_matter(stage, progress), search.free
     best = int(np.argmin(progress.losses))
@@ -136,6 +138,8 @@ def _problem(search: _Search, stage: Stage, progress: Progress) -> StageProblem:
         losses=progress.losses,
         free=Free(free.coefficients & stage.coefficients, free.offsets & kept & stage.offsets),
         seed=1 + search.seed + 1000 * progress.stage,
+        damping=progress.damping,
+        last=last,
     )
     return _with_clocks_set_right(problem, best) if stage.prunes else problem
 
@@ -193,13 +197,15 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
     """Return where the search stands after the stage, the next one's weights included."""
     stage, iterate = problem.stage, progress.iterate
     assert iterate is not None, "a stage takes at least one step"
+    onward = None if problem.last else iterate.onward
     progress = replace(
         progress,
         stage=progress.stage + 1,
-        points=iterate.points,
+        points=iterate.points if onward is None else onward.points,
         losses=iterate.losses,
         steps=0,
         iterate=None,
+        damping=np.ones(len(iterate.losses)) if onward is None else onward.damping,
     )
     if iterate.sums is None:
         return progress

@@ -5,13 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import Step, advance, begin, on_host
-from tuner.search.optimiser import Iterate, Optimiser, StageProblem
+from tuner.search.levenberg_marquardt import Step, advance, begin, on_host, proposed
+from tuner.search.optimiser import Iterate, Onward, Optimiser, StageProblem
+from tuner.search.weights import NEAR, worst_channels
+
+HANDED_ON = 0.01
+"""Share of the loss: where a stage's normal equations promise no more, their step is not tried in
+it, but in the next. With 0.05 instead, a flight of noise among good ones leads the search astray,
+`examples/search_trials.py`."""
+LEAST_DAMPING = 1e-6
+"""λ that no stage begins below, relative to the Hessian per compared value."""
+SETTLED = 0.5 * 0.1**2
+"""Promised rise of the log-likelihood at which the last stage ends: a tenth of a standard error."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +49,7 @@ class LeastSquares(Optimiser):
 
     def init(self, problem: StageProblem) -> Descent:
         """Return the solver before its first step from the stage's points."""
-        return Descent(begin(on_host(problem.points)))
+        return Descent(begin(on_host(problem.points), problem.damping))
 
     def step(self, problem: StageProblem, state: Descent) -> tuple[Descent, Iterate]:
         """Fly every start's next point with derivatives; keep those that are better."""
@@ -52,6 +64,7 @@ class LeastSquares(Optimiser):
             position_rmse=_position_rmse(problem.objective, step, best),
             damping=float(step.damping[best]),
             sums=step.sums,
+            onward=_onward(problem, step),
         )
         return Descent(step, (*state.losses, losses)), iterate
 
@@ -60,12 +73,14 @@ class LeastSquares(Optimiser):
 
         optimistix's own rule, `Step.still`, ends a start whose nine leading digits no longer
         change. No recording has so many, so that a stage's tolerance ends it sooner: as soon as the
-        loss gains less than that, by the last accepted step or by the last three tries.
+        loss gains less than that, by the last accepted step or by the last three tries; or before
+        that step is tried, where the normal equations promise no gain that matters.
         """
         if not state.losses:
             return False
         tolerance, last = problem.stage.tolerance, state.losses[-1]
         ended = (last <= problem.stage.enough) | np.asarray(state.step.still)
+        ended |= _promises_little(problem, state.step)
         if len(state.losses) == 1:
             return bool(np.all(ended))
         accepted = np.asarray(state.step.accepted)
@@ -78,6 +93,40 @@ def _gains_little(losses: Sequence[NDArray[np.float64]], tolerance: float) -> ND
     """Return (S,) whether the loss fell by no more than a share of itself."""
     first, *_, last = losses
     return np.asarray(first - last <= tolerance * np.abs(last))
+
+
+def _promises_little(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
+    """Return (S,) whether no step from the best points is worth to be tried in this stage."""
+    promise = np.asarray(step.promise)
+    if not problem.last:
+        return np.asarray((promise <= HANDED_ON) & _is_near(problem, step))
+    assert step.sums is not None, "what has stepped has sums"
+    compared = sum(np.sum(np.asarray(n), axis=-1) for n in step.sums.counts.values())
+    return np.asarray(promise * np.asarray(step.loss) * compared <= SETTLED)
+
+
+def _is_near(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
+    """Return (S,) whether most flights are met so well that the normal equations can be trusted.
+
+    A model that lacks something is led astray by long steps: the damping that a stage begins with
+    holds it where the last one ended.
+    """
+    assert step.sums is not None, "what has stepped has sums"
+    worst = worst_channels(problem.objective, step.sums)
+    return np.asarray(np.asarray(step.accepted) & (np.median(worst, axis=-1) <= NEAR))
+
+
+def _onward(problem: StageProblem, step: Step) -> Onward:
+    """Return what a next stage begins with: the trust that was earned, if the fit is near."""
+    near = _is_near(problem, step)
+    untried = np.asarray(near & (step.promise <= HANDED_ON))
+    points: Point = jax.tree.map(
+        lambda new, old: np.where(untried.reshape(-1, *[1] * (old.ndim - 1)), new, old),
+        proposed(step),
+        step.point,
+    )
+    damping = np.where(near, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
+    return Onward(points, damping)
 
 
 def _position_rmse(objective: Objective, step: Step, start: int) -> float:

@@ -22,6 +22,7 @@ import optimistix
 from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
 
 from tuner.coefficients.space import Coordinates
 from tuner.objective.criterion import Criterion, Point, SegmentSums
@@ -73,6 +74,9 @@ class Step(eqx.Module):
     still
         Whether optimistix's own `terminate` holds: the accepted point and its residuals differ
         from those before by less than 1e-9.
+    promise
+        Share of the loss at the best point by which its minimum would be lower, were the residuals
+        linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
     """
 
     point: Point
@@ -82,6 +86,7 @@ class Step(eqx.Module):
     accepted: Bool[Array, ""]
     damping: Float[Array, ""]
     still: Bool[Array, ""]
+    promise: Float[Array, ""]
 
 
 def _pack(point: Point) -> Array:
@@ -94,16 +99,19 @@ def _unpack(packed: Array, like: Point) -> Point:
 
 
 @eqx.filter_jit
-def _init(parameters: Array) -> Any:
-    """Return the solver's state before the first step, for S starts (S, P)."""
+def _init(parameters: Array, damping: Array) -> Any:
+    """Return the solver's state before the first step, for S starts (S, P) and their λ (S,)."""
 
-    def init(parameters: Array) -> Any:
+    def init(parameters: Array, damping: Array) -> Any:
         count = len(parameters)
         shapes = LinearResiduals(jnp.eye(count), jnp.zeros(count + 1), parameters)
         residual, _ = jax.eval_shape(residuals_at, parameters, shapes)
-        return _SOLVER.init(residuals_at, parameters, shapes, _NO_OPTIONS, residual, None, _NO_TAGS)
+        state = _SOLVER.init(
+            residuals_at, parameters, shapes, _NO_OPTIONS, residual, None, _NO_TAGS
+        )
+        return eqx.tree_at(lambda s: s.search_state.step_size, state, 1.0 / damping)
 
-    return eqx.filter_vmap(init)(parameters)
+    return eqx.filter_vmap(init)(parameters, damping)
 
 
 @eqx.filter_jit
@@ -135,32 +143,43 @@ def _step(
             accepted=solver.num_steps_since_acceptance == 0,
             damping=1.0 / solver.search_state.step_size,
             still=still,
+            promise=_promise(solver.f_info),
         )
 
     after: Step = eqx.filter_vmap(advanced)(step)
     return after
 
 
-def begin(points: Point) -> Step:
+def _promise(info: Any) -> Array:
+    """Return the share of a loss that `linear_residuals` say can be gained: r is (L⁻¹g, rest)."""
+    gain = 0.5 * jnp.sum(info.residual[:-1] ** 2)
+    return gain / jnp.maximum(info.as_min(), 1e-300)
+
+
+def begin(points: Point, damping: NDArray[np.float64] | None = None) -> Step:
     """Return where the solver stands before its first step from S points.
 
     Parameters
     ----------
     points
         The starts; their leaves have S first, and so has every array returned.
+    damping
+        (S,) λ of the first step, relative to the Hessian per compared value; 1 by default.
     """
     starts = len(points.coefficients)
+    first = jnp.ones(starts) if damping is None else jnp.asarray(damping)
     return cast(
         Step,
         on_host(
             Step(
                 point=points,
-                solver=_init(jax.vmap(_pack)(points)),
+                solver=_init(jax.vmap(_pack)(points), first),
                 sums=None,
                 loss=jnp.full(starts, jnp.inf),
                 accepted=jnp.ones(starts, bool),
-                damping=jnp.ones(starts),
+                damping=first,
                 still=jnp.zeros(starts, bool),
+                promise=jnp.full(starts, jnp.inf),
             )
         ),
     )
@@ -183,15 +202,19 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     free
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
-    tried = jax.vmap(_unpack)(jnp.asarray(before.solver.y_eval), before.point)
     after = _step(
         objective.space.coordinates,
         np.asarray(objective.segments.flight),
-        replace(before, sums=sums_at(objective, on_host(tried), criterion)),
+        replace(before, sums=sums_at(objective, proposed(before), criterion)),
         criterion,
         np.asarray(free),
     )
     return cast(Step, on_host(after))
+
+
+def proposed(step: Step) -> Point:
+    """Return the points (S) that are to be tried next."""
+    return cast(Point, on_host(jax.vmap(_unpack)(jnp.asarray(step.solver.y_eval), step.point)))
 
 
 def on_host(tree: Any) -> Any:

@@ -52,6 +52,10 @@ class StageProblem:
         What may move in this stage.
     seed
         For an optimiser that draws at random; differs from stage to stage.
+    damping
+        (S,) λ to begin with, for an optimiser that damps its steps.
+    last
+        Whether no stage follows, so that what is found has to stand.
     """
 
     objective: Objective
@@ -61,11 +65,29 @@ class StageProblem:
     losses: NDArray[np.float64]
     free: Free
     seed: int
+    damping: NDArray[np.float64]
+    last: bool
 
     @property
     def best(self) -> int:
         """The number of the start with the least loss."""
         return int(np.argmin(self.losses))
+
+
+@dataclass(frozen=True)
+class Onward:
+    """What a stage hands on.
+
+    Attributes
+    ----------
+    points
+        S points; one that promises to differ by little has not been tried.
+    damping
+        (S,) λ.
+    """
+
+    points: Point
+    damping: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -87,6 +109,8 @@ class Iterate:
     sums
         The segments' sums at the points tried, S first; None where they were not computed. The
         next stage's weights follow from those of the last step.
+    onward
+        What the next stage begins with, if there is one; None for ``points`` and a damping of 1.
     """
 
     points: Point
@@ -95,6 +119,7 @@ class Iterate:
     position_rmse: float
     damping: float = float("nan")
     sums: SegmentSums | None = None
+    onward: Onward | None = None
 
 
 class Optimiser(ABC):

@@ -49,6 +49,8 @@ class Progress:
         The mixer's saturation feedback that is flown: 1 as in PX4.
     left
         s that the search may still take; NaN where that is unknown.
+    damping
+        (S,) λ with which the next stage begins.
     steps, iterate
         How many steps of the stage are done, and where the last one led; None between stages.
     """
@@ -60,6 +62,7 @@ class Progress:
     losses: NDArray[np.float64]
     iterations: tuple[Iteration, ...]
     evaluations: int
+    damping: NDArray[np.float64]
     converged: bool = False
     feedback: float = 1.0
     left: float = float("nan")
@@ -86,6 +89,7 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
         losses=np.full(len(vectors), np.inf),
         iterations=(),
         evaluations=0,
+        damping=np.ones(len(vectors)),
         feedback=feedback_of(objective),
     )
 

@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import SegmentSums
 from tuner.objective.normal import Objective
 
+NEAR = 3.0
+"""Multiple of the noise up to which a flight counts as met, by its worst channel."""
 STRAY = 3.0
 """A flight that is met this many times worse than the median one counts less."""
 
@@ -31,6 +33,24 @@ def root_mean_squares(
         mean = np.bincount(flight, np.asarray(squares[best]), flights) / np.maximum(counts, 1.0)
         residual[name] = np.where(counts > 0, np.sqrt(mean), np.nan)
     return residual
+
+
+def worst_channels(objective: Objective, sums: SegmentSums) -> NDArray[np.float64]:
+    """Return (S, N) root mean square residual in σ of each flight's worst channel.
+
+    Parameters
+    ----------
+    objective
+        Says which segment belongs to which flight.
+    sums
+        The segments' sums with S first.
+    """
+    owner = np.eye(objective.flights)[np.asarray(objective.segments.flight)]
+    squares = [
+        (np.asarray(total) @ owner) / np.maximum(np.asarray(sums.counts[name]) @ owner, 1.0)
+        for name, total in sums.squares.items()
+    ]
+    return np.asarray(np.sqrt(np.max(squares, axis=0)))
 
 
 def strays(

@@ -1,6 +1,9 @@
 """The growing horizon on two short simulated flights whose truth is known."""
 
+from itertools import pairwise
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,8 +11,9 @@ import pytest
 from tests.tuner.uncertainty.making import problem, truth, with_data
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
+from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import Free
-from tuner.search.progress import beginning
+from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import schedule_of
 
 FREE = ("inertia_xx", "inertia_zz", "time_constant_up", "motor_constant", "input_scaling")
@@ -69,3 +73,30 @@ def test_the_same_search_twice_gives_the_same_numbers(fit):
     first, _ = searched(fit, start)
     second, _ = searched(fit, start)
     np.testing.assert_array_equal(first.points.coefficients, second.points.coefficients)
+
+
+def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
+    start = np.asarray(fit.space.initial) + 0.1
+    progress, reports = searched(fit, [start])
+    last = reports[-1]
+    iterate, stage = last.iterate, schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1]
+    assert iterate.accepted[0]
+    assert progress.points is iterate.points  # what it ends with was flown
+    point, here = point_of(iterate.points, 0), jax.tree.map(lambda leaf: leaf[0], iterate.sums)
+    criterion = criterion_of(stage, last.scales, np.asarray(point.offsets))
+    flight, count = np.asarray(fit.segments.flight), len(fit.space)
+    _, gradient, hessian = normal_equations(fit.space, flight, point, criterion, here)
+    compared = sum(float(np.sum(n)) for n in here.counts.values())
+    gradient, hessian = np.asarray(gradient)[:count], np.asarray(hessian)[:count, :count]
+    away = np.sqrt(compared * gradient @ np.linalg.solve(hessian, gradient))
+    assert away <= 0.1
+
+
+def test_a_stage_begins_with_the_trust_that_the_last_one_earned(fit):
+    progress, _ = searched(fit, [np.asarray(fit.space.initial) + 0.1])
+    pairs = list(pairwise(progress.iterations))
+    borders = [(old, new) for old, new in pairs if old.stage != new.stage]
+    assert len(borders) > 3
+    for old, new in borders:
+        assert new.damping == pytest.approx(min(old.damping, 1.0)) or new.damping == 1.0, new.stage
+    assert borders[-1][1].damping < 1e-2
