@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
+from sim_jax.numeric import GRAVITY
 from tuner.bench.bench_json import bench_record
 from tuner.bench.combine import Combination, combine
 from tuner.bench.experiments import measure, names_of
@@ -50,6 +51,8 @@ from tuner.uncertainty.verdict import (
 from tuner.versions import PROGRAM, versions
 from tuner.wording.verdicts import judgement_in_words
 
+SLIGHT = 1e-3
+"""Share of the weight that, at a rotor's place, is a slight moment."""
 RELINEARISATIONS = 3
 """Times that yaw spins are linearised at the motor constant that all experiments give."""
 
@@ -258,7 +261,8 @@ def _coefficients(
             )
             continue
         place = places[name]
-        verdict, reason = _judged(name, place, combination, measurements)
+        least = least_noticed(name, start)
+        verdict, reason = _judged(name, place, combination, measurements, least)
         known = bool(combination.determined[place])
         scaled = float(combination.scaled[place])
         deviation = float(np.sqrt(combination.covariance[place, place]))
@@ -278,8 +282,23 @@ def _coefficients(
     return coefficients
 
 
+def least_noticed(name: str, vehicle: VehicleFile) -> float:
+    """Return the size of a coefficient that is no logarithm below which nobody notices it.
+
+    A steady moment counts by the vehicle's own: `SLIGHT` of its weight at a rotor's place.
+    """
+    if not name.startswith("torque_trim"):
+        return COEFFICIENTS[name].step
+    arm = float(np.mean([np.hypot(*rotor.position[:2]) for rotor in vehicle.rotors]))
+    return SLIGHT * vehicle.mass * GRAVITY * arm
+
+
 def _judged(
-    name: str, place: int, combination: Combination, measurements: Sequence[Measurement]
+    name: str,
+    place: int,
+    combination: Combination,
+    measurements: Sequence[Measurement],
+    least: float,
 ) -> tuple[Verdict, Reason]:
     """Return how well the experiments determine a coefficient, and why."""
     if not combination.determined[place]:
@@ -292,7 +311,7 @@ def _judged(
         return Verdict.NOT_IDENTIFIABLE, reason
     row, scaled = COEFFICIENTS[name], float(combination.scaled[place])
     deviation = float(np.sqrt(combination.covariance[place, place]))
-    relative = deviation if row.scale == "log" else deviation / max(abs(scaled), row.step)
+    relative = deviation if row.scale == "log" else deviation / max(abs(scaled), least)
     half_width = QUANTILE * deviation
     unit = None if row.scale == "log" else row.unit
     if relative > IDENTIFIABLE_ERROR:

@@ -20,6 +20,7 @@ from tuner.findings import Code
 from tuner.flights.inertial import read_inertial
 from tuner.inertial.ahead import rate_errors
 from tuner.inertial.signals import stretches_of
+from tuner.job.bench import least_noticed
 from tuner.job.inertial import fit_without_pose, without_pose
 from tuner.result import BEST_FIT_FILE
 from tuner.simulation.simulate import simulate
@@ -112,6 +113,9 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
     for name, truth in {"torque_trim_x": moment, "torque_trim_y": -2.0 * moment}.items():
         assert best[name] == pytest.approx(truth, rel=0.1), name
         assert fitted.result.coefficients[name].fitted
+        # known by its own size or the vehicle's, whichever is larger, small as the vehicle may be
+        assert least_noticed(name, flown) < 0.1 * moment
+        assert least_noticed(name, flown.replace(mass=1e-3)) < 1e-3 * moment
     # the file that leaves the trims out foretells the body rate worse
     (flight,) = without_pose(settings)
     stretches = stretches_of(flight.series, flight.flying)
