@@ -76,10 +76,12 @@ def test_the_same_search_twice_gives_the_same_numbers(fit):
 
 
 def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
-    start = np.asarray(fit.space.initial) + 0.1
-    progress, reports = searched(fit, [start])
+    stage, reports = schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1], []
+    free = Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool))
+    start = beginning(fit, np.asarray(fit.space.initial)[None] + 0.02)
+    progress = grow(fit, (stage,), start, free=free, clipped=False, on_progress=reports.append)
     last = reports[-1]
-    iterate, stage = last.iterate, schedule_of(fit.samples, 1.0, robust=True, steps=30)[-1]
+    iterate = last.iterate
     assert iterate.accepted[0]
     assert progress.points is iterate.points  # what it ends with was flown
     point, here = point_of(iterate.points, 0), jax.tree.map(lambda leaf: leaf[0], iterate.sums)
