@@ -8,12 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.memory import give_back
+from tests.memory import BEFORE_A_FIT, give_back
 from tuner.result import RunResult, read_run
 
 FLIGHTS = Path(__file__).parents[1] / "reference_flights"
-BEFORE = 600 * 2**20
-"""bytes beyond which a process gives back what it can before the fit, the suite's largest."""
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +28,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RunResult]:
     with (shared / "demo.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / RunResult.FILE).exists():
-            give_back(BEFORE)
+            give_back(BEFORE_A_FIT)
             bags = [str(path) for path in sorted(FLIGHTS.glob("*.bag"))]
             with profiling(True, quiet=True) as profile_into:
                 run(Options(bags), out=folder)

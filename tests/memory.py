@@ -13,6 +13,8 @@ MOST_MEMORY = 900 * 2**20
 """bytes of a process at the end of a module beyond which its compiled programs are dropped."""
 MOST_IN_A_MODULE = 1100 * 2**20
 """The same at the end of a test that others of its module follow, with which it shares programs."""
+BEFORE_A_FIT = 600 * 2**20
+"""bytes beyond which a process gives back what it can before it fits recorded flights."""
 GROWTH = 150 * 2**20
 """bytes by which a process grows beyond what it could not give back before it tries again."""
 

@@ -22,6 +22,7 @@ from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.terms import total
 from sim_jax.vector import Vec3
+from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.coefficients import EFFECTS, REGISTRY, Coefficient, NotCarried, Written
 from tuner.config import (
@@ -158,6 +159,7 @@ def test_a_row_is_a_key_of_the_vehicle_file_and_of_the_job_file(updated, tmp_pat
 @pytest.mark.slow
 @pytest.mark.usefixtures("added", "ini_target")
 def test_a_coefficient_and_its_term_are_fitted_judged_reported_and_exported(updated, tmp_path):
+    give_back(BEFORE_A_FIT)
     flown = with_values(updated, {NAME: TRUTH})
     bag = tmp_path / "circle.bag"
     flights = tuner.simulate("circle", vehicle=flown, radius=1.0, speed=3.0, duration=12.0)
