@@ -110,7 +110,7 @@ def collect_rarely() -> None:
 
 def return_memory() -> None:
     """Give memory that nobody uses back to the system, where the C library can: that of glibc."""
-    with suppress(OSError, AttributeError):
+    with suppress(OSError, AttributeError, TypeError):  # the last is what Windows answers
         ctypes.CDLL(None).malloc_trim(0)
 
 

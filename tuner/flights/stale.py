@@ -32,8 +32,7 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
         time, values = series[name].time, series[name].values
         changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
         last = int(changes[-1]) + 1 if len(changes) else 0
-        after = position.values[position.time >= time[last]]
-        if not last or time[-1] - time[last] < LASTS or np.ptp(after, axis=0).max() < MOVED:
+        if not last or time[-1] - time[last] < LASTS or not _moves(position, time[last]):
             continue
         kept[name] = Series(time[: last + 1], values[: last + 1])
         numbers = {"seconds": float(time[-1] - time[last])}
@@ -41,6 +40,12 @@ def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list
             Note(NoteCode.STALE, count=len(time) - last - 1, numbers=numbers, names=(name,))
         )
     return kept, notes
+
+
+def _moves(position: Series, since: float) -> bool:
+    """Return whether the vehicle is seen to move; without a position it is not."""
+    places = position.values[(position.time >= since) & np.isfinite(position.values).all(axis=1)]
+    return len(places) > 0 and bool(np.ptp(places, axis=0).max() >= MOVED)
 
 
 def is_stale(flight: Flight) -> bool:

@@ -45,6 +45,15 @@ def test_a_vehicle_at_rest_and_a_moment_without_change_are_left_alone(stops, mov
     assert find_missions(kept)[0].end == pytest.approx(TIME[-1])
 
 
+@pytest.mark.parametrize("lost", [np.s_[:300], np.s_[:]])
+def test_where_no_position_is_seen_nothing_is_taken_for_motion(lost) -> None:
+    signals = flight(6.0, moves=True)
+    position = signals["position"]
+    unseen = np.where(TIME[:, None] < 3.0, position.values, np.nan)
+    signals["position"] = Series(TIME[lost], unseen[lost])
+    assert without_stale(signals) == (signals, [])
+
+
 def written(path, stops: float):
     """Write a table of such a flight."""
     signals = flight(stops, moves=True)
