@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -12,15 +12,23 @@ from tuner.cli.tables import console, print_settings
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from tuner.job.listener import Listener
     from tuner.search.iteration import Iteration
+    from tuner.search.point_estimate import PointEstimate
+
+
+SEARCHED = (
+    "The search ended here. Which terms the flights call for, how far each value can be trusted, "
+    "and how well held-out flights are predicted, follows."
+)
 
 
 @contextmanager
 def listening(*, quiet: bool) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing."""
-    from tuner.cli.results import folds_table
+    from tuner.cli.results import estimates_table, folds_table
     from tuner.job.listener import SILENT, Listener
 
     if quiet:
@@ -28,12 +36,18 @@ def listening(*, quiet: bool) -> Iterator[Listener]:
         return
     screen = console()
     search = _MovingLine(screen) if screen.is_terminal else _StageLines(screen)
+
+    def show_estimates(estimates: Sequence[PointEstimate]) -> None:
+        search.table(estimates_table(estimates))
+        search.message(SEARCHED)
+
     try:
         yield Listener(
             on_settings=lambda settings: print_settings(settings, screen),
             on_iteration=search.show,
+            on_estimates=show_estimates,
             on_message=search.message,
-            on_folds=lambda folds: screen.print(folds_table(folds)),
+            on_folds=lambda folds: search.table(folds_table(folds)),
         )
     finally:
         search.close()
@@ -55,6 +69,9 @@ class _MovingLine:
     def message(self, text: str) -> None:
         self._screen.print(text, markup=False)
 
+    def table(self, table: Table) -> None:
+        self._screen.print(table)
+
     def close(self) -> None:
         self._status.stop()
 
@@ -75,6 +92,10 @@ class _StageLines:
     def message(self, text: str) -> None:
         self.close()
         self._screen.print(text, markup=False, soft_wrap=True)
+
+    def table(self, table: Table) -> None:
+        self.close()
+        self._screen.print(table)
 
     def close(self) -> None:
         if self._last is not None:

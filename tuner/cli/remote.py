@@ -55,6 +55,7 @@ def client_of(server: str | None, token: str | None) -> Iterator[Client]:
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:
     """Pass what happens to a job on to a listener, as a run on this machine does."""
     from tuner.search.iteration import Iteration
+    from tuner.search.point_estimate import PointEstimate
 
     for kind, content in events:
         if kind == "message":
@@ -62,6 +63,8 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
         elif kind == "iteration":
             left = content.pop("seconds_left", None)
             listener.on_iteration(Iteration(**content), float("nan") if left is None else left)
+        elif kind == "estimates":
+            listener.on_estimates([PointEstimate(**row) for row in content["estimates"]])
         elif kind == "folds":
             listener.on_folds(_folds(content["folds"]))
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tuner.job.cross_validation import Fold
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import AxesRmse, EffectiveResult, RunResult
+    from tuner.search.point_estimate import PointEstimate
 
 RMSE_COLUMNS = [f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()]
 NOT_SIMULATED = "–"
@@ -211,6 +212,15 @@ def _predictions(result: RunResult) -> Table:
                 for name in PREDICTED
             ]
             table.add_row(flight.name + held_out, f"{after.seconds:g} s", *cells)
+    return table
+
+
+def estimates_table(estimates: Sequence[PointEstimate]) -> Table:
+    """Return where a search ended, of which nothing is known yet but the values."""
+    table = columns_of(left=("coefficient",), right=("initial", "estimate"))
+    table.add_column("unit")
+    for row in estimates:
+        table.add_row(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit)
     return table
 
 

@@ -12,6 +12,7 @@ from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings import with_conditions, with_offsets
 from tuner.search.fitted import Fitted
+from tuner.search.point_estimate import PointEstimate
 
 
 def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
@@ -32,6 +33,17 @@ def best_values(job: Job, fitted: Fitted) -> dict[str, float]:
     held = {*impossible_inertia(job, fitted), *_held(job, fitted)}
     values = job.space.numbers(fitted.point.coefficients)
     return {name: initial[name] if name in held else v for name, v in values.items()}
+
+
+def point_estimates(job: Job, fitted: Fitted) -> tuple[PointEstimate, ...]:
+    """Return each free coefficient's initial and reported value."""
+    initial = initial_of(job)
+    return tuple(
+        PointEstimate(
+            name=name, unit=COEFFICIENTS[name].unit, initial=initial[name], estimate=estimate
+        )
+        for name, estimate in best_values(job, fitted).items()
+    )
 
 
 def initial_of(job: Job) -> dict[str, float]:

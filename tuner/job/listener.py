@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from tuner.config import Settings
     from tuner.job.cross_validation import Fold
     from tuner.search.iteration import Iteration
+    from tuner.search.point_estimate import PointEstimate
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,8 @@ class Listener:
     on_iteration
         Gets each iteration of the search, and the s that the search may still take (NaN where that
         is unknown).
+    on_estimates
+        Gets where the search of the base model ended, long before intervals and validation.
     on_message
         Gets a sentence on what is done next, or on what a user should know.
     on_folds
@@ -31,6 +34,7 @@ class Listener:
 
     on_settings: Callable[[Settings], None] = lambda _: None
     on_iteration: Callable[[Iteration, float], None] = lambda *_: None
+    on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None
     on_message: Callable[[str], None] = lambda _: None
     on_folds: Callable[[Sequence[Fold]], None] = lambda _: None
 

@@ -215,6 +215,7 @@ def _fitted(
                 resume=resume,
                 on_progress=on_progress,
                 on_message=listener.on_message,
+                on_estimates=listener.on_estimates,
                 findings=(*findings, *at_start),
                 before_selection=ahead.await_selection,
             )

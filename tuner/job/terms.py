@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from tuner.findings import Finding
+from tuner.job.best_fit import point_estimates
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, search
 from tuner.job.selected import Selected
 from tuner.job.selection import Selection
 from tuner.objective.inlets import INLETS
 from tuner.search.fitted import Fitted
+from tuner.search.point_estimate import PointEstimate
 from tuner.selection.candidates import Groups, candidate_groups, groups_around
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.spans import span
@@ -26,14 +28,16 @@ def search_with_terms(
     resume: bool,
     on_progress: OnProgress,
     on_message: Callable[[str], None],
+    on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None,
     findings: tuple[Finding, ...] = (),
     before_selection: Callable[[], None] = lambda: None,
 ) -> Selected:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
     Where most flights are far off, terms are tried before the base model is polished, and before
-    CMA-ES looks for another beginning. Arguments and errors are those of `search`;
-    ``before_selection`` is called between the two.
+    CMA-ES looks for another beginning. Arguments and errors are those of `search`; between the two,
+    ``on_estimates`` gets where it ended, unless it has stopped because the model is far off, and
+    ``before_selection`` is called.
     """
 
     def searched(*, resume: bool, provisional: bool) -> Selected:
@@ -46,6 +50,8 @@ def search_with_terms(
                 findings=findings,
                 provisional=provisional,
             )
+        if fitted.polished:
+            on_estimates(point_estimates(job, fitted))
         with span("selection of terms"):
             before_selection()
             return with_terms_selected(job, fitted, on_progress, on_message)

@@ -160,7 +160,7 @@ def _follow(
             ended = line is None
             message = _message(line)
             kind = message.pop("kind", None)
-            if kind in ("message", "iteration", "folds"):
+            if kind in ("message", "iteration", "estimates", "folds"):
                 events.append((kind, message))
             elif kind in ("done", "refused", "fault"):
                 last, ended = {"kind": kind, **message}, True

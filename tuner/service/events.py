@@ -24,8 +24,8 @@ SILENCE = 15.0
 async def follow(service: Service, job: str, after: int) -> AsyncIterator[str]:
     """Yield the events of a job after one of them, and the job whenever it changes, to its end.
 
-    ``message``, ``iteration``, ``folds`` and ``state`` are what happened, with their numbers as
-    ids; ``job`` is the job as it stands.
+    ``message``, ``iteration``, ``estimates``, ``folds`` and ``state`` are what happened, with their
+    numbers as ids; ``job`` is the job as it stands.
     """
     shown, quiet = "", 0.0
     while not service.stopping.is_set():

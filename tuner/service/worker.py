@@ -134,6 +134,9 @@ def _listener(channel: IO[str]) -> Any:
         rest = None if math.isnan(left) else left
         say("iteration", **iteration.model_dump(mode="json"), seconds_left=rest)
 
+    def on_estimates(estimates: Sequence[Any]) -> None:
+        say("estimates", estimates=[estimate.model_dump(mode="json") for estimate in estimates])
+
     def on_folds(folds: Sequence[Any]) -> None:
         rows = [
             {
@@ -147,6 +150,7 @@ def _listener(channel: IO[str]) -> Any:
     return Listener(
         on_settings=on_settings,
         on_iteration=on_iteration,
+        on_estimates=on_estimates,
         on_message=lambda text: say("message", text=text),
         on_folds=on_folds,
     )

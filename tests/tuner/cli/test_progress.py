@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 from tuner.cli.progress import listening
 from tuner.search.iteration import Iteration
+from tuner.search.point_estimate import PointEstimate
 
 MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
 
@@ -35,6 +36,20 @@ def test_a_stage_is_one_line_with_its_last_iteration(capsys):
     assert lines[1].startswith("2 s: iteration 30, horizon 2 s, position RMSE 3.33 mm")
     assert lines[2].startswith("whole flights: iteration 90, ")
     assert lines[3] == MESSAGE
+
+
+def test_where_the_search_ended_is_a_table_after_its_last_stage(capsys):
+    estimate = PointEstimate(name="inertia_xx", unit="kg m²", initial=0.021, estimate=0.0265)
+    with listening(quiet=False) as listener:
+        listener.on_iteration(iterations("polish", 1)[0], 1.0)
+        listener.on_estimates([estimate])
+        listener.on_message("Examining.")
+    stage, head, row, searched, message = capsys.readouterr().out.splitlines()
+    assert stage.startswith("polish: ")
+    assert searched.startswith("The search ended here. ")
+    assert head.split() == ["coefficient", "initial", "estimate", "unit"]
+    assert row.split() == ["inertia_xx", "0.021", "0.0265", "kg", "m²"]
+    assert message == "Examining."
 
 
 def test_an_interrupted_stage_still_gets_its_line(capsys):

@@ -26,6 +26,7 @@ from tuner.recordings import Recording
 from tuner.report import render
 from tuner.report.record import SearchRecord
 from tuner.result import read_run
+from tuner.search.point_estimate import PointEstimate
 from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
@@ -248,10 +249,19 @@ def test_an_interrupted_run_goes_on_elsewhere_to_the_same_numbers(broken, salvag
     elsewhere.mkdir()
     shutil.move(tmp_path / "cut", elsewhere)
     job = Options([str(shutil.copy(broken, elsewhere))], **SHORT)
+    reported = []
+    listener = Listener(on_estimates=reported.extend, on_message=reported.append)
     with nothing_proposed():
-        _, resumed = run(job, out=elsewhere / "cut", resume=True)
+        _, resumed = run(job, out=elsewhere / "cut", resume=True, listener=listener)
     for name, coefficient in whole.coefficients.items():
         assert resumed.coefficients[name].best == coefficient.best
+    # where the search ended is reported before it is examined, and no term moves it here
+    examining = next(i for i, each in enumerate(reported) if str(each).startswith("Examining"))
+    estimates = {e.name: e for e in reported[:examining] if isinstance(e, PointEstimate)}
+    assert set(estimates) == set(SHORT["fit"])
+    for name, estimate in estimates.items():
+        coefficient = whole.coefficients[name]
+        assert (estimate.initial, estimate.estimate) == (coefficient.initial, coefficient.best)
     assert resumed.search.evaluations == whole.search.evaluations
 
 

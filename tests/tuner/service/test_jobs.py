@@ -75,11 +75,11 @@ def test_events_tell_the_whole_story_and_go_on_from_any_of_them(client, recordin
         if block
     ]
     kinds = [event["event"] for event in events if "id" in event]
-    assert kinds == ["state", "state", "message", *["iteration"] * 5, "state"]
-    assert [int(event["id"]) for event in events if "id" in event] == list(range(1, 10))
+    assert kinds == ["state", "state", "message", *["iteration"] * 5, "estimates", "state"]
+    assert [int(event["id"]) for event in events if "id" in event] == list(range(1, 11))
     last = json.loads([event for event in events if event["event"] == "job"][-1]["data"])
     assert last["state"] == "done"
-    rest = client.get(f"/api/v1/jobs/{job}/events", headers={"Last-Event-ID": "8"}).text
+    rest = client.get(f"/api/v1/jobs/{job}/events", headers={"Last-Event-ID": "9"}).text
     assert rest.count("event: iteration") == 0
     assert '"state": "done"' in rest
 
