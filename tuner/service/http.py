@@ -220,7 +220,10 @@ async def get_events(
     after: Annotated[int, Query(ge=0, le=2**31 - 1)] = 0,
     last_event_id: Annotated[str | None, Header(max_length=20)] = None,
 ) -> StreamingResponse:
-    """Send a job's events as they happen: ``message``, ``iteration``, ``state``, and ``job``."""
+    """Send a job's events as they happen.
+
+    Their kinds are ``message``, ``iteration``, ``estimates``, ``folds``, ``state`` and ``job``.
+    """
     row = await anyio.to_thread.run_sync(jobs.job, service.database, job)
     if last_event_id is not None and last_event_id.isdecimal():
         after = min(int(last_event_id), 2**31 - 1)
