@@ -195,3 +195,12 @@ def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[R
         open_.pop()
     elsewhere = rows.pop(ELSEWHERE)
     return (*rows.values(), elsewhere)
+
+
+def beside_of(spans: Sequence[Span]) -> dict[str, float]:
+    """Return name -> s that other threads and processes spent on it, all its spans together."""
+    seconds: dict[str, float] = {}
+    for each in spans:
+        if each.beside:
+            seconds[each.name] = seconds.get(each.name, 0.0) + each.end - each.begin
+    return seconds

@@ -97,9 +97,13 @@ def test_a_profile_is_left_in_the_folder_and_on_the_terminal(tmp_path, capsys):
     with profiling(True, quiet=False) as into:
         with span("reading"):
             time.sleep(0.06)
+        for spent in (0.2, 0.3, 0.001):
+            add_beside("figures", time.time() - spent, time.time())
+        add_beside("loading", time.time() - 0.001, time.time())
         into(tmp_path)
     text = capsys.readouterr().out
     assert "reading" in text
+    assert "Beside it, by other threads and processes: figures 0.5 s." in " ".join(text.split())
     header, *rows = (tmp_path / "profile.csv").read_text().splitlines()
     assert header.startswith("stage,seconds [s],processor [s],tracing [s]")
     (reading,) = (row.split(",") for row in rows if row.startswith("reading"))

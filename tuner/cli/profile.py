@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from tuner.disk import write_text
 from tuner.files import csv_text
-from tuner.spans import OF_JAX, Recorder, Row, Span, recording, table_of
+from tuner.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
+from tuner.wording.phrases import listed
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -87,10 +88,10 @@ def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
 
     screen = console()
     screen.print(_table(rows))
-    for beside in recorder.spans:
-        if beside.beside:
-            seconds = beside.end - beside.begin
-            screen.print(f"{beside.name}, drawn beside it by another process: {seconds:.1f} s")
+    beside = {name: f"{spent:.1f}" for name, spent in beside_of(recorder.spans).items()}
+    parts = [f"{name} {seconds} s" for name, seconds in beside.items() if float(seconds)]
+    if parts:
+        screen.print(f"Beside it, by other threads and processes: {listed(parts)}.", markup=False)
     screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}", markup=False)
 
 
