@@ -72,7 +72,7 @@ def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: 
     measured = np.isfinite(near.values[:, column])
     time, values = near.time[measured], near.values[measured, column]
     if len(time) == 0:
-        return _nearest(series, column)
+        return float("nan") if derivative else _nearest(series, column)
     if hover:
         middle = np.median(values)
         spread = 1.4826 * np.median(np.abs(values - middle)) + 1e-12

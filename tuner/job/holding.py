@@ -32,6 +32,9 @@ from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 3
 """Largest number of rounds: what is held may leave something else undetermined."""
+NOTHING = 0.002
+"""Share of the loss by which it may rise where one of what trades off exactly is held: what an
+optimiser leaves. More says that the others cannot follow, their bounds being in the way, say."""
 
 
 def with_undetermined_held(
@@ -46,7 +49,7 @@ def with_undetermined_held(
 
     A fit that predicts from recorded states keeps the values of all but those that trade off:
     together they predict, even where the flights do not tell them apart, and each one's verdict
-    says so.
+    says so. There, too, all are kept if the flights are met worse by what follows.
     """
 
     def examined(fitted: Fitted) -> Examination:
@@ -68,9 +71,25 @@ def with_undetermined_held(
             f"The flights do not identify {listed(names)}: held at the initial value, and the "
             "others are fitted again."
         )
-        fitted = hold(job, fitted, stand_ins, on_progress)
+        rest = hold(job, fitted, stand_ins, on_progress)
+        if predicts and _rises(fitted, rest) > NOTHING:
+            on_message(
+                f"With {listed(names)} at the initial value the flights are met worse: all keep "
+                "their values."
+            )
+            break
+        fitted = rest
         examination = examined(fitted)
     return fitted, examination
+
+
+def _rises(fitted: Fitted, other: Fitted) -> float:
+    """Return the share by which a fit's loss is higher where another one has led."""
+    before, after = (
+        float(np.sum(fitted.objective.sums(f.point, fitted.criterion, derivatives=False).loss))
+        for f in (fitted, other)
+    )
+    return after / before - 1.0
 
 
 def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:

@@ -16,18 +16,20 @@ from tuner.engine import Report, current
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 
-_Problem = Callable[[], tuple[Objective, Criterion]]
+_Problem = Callable[[], tuple[Objective, Criterion, bool]]
 
 
-def sums_at(objective: Objective, points: Point, criterion: Criterion) -> SegmentSums:
+def sums_at(
+    objective: Objective, points: Point, criterion: Criterion, *, derivatives: bool = True
+) -> SegmentSums:
     """Return every segment's contribution at S points, as `Objective.sums_of` does.
 
     The engine in force computes them, a task each; one alone stays here.
     """
     if len(points.coefficients) == 1:
-        return objective.sums_of(points, criterion)
+        return objective.sums_of(points, criterion, derivatives=derivatives)
     engine = current()
-    problem = engine.share((objective, criterion))
+    problem = engine.share((objective, criterion, derivatives))
     alone = [
         Point(coefficients[None], offsets[None])
         for coefficients, offsets in zip(points.coefficients, points.offsets, strict=True)
@@ -39,6 +41,7 @@ def sums_at(objective: Objective, points: Point, criterion: Criterion) -> Segmen
 
 def _sums(task: tuple[_Problem, Point], _report: Report) -> SegmentSums:
     problem, point = task
-    objective, criterion = problem()
-    sums: SegmentSums = jax.tree.map(np.asarray, objective.sums_of(point, criterion))
+    objective, criterion, derivatives = problem()
+    flown = objective.sums_of(point, criterion, derivatives=derivatives)
+    sums: SegmentSums = jax.tree.map(np.asarray, flown)
     return sums

@@ -6,7 +6,7 @@ enough for a fit to find its way from almost anywhere, and a window needs no gen
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,7 +73,8 @@ def windows_of(
         s from the beginning of a window to that of the next; by default its length.
     smoothed_widely
         Whether a window's initial state is smoothed over a tenth of a second on either side, for
-        a start that stays free; else it is the recorded state of `tuner.flights.states`.
+        a start that stays free; else it is the recorded state of `tuner.flights.states`. The
+        windows are the same ones either way.
 
     Raises
     ------
@@ -82,13 +83,10 @@ def windows_of(
     """
     stretches = _stretches(flight, seconds, stride)
     usable = [(first, last) for first, last in stretches if _is_fed(flight, first, last, fed)]
-    begins = flight.time[[first for first, _ in usable]]
-    states = None if smoothed_widely or not usable else states_at(flight.series, begins)
     windows = [
-        window
-        for number, (first, last) in enumerate(usable)
-        if (window := _window(flight, first, last, None if states is None else states.at(number)))
-        is not None
+        _window(flight, first, last, state, smoothed_widely=smoothed_widely)
+        for (first, last), state in zip(usable, _states(flight, usable), strict=True)
+        if _is_known(state)
     ]
     if not windows:
         if any(_is_fed(flight, first, last, ()) for first, last in stretches):
@@ -166,7 +164,17 @@ def _period(time: NDArray[np.float64]) -> float:
     return usual if np.mean(np.abs(steps - usual) < 0.5 * usual) > STEADY else 0.0
 
 
-def _window(flight: Flight, first: int, last: int, initial: InitialState | None) -> Window | None:
+def _states(flight: Flight, stretches: Sequence[tuple[int, int]]) -> list[InitialState]:
+    """Return the recorded states at which some stretches begin."""
+    if not stretches:
+        return []
+    states = states_at(flight.series, flight.time[[first for first, _ in stretches]])
+    return [states.at(number) for number in range(len(stretches))]
+
+
+def _window(
+    flight: Flight, first: int, last: int, recorded: InitialState, *, smoothed_widely: bool
+) -> Window:
     begin, end = float(flight.time[first]), float(flight.time[last])
     series = _around(flight.series, begin, end)
     stretch = replace(
@@ -174,10 +182,21 @@ def _window(flight: Flight, first: int, last: int, initial: InitialState | None)
         time=flight.time[first : last + 1] - begin,
         signals={name: rows[first : last + 1] for name, rows in flight.signals.items()},
         series=series,
-        initial=initial_state(series) if initial is None else initial,
+        initial=_smoothed(series, recorded) if smoothed_widely else recorded,
     )
-    known = (stretch.initial.position, stretch.initial.velocity, stretch.initial.attitude)
-    return Window(stretch, begin) if all(np.isfinite(part).all() for part in known) else None
+    return Window(stretch, begin)
+
+
+def _smoothed(series: Mapping[str, Series], recorded: InitialState) -> InitialState:
+    """Return the state smoothed widely, or the recorded one where a gap leaves too little."""
+    smoothed = initial_state(series)
+    return smoothed if _is_known(smoothed) else recorded
+
+
+def _is_known(state: InitialState) -> bool:
+    """Return whether a window can begin at a state."""
+    parts = (state.position, state.velocity, state.attitude)
+    return all(bool(np.isfinite(part).all()) for part in parts)
 
 
 def _around(series: Mapping[str, Series], begin: float, end: float) -> dict[str, Series]:

@@ -46,7 +46,8 @@ def predicted_losses(
         vectors.append(vector_after(space, fitted.point.coefficients, change))
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
     points = Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets))
-    of_each, losses = sums_at(objective, points, criterion), []
+    of_each = sums_at(objective, points, criterion, derivatives=bool(movable.any()))
+    losses = []
     for number in range(objective.flights):
         sums = jax.tree.map(lambda leaf, at=number: leaf[at], of_each)
         inside = flight == number

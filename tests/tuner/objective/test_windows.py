@@ -38,6 +38,21 @@ def test_a_stretch_without_poses_is_no_window(flight):
     assert 5 in begins
 
 
+def test_a_window_that_begins_in_a_gap_of_the_pose_is_one_however_its_start_is_smoothed(flight):
+    bare = {name: signal for name, signal in flight.series.items() if name != "velocity"}
+    for name in ("position", "attitude"):
+        time, values = bare[name].time, bare[name].values
+        kept = np.abs(time - 3.0) > 0.12  # no slope within a tenth of a second of the begin
+        bare[name] = Series(time[kept], values[kept])
+    signals = {name: rows for name, rows in flight.signals.items() if name != "velocity"}
+    gap = replace(flight, series=bare, signals=signals)
+    wide, narrow = (windows_of(gap, 1.0, smoothed_widely=wide) for wide in (True, False))
+    (begun,) = (window.flight.initial for window in wide if round(window.begin) == 3)
+    index = np.searchsorted(flight.time, 3.0)
+    np.testing.assert_allclose(begun.velocity, flight.signals["velocity"][index], atol=0.1)
+    assert [window.begin for window in wide] == [window.begin for window in narrow]
+
+
 def test_a_flight_without_poses_is_refused(flight):
     series = {name: signal for name, signal in flight.series.items() if name != "position"}
     with pytest.raises(RecordingError, match="poses throughout"):

@@ -77,6 +77,32 @@ def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
     assert elsewhere.errors["position"][-1, 5] == pytest.approx(np.sqrt(3.0), rel=0.02)
 
 
+@pytest.mark.parametrize("inlet", ["body_rate", "actuator", "attitude"])
+def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
+    position = full_flight.series["position"]
+    ahead = (position.time > 3.1) & (position.time < 3.4)
+    shifted = Series(position.time, position.values + np.where(ahead, 1.0, 0.0)[:, None])
+    elsewhere = replace(full_flight, series=dict(full_flight.series) | {"position": shifted})
+    wrong = with_values(updated, {"motor_constant": 0.98 * updated.aerodynamics.motor_constant})
+
+    def errors(flight):
+        of_windows = Comparison([Recording(flight, inlet)], ControllerFile()).fly(wrong)
+        predicted = predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
+        return of_windows[flight.name], predicted
+
+    (windows, predicted), (windows_moved, moved) = errors(full_flight), errors(elsewhere)
+    change = windows_moved.position.error - windows.position.error
+    there = (windows.position.time > 3.1) & (windows.position.time < 3.4)
+    np.testing.assert_allclose(change, np.where(there, -1.0, 0.0)[:, None].repeat(3, 1), atol=1e-9)
+    np.testing.assert_allclose(windows_moved.attitude.error, windows.attitude.error, atol=1e-9)
+    begun = np.flatnonzero(np.isclose(predicted.begins, 3.0))
+    for name in set(predicted.errors) - {"position"}:
+        np.testing.assert_allclose(
+            moved.errors[name][:, begun], predicted.errors[name][:, begun], rtol=1e-9
+        )
+    assert moved.errors["position"][29, begun] > 1.0 > predicted.errors["position"][29, begun]
+
+
 def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(full_flight, updated):
     wrong = with_values(updated, {"torque_trim_x": 0.02})
     comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
