@@ -163,7 +163,8 @@ class _Group:
         rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
         if self.windowed:
             self._windows = [
-                windows_of(flight, seconds, fed=INLETS[inlet].fed(flight)) for flight in flights
+                windows_of(flight, seconds, fed=INLETS[inlet].fed(flight), smoothed_widely=False)
+                for flight in flights
             ]
             self._segments = self._laid(free_starts=False)
             self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE

@@ -15,7 +15,7 @@ from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Series
 from tuner.flights.formats import open_recording
 from tuner.flights.frames import correct_frames
-from tuner.flights.locate import Place, choose_map, locate, require_pose
+from tuner.flights.locate import Place, choose_map, locate, require_pose, unread
 from tuner.flights.mission import Mission, find_missions
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Contents, Recording, Samples
@@ -167,6 +167,7 @@ def read_signals(
     notes = [
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *passed_over,
+        *unread(recording, chosen, places),
         *contents.notes,
         *noticed,
     ]

@@ -14,6 +14,9 @@ from tuner.flights.recording import Recording
 from tuner.flights.topics import Source, TopicMap
 from tuner.wording.notes import reason_in_words
 
+NAMED = 12
+"""Columns that a note names, at most."""
+
 
 @dataclass(frozen=True)
 class Place:
@@ -110,6 +113,21 @@ def _place(recording: Recording, signal: str, source: Source, topic: str) -> Pla
         return None if absent else Note(NoteCode.FIELD_MISSING, topic=topic, names=names)
     unit = source.unit or (usual.unit if usual and not source.fields else "si")
     return Place(source, topic, fields, unit, source.frame or (usual.frame if usual else "enu_flu"))
+
+
+def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) -> tuple[Note, ...]:
+    """Return a note on the columns of a table that hold no signal and no time, if there are any.
+
+    A column under another name than the map's would be missed in silence otherwise.
+    """
+    if not is_tabular(recording.format):
+        return ()
+    read = {field for place in places.values() for field in place.fields}
+    read |= {clock.field for clock in topics.time}
+    columns = [name for topic in recording.topics for name in recording.fields(topic.name)]
+    others = tuple(name for name in columns if name not in read)
+    note = Note(NoteCode.COLUMNS_UNREAD, "info", count=len(others), names=others[:NAMED])
+    return (note,) if others else ()
 
 
 def require_pose(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) -> None:

@@ -82,14 +82,14 @@ def windows_of(
         No stretch of the flight holds enough poses and enough of what is fed in.
     """
     stretches = _stretches(flight, seconds, stride)
-    usable = [(first, last) for first, last in stretches if _is_fed(flight, first, last, fed)]
+    usable = _usable(flight, stretches, fed)
     windows = [
         _window(flight, first, last, state, smoothed_widely=smoothed_widely)
         for (first, last), state in zip(usable, _states(flight, usable), strict=True)
         if _is_known(state)
     ]
     if not windows:
-        if any(_is_fed(flight, first, last, ()) for first, last in stretches):
+        if _usable(flight, stretches, ()):
             what = " and ".join(name.replace("_", " ") for name in fed)
             remedy = "inspect the recording: most of that column may be corrupt"
         else:
@@ -113,7 +113,7 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
     """
     stretches = _stretches(flight, seconds, None)
     for what, names in ((" and ".join(fed), fed), ("pose", ())):
-        usable = sum(_is_fed(flight, first, last, names) for first, last in stretches)
+        usable = len(_usable(flight, stretches, names))
         if usable < MOSTLY * len(stretches):
             lacking = 100.0 * (1.0 - usable / len(stretches))
             raise RecordingError(
@@ -133,28 +133,40 @@ def _stretches(flight: Flight, seconds: float, stride: float | None) -> list[tup
     ]
 
 
-def _is_fed(flight: Flight, first: int, last: int, fed: Collection[str]) -> bool:
-    """Return whether a stretch has poses, and its signals are never unknown for long."""
-    begin, end = float(flight.time[first]), float(flight.time[last])
-    pose = flight.series.get("position")
-    if pose is None or "attitude" not in flight.series:
-        return False
-    inside = pose.time[(pose.time >= begin) & (pose.time <= end)]
-    if len(inside) < FEWEST or np.diff(inside).max() > 0.5 * (end - begin):
-        return False
-    for name in fed:
-        series = flight.series.get(name)
-        if series is None:
+def _usable(
+    flight: Flight, stretches: Sequence[tuple[int, int]], fed: Collection[str]
+) -> list[tuple[int, int]]:
+    """Return the stretches with poses, and with signals that are fed in known throughout."""
+    known, time = _Known(flight, fed), flight.time
+    return [(a, b) for a, b in stretches if known.throughout(float(time[a]), float(time[b]))]
+
+
+class _Known:
+    """When the pose of a flight, and signals that are fed in, are known."""
+
+    def __init__(self, flight: Flight, fed: Collection[str]) -> None:
+        signals = [flight.series.get(name) for name in ("position", "attitude", *fed)]
+        series = [signal for signal in signals if signal is not None]
+        known = [s.time[np.isfinite(column)] for s in series[2:] for column in s.values.T]
+        lacks = None in signals or any(len(time) < 2 for time in known)
+        self._pose = np.empty(0) if lacks else series[0].time
+        self._fed = [] if lacks else [(time, _period(time)) for time in known]
+
+    def throughout(self, begin: float, end: float) -> bool:
+        """Return whether a stretch has poses, and its signals are never unknown for long."""
+        pose = _between(self._pose, begin, end)
+        if len(pose) < FEWEST or np.diff(pose).max() > 0.5 * (end - begin):
             return False
-        for column in series.values.T:
-            known = series.time[np.isfinite(column)]
-            if len(known) < 2:
-                return False
-            longest = max(UNFED * (end - begin), 2.0 * _period(known))
-            known = known[(known > begin) & (known < end)]
-            if np.diff(known, prepend=begin, append=end).max() > longest:
-                return False
-    return True
+        return all(
+            np.diff(_between(known, begin, end), prepend=begin, append=end).max()
+            <= max(UNFED * (end - begin), 2.0 * period)
+            for known, period in self._fed
+        )
+
+
+def _between(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
+    """Return the times from one to another, both included."""
+    return time[np.searchsorted(time, begin) : np.searchsorted(time, end, side="right")]
 
 
 def _period(time: NDArray[np.float64]) -> float:

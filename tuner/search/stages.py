@@ -24,6 +24,9 @@ GENERATIONS = 60
 """Generations of CMA-ES in one stage, at most."""
 FEEDBACK_AT = 3.0
 """s of horizon at which the mixer's saturation feedback is tried both ways."""
+WEIGHED = 1e-3
+"""Tolerance of windows' first polish, which is there for the residuals that it leaves: these are
+the last one's weights. Open loops meet no recording so well that less would change them."""
 WHOLE = "whole length"
 USUAL = 5
 """Steps that a stage usually takes: predicts the time that is left."""
@@ -121,10 +124,11 @@ def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> t
         )
         for share, noise_inflation, offsets in WINDOWS
     ]
-    return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
+    whole, polish, last = _whole_stages(samples, robust=robust, steps=steps)
+    return (*stages, whole, replace(polish, tolerance=WEIGHED), last)
 
 
-def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, ...]:
+def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, Stage, Stage]:
     whole = Stage(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
     polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
     return (whole, replace(polish, name="polish"), replace(polish, name="polish again"))

@@ -16,6 +16,9 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.OTHERS_MATCH: "{first} from {topic}; {others} would also match",
     NoteCode.LAYOUT_UNKNOWN: "it is not known where {topic} ({first}) holds the {second}",
     NoteCode.FIELD_MISSING: "{where} '{first}' for the {second}{alike}",
+    NoteCode.COLUMNS_UNREAD: (
+        "{count} columns are not read, which the topic map does not name: {all}{more}"
+    ),
     NoteCode.WITHOUT_POSE: (
         "no pose was recorded: the {seconds:.1f} s with turning motors are fitted without motion "
         "capture, by body rate and specific force"
@@ -84,6 +87,7 @@ def reason_in_words(note: Note) -> str:
         first=first,
         second=second,
         all=", ".join(note.names),
+        more=", ..." if note.count > len(note.names) else "",
         others=", ".join(note.names[1:]),
         samples=f"{note.count} {listed(note.names or ('',))} samples",
         where=f"{note.topic} has no field" if note.topic else "there is no column",

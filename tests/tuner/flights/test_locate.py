@@ -12,6 +12,7 @@ from tests.tuner.flights import making
 from tuner.errors import RecordingError
 from tuner.flights import load_flight
 from tuner.flights.notes import NoteCode
+from tuner.wording.notes import note_in_words
 
 LAB = "name: lab\nformat: ros\nsignals:\n  attitude: /optitrack/pose\n"
 
@@ -54,6 +55,19 @@ def test_the_nearest_column_of_a_table_is_named(tmp_path: Path) -> None:
     (tmp_path / "own.yaml").write_text(text.replace("pzz", "pz").replace("time: time", "time: t"))
     with pytest.raises(RecordingError, match="finds no position"):
         load_flight(path, topics=tmp_path / "own.yaml")
+
+
+def test_columns_that_the_map_does_not_name_are_said(tmp_path: Path) -> None:
+    path = tmp_path / "f.csv"
+    spare = [f"pwm_{number}" for number in range(14)]
+    rows = [f"{t / 100},0,0,1,1,0,0,0" + ",0.5" * 14 for t in range(300)]
+    path.write_text("\n".join([",".join(["time,x,y,z,qw,qx,qy,qz", *spare]), *rows]))
+    (note,) = (n for n in load_flight(path).notes if n.code is NoteCode.COLUMNS_UNREAD)
+    assert note_in_words(note) == (
+        "14 columns are not read, which the topic map does not name: "
+        + ", ".join(spare[:12])
+        + ", ..."
+    )
 
 
 def test_a_pattern_takes_the_busiest_topic_and_says_so(short: Path, tmp_path: Path) -> None:
