@@ -4,8 +4,9 @@ Truths are drawn from a prior, and flown with measurement noise; depending on th
 with gusts, and with a random half of some terms beyond the motor model. Each set is fitted from the
 prior's mean by the last stages of the search, with that prior and with all of these terms in the
 model, and the truth is ranked. So what is calibrated is the interval of a model that can fly what
-flew: `benchmarks.lab` measures what selects terms. ``TUNE_CALIBRATION_DRAWS`` sets of each kind are
-drawn, in ``TUNE_CALIBRATION_WORKERS`` processes beside this one.
+flew: `benchmarks.lab` measures what selects terms. A search that says that it did not converge is
+counted as such, not ranked: it says so to its user, too. ``TUNE_CALIBRATION_DRAWS`` sets of each
+kind are drawn, in ``TUNE_CALIBRATION_WORKERS`` processes beside this one.
 
 Source: Talts, Betancourt, Simpson, Vehtari, Gelman, "Validating Bayesian inference algorithms with
 simulation-based calibration", 2018.
@@ -45,10 +46,13 @@ from tuner.search.stages import plan
 from tuner.selection.candidates import with_terms
 from tuner.uncertainty.calibration import FILE, LEVELS, Calibration, Held
 from tuner.uncertainty.estimates import uncertainty_of
+from tuner.wording.phrases import listed
 
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
 WORKERS = int(os.environ.get("TUNE_CALIBRATION_WORKERS", "0")) or None
 
+FIRST = 20
+"""Seed of the first set: on those before, the rules' parameters were chosen."""
 NARROWED = 0.25
 """The prior that truths are drawn from and fits are steadied by, over the usual one: with that,
 half of the vehicles could not fly."""
@@ -100,23 +104,27 @@ class Ranked:
         Coefficient -> what someone would quote who knows the truth and the gusts' law.
     seconds
         Of processor time.
+    converged
+        Whether the search says that it did.
     """
 
     off: dict[str, float]
     error: dict[str, float]
     oracle: dict[str, float]
     seconds: float
+    converged: bool
 
 
 def measure() -> Section:
     """Draw, fly, fit and rank every kind of flight; keep what is found for the report's page."""
-    tasks = [(number, seed) for number in range(len(KINDS)) for seed in range(DRAWS)]
+    seeds = range(FIRST, FIRST + DRAWS)
+    tasks = [(number, seed) for number in range(len(KINDS)) for seed in seeds]
     found: dict[str, list[Ranked]] = {kind.name: [] for kind in KINDS}
     with engine_for(WORKERS) as engine:
         for (number, seed), ranked in zip(tasks, engine.stream(_task, tasks), strict=True):
             found[KINDS[number].name].append(ranked)
             print(_line(KINDS[number], seed, ranked), flush=True)
-    kinds = tuple(_held(name, sets) for name, sets in found.items())
+    kinds = tuple(_held(name, _converged(sets)) for name, sets in found.items())
     today = datetime.date.today().isoformat()
     text = Calibration(date=today, kinds=kinds).model_dump_json(indent=2)
     FILE.write_text(f"{text}\n", encoding="utf-8")
@@ -125,7 +133,8 @@ def measure() -> Section:
 
 def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
     """Return the table of what was found of each kind of flight."""
-    rows = [row for name, sets in found.items() for row in _rows(name, sets)]
+    rows = [row for name, sets in found.items() for row in _rows(name, _converged(sets))]
+    left = [sum(not ranked.converged for ranked in sets) for sets in found.values()]
     draws = sorted({len(sets) for sets in found.values()})
     seconds = [ranked.seconds for sets in found.values() for ranked in sets]
     text = (
@@ -137,9 +146,10 @@ def section(found: Mapping[str, Sequence[Ranked]], date: str) -> Section:
         "scatter from set to set; of each, beside it the range in which the share of so many sets "
         "would lie 19 times of 20, were the intervals what they say. Estimate minus truth is in "
         "quoted standard errors: its root mean square is 1 where these are exact, less where they "
-        "are too large. An oracle knows the truth and the law of the gusts, flies the set again "
-        "and again, and quotes how far linear fits to those flights scatter; beside it the median "
-        "of how many times as large the quoted error is. "
+        f"are too large. {listed(tuple(map(str, left)))} searches say that they did not converge, "
+        "and are not counted. An oracle knows the truth and the law of the gusts, flies the set "
+        "again and again, and quotes how far linear fits to those flights scatter; beside it the "
+        "median of how many times as large the quoted error is. "
         f"{np.mean(seconds):.0f} s of processor time a set."
     )
     head = ["flights", "coefficient", "sets", *(f"{level} %" for level in LEVELS)]
@@ -172,7 +182,7 @@ def ranked_set(kind: Kind, seed: int) -> Ranked:
         gusts=kind.gusts,
         random=np.random.default_rng([seed, KINDS.index(kind), 1]),
     )
-    return Ranked(off, errors, oracle, time.process_time() - clock)
+    return Ranked(off, errors, oracle, time.process_time() - clock, found.converged)
 
 
 @lru_cache(maxsize=1)
@@ -224,7 +234,8 @@ def fitted(objective: Objective) -> Fitted:
     """Return the fit that the last stages of the search lead to from the prior's mean."""
     space, names = objective.space, [flight.name for flight in reference_job().fitted]
     rate = float(objective.schedule.log_rate)
-    stages = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=8)
+    steps = reference_job().settings.job.search.max_iterations
+    stages = plan("gradient", objective.samples, rate, windows=False, robust=True, steps=steps)
     stages = stages[-STAGES:]
     begin = space.at_share((space.prior_mean - space.lower) / space.width)
     progress = grow(
@@ -276,6 +287,10 @@ def scatter(sets: Sequence[Ranked], level: str) -> float:
     """Return the standard error of the share of all coefficients, whose errors go together."""
     shares = [share_within(ranked.off.values(), level) for ranked in sets]
     return float(np.std(shares, ddof=1) / np.sqrt(len(shares))) if len(shares) > 1 else float("nan")
+
+
+def _converged(sets: Sequence[Ranked]) -> list[Ranked]:
+    return [ranked for ranked in sets if ranked.converged]
 
 
 def _held(name: str, sets: Sequence[Ranked]) -> Held:
@@ -334,4 +349,5 @@ def _line(kind: Kind, seed: int, ranked: Ranked) -> str:
     worst = sorted(ranked.off, key=lambda name: -abs(ranked.off[name]))[:4]
     off = ", ".join(f"{name} {ranked.off[name]:+.1f}" for name in worst)
     held = share_within(ranked.off.values(), "95")
-    return f"{kind.name} {seed}: {_percent(held)} hold, {off}; {ranked.seconds:.0f} s"
+    end = "" if ranked.converged else ", not converged"
+    return f"{kind.name} {seed}: {_percent(held)} hold, {off}; {ranked.seconds:.0f} s{end}"

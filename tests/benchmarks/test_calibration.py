@@ -13,10 +13,10 @@ from tuner.search.stages import plan
 NOISE, GUSTS, *_ = cal.KINDS
 
 
-def ranked(*off):
+def ranked(*off, converged=True):
     names = [f"c{i}" for i in range(len(off))]
     quoted, oracle = dict.fromkeys(names, 3.0), dict.fromkeys(names, 2.0)
-    return cal.Ranked(dict(zip(names, off, strict=True)), quoted, oracle, 1.0)
+    return cal.Ranked(dict(zip(names, off, strict=True)), quoted, oracle, 1.0, converged)
 
 
 def test_of_truths_that_are_where_the_interval_says_the_level_lies_inside():
@@ -41,6 +41,14 @@ def test_the_table_says_what_was_found_of_all_and_of_each():
     assert [row[6] for row in rows] == ["+1.00", "+0.00", "+2.00"]
     assert rows[2][7] == f"{np.sqrt(5):.3g}"
     assert [row[8] for row in rows] == ["1.5 ×"] * 3
+
+
+def test_a_search_that_did_not_converge_is_counted_and_not_ranked():
+    sets = [ranked(0.1, 0.2), ranked(9.0, 9.0, converged=False)]
+    found = cal.section({"gusts": sets, "noise alone": sets[:1]}, "2026-01-02")
+    assert [row[2] for row in found.rows] == ["1"] * 6
+    assert found.rows[0][5].startswith("100 %")
+    assert "1 and 0 searches say that they did not converge" in found.text
 
 
 def test_what_wanders_has_its_size_and_forgets_in_its_time():

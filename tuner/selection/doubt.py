@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner.selection.linear import RIDGE, Array, Columns, Linear
-from tuner.selection.score import long_run
+from tuner.uncertainty.covariance import scatter
+from tuner.uncertainty.stretches import STRETCH
 
 HIDDEN, SMALLEST = 0.4, 0.1
 """Of the standard error with which the flights tell a term, and of its usual size (its prior's
@@ -43,22 +44,24 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array
     Notes
     -----
     Hoeting, Madigan, Raftery and Volinsky, "Bayesian model averaging: a tutorial", 1999. Its
-    evidence takes errors as large as they are: the group's score scatters from stretch to stretch
-    (`long_run`), gusts included. What a refit would do is no measure where the flights can hardly
-    tell a term from the model: that is chance.
+    evidence takes errors as large as they are, gusts included: they are those of a fit with the
+    group, by how much stretches of time scatter about it, corrected for what it takes out of them
+    (`tuner.uncertainty.covariance.scatter`; a fit of twenty coefficients and a group to a minute of
+    flight leaves a fraction). What a refit would do is no measure where the flights can hardly tell
+    a term from the model: that is chance.
     """
     square = linear.information() + linear.prior
     everything = np.ones(len(linear.flight), bool)
     alone = linear.step(model, inside=everything)
     squares = np.zeros(len(linear.scaled))
     for group in groups:
-        evidence = _Evidence.of(linear, square, alone, model, group)
+        evidence = Evidence.of(linear, square, alone, model, group)
         squares[model] += evidence.mean_square
     return np.asarray(np.sqrt(squares))
 
 
 @dataclass(frozen=True)
-class _Evidence:
+class Evidence:
     """What the flights say of a group's coefficients, in units of their usual sizes.
 
     Attributes
@@ -74,9 +77,7 @@ class _Evidence:
     variance: Array
 
     @staticmethod
-    def of(
-        linear: Linear, square: Array, alone: Array, model: Columns, group: Columns
-    ) -> _Evidence:
+    def of(linear: Linear, square: Array, alone: Array, model: Columns, group: Columns) -> Evidence:
         """Return the evidence beside a model whose minimum is at ``alone`` (P,)."""
         usual = linear.prior_sd[group]
         unit = 1.0 / np.sqrt(np.maximum(np.diag(square)[model], 1e-300))
@@ -89,18 +90,18 @@ class _Evidence:
         wider = alone.copy()
         wider[group] += step
         wider[model] += follow @ step
-        at = linear.slopes(wider)
-        seen = np.any(linear.diagonals[:, group] > 0.0, axis=1)
-        scores = (at[:, group] + at[:, model] @ follow)[seen] * usual
+        both = np.concatenate([model, group])
+        stretches = linear.stretches(both, wider, STRETCH)
+        meat, _ = scatter(stretches, square[np.ix_(both, both)])
+        along = np.vstack([follow, np.eye(len(group))]) * usual
         known = left * np.outer(usual, usual) - np.eye(len(group))  # by the flights alone
         values, vectors = np.linalg.eigh(0.5 * (known + known.T))
         inverse = (vectors / np.maximum(values, FLAT * values[-1])) @ vectors.T
-        count = max(len(scores), 2)
-        spread = long_run(scores, linear.flight[seen]) * count / (count - 1.0) + known / count
+        spread = along.T @ meat @ along + known / stretches.count
         covariance = inverse @ spread @ inverse
         variance, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
         value = -axes.T @ inverse @ (slope * usual)
-        return _Evidence(follow * usual @ axes, value, np.maximum(variance, 0.0))
+        return Evidence(follow * usual @ axes, value, np.maximum(variance, 0.0))
 
     @property
     def mean_square(self) -> Array:

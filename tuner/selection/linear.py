@@ -21,7 +21,8 @@ from tuner.coefficients.space import Parameter, Space
 from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
-from tuner.uncertainty.information import FisherInformation, information_from_jacobian
+from tuner.uncertainty.information import BLOCK, FisherInformation, information_from_jacobian
+from tuner.uncertainty.stretches import Stretches
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.intp]
@@ -97,6 +98,24 @@ class Linear:
     def diagonals(self) -> Array:
         """The information (S, P) of each stretch about each column by itself."""
         return self._spread(np.einsum("spp->sp", self.hessian))
+
+    def stretches(self, columns: Columns, change: Array, seconds: float) -> Stretches:
+        """Return what longer stretches say of some columns after a change (P,).
+
+        Each flight is cut into stretches alike, as close to so many seconds as they can be.
+        """
+        slopes, information, score = self.slopes(change), [], []
+        for number in np.unique(self.flight):
+            of_flight = np.flatnonzero(self.flight == number)
+            seen = self.columns[of_flight[0]]
+            mine = np.flatnonzero(np.isin(columns, seen))
+            local = np.searchsorted(seen, columns[mine])
+            for part in np.array_split(of_flight, max(round(len(of_flight) * BLOCK / seconds), 1)):
+                square = np.zeros((len(columns), len(columns)))
+                square[np.ix_(mine, mine)] = self.hessian[part].sum(axis=0)[np.ix_(local, local)]
+                information.append(square)
+                score.append(slopes[part].sum(axis=0)[columns])
+        return Stretches(np.stack(information), np.stack(score))
 
     def _spread(self, local: Array) -> Array:
         """Return rows (S, L) of what stretches see as rows (S, P), zero where they see nothing."""

@@ -96,7 +96,7 @@ def covariance_of(information: FisherInformation) -> Covariance:
     """
     independent = IndependentErrors.of(information)
     inverse, matrix = independent.inverse, independent.matrix
-    meat, freedom = _scatter(stretches_of(information), information.total)
+    meat, freedom = scatter(stretches_of(information), information.total)
     observed = np.diag(inverse.sandwiched(meat, np.zeros_like(meat)))
     inflation = independent.widened(observed, freedom) / np.sqrt(np.diag(matrix))
     data = information.data + information.prior / WIDE**2
@@ -111,7 +111,7 @@ def covariance_of(information: FisherInformation) -> Covariance:
     )
 
 
-def _scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
+def scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     """Return the sum (K, K) over stretches of the corrected scores' outer products, the "meat".
 
     And the degrees of freedom (K,) of the variances that it gives: were the scores' covariances

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.selection.doubt import in_doubt
+from tuner.selection.doubt import Evidence, in_doubt
 from tuner.selection.linear import Linear
 
 MODEL, TERM = np.array([0]), np.array([1])
@@ -109,6 +109,40 @@ def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
     sizes = np.exp(np.linspace(np.log(0.1), 0.0, 25))
     expected = USUAL * np.sqrt(np.mean(sizes**2))
     assert in_doubt(same, MODEL, [TERM])[0] == pytest.approx(expected, rel=0.05)
+
+
+def crowded(random, count):
+    """Return a loss of many columns and one that is absent, from a minute in gusts of seconds."""
+    size, shape = count + 1, (3 * 9, 40)
+    columns = random.normal(size=(*shape, size)) + random.normal(size=(shape[0], 1, size))
+    gusts = np.zeros(shape[0])
+    for stretch in range(shape[0]):
+        before = gusts[stretch - 1] if stretch % 9 else random.normal()
+        gusts[stretch] = 0.5 * before + np.sqrt(0.75) * random.normal()
+    residual = random.normal(size=shape) + 2.0 * gusts[:, None]
+    return Linear(
+        scaled=np.zeros(size),
+        hessian=columns.transpose(0, 2, 1) @ columns,
+        score=np.einsum("sip,si->sp", columns, residual),
+        prior=np.diag([*[1e-9] * count, 1.0]),
+        pull=np.zeros(size),
+        prior_sd=np.array([*[1e3] * count, 1.0]),
+        flight=np.repeat(np.arange(3), 9),
+        section=np.tile(np.repeat(np.arange(3), 3), 3),
+        loss=1.0,
+    )
+
+
+@pytest.mark.parametrize("count", [3, 20])
+def test_an_absent_term_is_told_no_surer_than_it_is_whatever_a_fit_takes_out_of_the_gusts(count):
+    random, model, term = np.random.default_rng(3), np.arange(count), np.array([count])
+    held = []
+    for linear in (crowded(random, count) for _ in range(DRAWS)):
+        square = linear.information() + linear.prior
+        alone = linear.step(model, inside=np.ones(len(linear.flight), bool))
+        found = Evidence.of(linear, square, alone, model, term)
+        held.append(abs(found.value[0]) < 1.96 * np.sqrt(found.variance[0]))
+    assert np.mean(held) > 0.86  # 0.79 were twenty coefficients' leverage not allowed for
 
 
 def test_groups_add_up_as_squares(fits):
