@@ -41,15 +41,20 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
 
     def trial(error, half):
         value, off = true * (1.0 + error), half * true
-        parts = ErrorParts(noise=0.1 * off, residuals=0.2 * off, left_out=0.5 * off)
+        parts = ErrorParts(noise=0.1 * off, residuals=0.2 * off, left_out=0.5 * off, terms=off)
         estimate = SimpleNamespace(value=value, ci95=(value - off, value + off), parts=parts)
         return Trial(lab, (), {"motor_constant": estimate}, {"motor_constant": 0.5}, 1.0)
 
-    trials = [trial(0.02, 0.03), trial(0.04, 0.01)]
+    trials = [trial(0.02, 0.03), trial(0.04, 0.01)]  # half as wide, the first would hold no longer
     (row,) = _rows(trials)
-    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "left out", "2 ×", "1 of 2"]
+    assert row == ["motor_constant", "2", "+3.00 %", "3.16 %", "2 %", "terms", "2 ×", "1 of 2"]
     part = section(trials)
     assert (part.rows, len(part.head)) == ([row], len(row))
     flown = 2 * len(lab.groups)
     assert "2 laboratories (0 with gusts)" in part.text
     assert f"Of {flown} groups of terms that were flown 0 are found; missed" in part.text
+    assert (
+        "In still air 1 of 2 95 % intervals hold the truth; without the part `terms` 0" in part.text
+    )
+    assert "1 of 2 that are twice the oracle's" in part.text
+    assert "In gusts" not in part.text
