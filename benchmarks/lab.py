@@ -10,22 +10,27 @@ import os
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.lab_flights import Lab, drawn, write
+from benchmarks.lab_flights import METER, Lab, drawn, write
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure
+from sim_jax.schedule import Schedule
 from tuner.coefficients import COEFFICIENTS
 from tuner.config import Options, settle, values_of
 from tuner.engine import Report, engine_for
+from tuner.flights.flight import Array, Flight
 from tuner.job.first_terms import with_first_terms
 from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
 from tuner.job.terms import search_with_terms
+from tuner.objective.battery import log_voltage_of
+from tuner.objective.voltage import VOLTAGE
+from tuner.objective.windows import Window
 from tuner.recordings import read_usable
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Estimate, Uncertainty
@@ -88,11 +93,11 @@ def section(trials: Sequence[Trial]) -> Section:
         f"{_named('', false)}. Errors are shares of the truth, or, of what may be zero, of the "
         "coefficient's usual size; the interval's half-width likewise, its median over the fits, "
         "and the part of it that is largest in most of them. "
-        "An oracle knows the truth and the law of the gusts: it flies the fit's model at the truth "
-        "again, in other gusts and other noise, and quotes how far linear fits to those flights "
-        "scatter; beside it the median of how many times as wide the quoted interval is. It does "
-        "not know by how much these fits miss: they lack terms that flew, and step four times more "
-        f"coarsely than what flew. {_held_of_all(trials)}"
+        "An oracle knows the truth and the laws of the gusts and of the voltmeter: it flies the "
+        "fit's model at the truth again, in other gusts, with other noise and other readings, and "
+        "quotes how far linear fits to those flights scatter; beside it the median of how many "
+        "times as wide the quoted interval is. It does not know by how much these fits miss: they "
+        f"lack terms that flew, and have some that did not. {_held_of_all(trials)}"
         f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
     )
     head = [
@@ -163,10 +168,38 @@ def trial_of(seed: int) -> Trial:
     }
     found = tuple(row.group for row in selected.rows if row.kept)
     trial = Trial(lab, found, free, {}, seconds)
-    return replace(trial, oracle=_oracle(trial, fitted, examination.uncertainty, seed))
+    volts = _voltages(selected.job.fitted, fitted.objective.schedule)
+    return replace(trial, oracle=_oracle(trial, fitted, examination.uncertainty, volts, seed))
 
 
-def _oracle(trial: Trial, fitted: Fitted, quoted: Uncertainty, seed: int) -> dict[str, float]:
+def _voltages(
+    flights: Sequence[Flight], schedule: Schedule
+) -> Callable[[np.random.Generator], Array | None]:
+    """Return what draws the voltage that other readings of the meter would have passed for."""
+    whole = [Window(flight, 0.0) for flight in flights]
+    known = log_voltage_of(flights, whole, schedule)
+
+    def drawn_voltage(random: np.random.Generator) -> Array | None:
+        if known is None:
+            return None
+        read_again = []
+        for flight in flights:
+            readings = flight.series[VOLTAGE]
+            noise = METER * random.normal(size=readings.values.shape)
+            other = replace(readings, values=readings.values + noise)
+            read_again.append(replace(flight, series={**flight.series, VOLTAGE: other}))
+        return np.asarray(log_voltage_of(read_again, whole, schedule))
+
+    return drawn_voltage
+
+
+def _oracle(
+    trial: Trial,
+    fitted: Fitted,
+    quoted: Uncertainty,
+    volts: Callable[[np.random.Generator], Array | None],
+    seed: int,
+) -> dict[str, float]:
     """Return coefficient -> what an oracle would quote, in quoted standard errors.
 
     The oracle's vehicle has the terms that were found; those that it lacks do not scatter.
@@ -176,7 +209,8 @@ def _oracle(trial: Trial, fitted: Fitted, quoted: Uncertainty, seed: int) -> dic
         {parameter.name: trial.true(parameter.name) for parameter in space.parameters}
     )
     random = np.random.default_rng([seed, 2])
-    errors = oracle_error(fitted, truth, gusts=trial.lab.gusts, random=random)
+    gusts = trial.lab.gusts
+    errors = oracle_error(fitted, truth, gusts=gusts, random=random, log_voltage=volts)
     own = dict(zip(quoted.names, quoted.covariance.error, strict=True))
     return {name: error / own[name] for name, error in errors.items() if name in trial.estimates}
 

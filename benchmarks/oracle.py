@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -20,7 +21,12 @@ DRAWS = 8
 
 
 def oracle_error(
-    fitted: Fitted, truth: Array, *, gusts: bool, random: np.random.Generator
+    fitted: Fitted,
+    truth: Array,
+    *,
+    gusts: bool,
+    random: np.random.Generator,
+    log_voltage: Callable[[np.random.Generator], Array | None] = lambda _: None,
 ) -> dict[str, float]:
     """Return parameter -> standard error of a fit's estimate, in the scaled coordinate.
 
@@ -36,6 +42,9 @@ def oracle_error(
         (K,) its search vector.
     gusts, random
         As of `recorded`.
+    log_voltage
+        What the voltage (ticks, F) may have been that the fit takes for what it read, by chance;
+        None where it knows.
     """
     names = fitted.objective.space.names
     held = set(fitted.held.values())
@@ -45,7 +54,8 @@ def oracle_error(
     criterion = replace(fitted.criterion, reference_offset=still)
     steps: list[Array] = []
     while len(steps) < DRAWS:
-        flown = recorded(fitted.objective, truth, random, gusts=gusts)
+        volts = log_voltage(random)
+        flown = recorded(fitted.objective, truth, random, gusts=gusts, log_voltage=volts)
         if flown is None:
             continue
         at_truth = flown.start(truth)

@@ -22,7 +22,12 @@ Array = NDArray[np.float64]
 
 
 def recorded(
-    objective: Objective, vector: Array, random: np.random.Generator, *, gusts: bool
+    objective: Objective,
+    vector: Array,
+    random: np.random.Generator,
+    *,
+    gusts: bool,
+    log_voltage: Array | None = None,
 ) -> Objective | None:
     """Return a problem with recordings of its flights at a truth, stamped and noisy as its own.
 
@@ -36,6 +41,8 @@ def recorded(
         Where noise and gusts come from.
     gusts
         Whether the air pushes them.
+    log_voltage
+        (ticks, F) logarithm of the battery's voltage in V, where it is not as the problem has it.
 
     Returns
     -------
@@ -44,7 +51,11 @@ def recorded(
     """
     model = objective.tunable.at(jnp.asarray(vector))
     pushing = _air(objective, model, random) if gusts else None
-    trace = _flown(model, objective, pushing)
+    flown = objective
+    if log_voltage is not None:
+        segments = replace(objective.segments, log_voltage=jnp.asarray(log_voltage))
+        flown = replace(objective, segments=segments)
+    trace = _flown(model, flown, pushing)
     if bool(jnp.isfinite(trace.crash_time).any()):
         return None
     still = jnp.zeros((len(OFFSETS), objective.segments.count))

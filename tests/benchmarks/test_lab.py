@@ -1,15 +1,20 @@
 """The drawn laboratories are ones that fly, and the table of their fits counts right."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks.lab import Trial, _rows, section
-from benchmarks.lab_flights import drawn
+from benchmarks import lab as laboratory
+from benchmarks.lab import Trial, _rows, _voltages, section
+from benchmarks.lab_flights import METER, drawn
 from sim_jax.numeric import GRAVITY
+from sim_jax.schedule import Schedule
 from tuner.coefficients import term_groups
 from tuner.config import values_of
+from tuner.flights.flight import Series
+from tuner.objective.voltage import VOLTAGE
 from tuner.uncertainty.error_parts import ErrorParts
 
 SEEDS = range(8)
@@ -58,3 +63,21 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     )
     assert "1 of 2 that are twice the oracle's" in part.text
     assert "In gusts" not in part.text
+
+
+@dataclass(frozen=True)
+class Read:
+    series: dict[str, Series]
+
+
+def test_other_readings_of_the_voltmeter_are_off_by_its_noise(monkeypatch):
+    volts, seconds = np.linspace(16.4, 15.6, 4000)[:, None], np.arange(4000.0)
+    flights = [Read({VOLTAGE: Series(seconds, volts)}) for _ in range(2)]
+
+    def unsmoothed(flights, *_):
+        return np.log(np.hstack([flight.series[VOLTAGE].values for flight in flights]))
+
+    monkeypatch.setattr(laboratory, "log_voltage_of", unsmoothed)
+    off = np.exp(_voltages(flights, Schedule())(np.random.default_rng(1))) - volts
+    assert np.std(off, axis=0) == pytest.approx(METER, rel=0.05)
+    assert abs(np.corrcoef(off.T)[0, 1]) < 0.1
