@@ -17,7 +17,7 @@ from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.flights.stale import is_stale
 from tuner.objective.allocation import with_commands
-from tuner.objective.choice import choose_inlet
+from tuner.objective.choice import FED_BY, choose_inlet
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.windows import require_windows
 from tuner.simulation.trajectory import with_named_reference
@@ -125,6 +125,7 @@ def read_usable(
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
     if left_out and (not recordings or none_to_fit):
         raise left_out[0][1]
+    recordings = [_as_fitted(recording, recordings, settings) for recording in recordings]
     chosen = (recording.because for recording in recordings if recording.because is not None)
     return tuple(recordings), (
         *(
@@ -201,6 +202,28 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
         check_mixer(settings.vehicle)
     late = None if offset == "free" else float(offset)
     return Recording(flight, chosen, late, holdout, because=choice.because)
+
+
+def _as_fitted(
+    recording: Recording, recordings: Sequence[Recording], settings: Settings
+) -> Recording:
+    """Return a held-out flight with its attitude followed where that of all fitted ones is.
+
+    Nothing would be fitted of how it turns.
+    """
+    job, flight = settings.job, recording.flight
+    own = job.flights.get(flight.name)
+    asked = (None if own is None else own.inlet) or job.inlet
+    fitted = {other.inlet for other in recordings if not other.holdout}
+    turns = recording.inlet in FED_BY and fitted == {"attitude"}
+    if not (recording.holdout and asked == "auto" and turns):
+        return recording
+    try:
+        require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))
+    except RecordingError:
+        return recording
+    because = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
+    return replace(recording, inlet="attitude", because=because)
 
 
 def _with_reference(flight: Flight, settings: Settings) -> Flight:

@@ -19,7 +19,7 @@ from tuner.flights.flight_cache import from_parquet, to_parquet
 from tuner.flights.initial import initial_state
 from tuner.flights.mission import Mission, yaw_spin
 from tuner.flights.notes import Note, NoteCode
-from tuner.flights.resample import GAP, resample, without_gaps
+from tuner.flights.resample import longest_gap, resample, without_gaps
 from tuner.flights.sidecar import Sidecar, read_sidecar
 from tuner.flights.topics import TopicMap
 
@@ -64,7 +64,7 @@ def make_flight(
         of, number = len(content.missions), {"number": index + 1}
         notes.append(Note(NoteCode.ONE_OF_SEVERAL, "info", count=of, numbers=number))
     signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
-    notes.extend(_gaps(signals, rate))
+    notes.extend(gaps_in(signals, mission_series, rate))
     spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
     return Flight(
         name=path.stem if index == 0 else f"{path.stem}-{index + 1}",
@@ -83,7 +83,7 @@ def make_flight(
     )
 
 
-def _gaps(signals: Mapping[str, Array], rate: float) -> list[Note]:
+def gaps_in(signals: Mapping[str, Array], series: Mapping[str, Series], rate: float) -> list[Note]:
     """Say where a signal is unknown for longer than at the ends of its recording."""
     notes = []
     for name, values in signals.items():
@@ -91,7 +91,7 @@ def _gaps(signals: Mapping[str, Array], rate: float) -> list[Note]:
             continue
         known = np.isfinite(values).any(axis=1)
         unknown = int((~known).sum())
-        if unknown > GAP * rate:
+        if unknown > longest_gap(series[name].time) * rate:
             edges = np.diff(np.concatenate([[0], ~known, [0]]).astype(np.int8))
             runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
             times = {"seconds": unknown / rate, "longest": float(runs.max() / rate)}

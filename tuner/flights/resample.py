@@ -33,7 +33,7 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
             result[:, column] = np.interp(clock, time, values)
             result[np.logical_not(_covered(time, clock)), column] = np.nan
         else:
-            gap = FOREVER if signal == "lap" else _longest_gap(time)
+            gap = FOREVER if signal == "lap" else longest_gap(time)
             result[:, column] = _hold(time, values, clock, gap)
     return result
 
@@ -52,7 +52,7 @@ def without_gaps(series: Series) -> Series:
         return series
     steps = np.diff(time)
     period = float(np.median(steps))
-    gaps = np.flatnonzero((steps > MISSED * period) & (steps <= _longest_gap(time)))
+    gaps = np.flatnonzero((steps > MISSED * period) & (steps <= longest_gap(time)))
     if len(gaps) == 0:
         return series
     counts = np.round(steps[gaps] / period).astype(int)
@@ -68,7 +68,8 @@ def without_gaps(series: Series) -> Series:
     return Series(steady, between)
 
 
-def _longest_gap(time: Array) -> float:
+def longest_gap(time: Array) -> float:
+    """Return the s between samples beyond which nothing is known."""
     return max(GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP
 
 
@@ -77,7 +78,7 @@ def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
     after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
     before = np.clip(np.searchsorted(time, clock, side="right") - 1, 0, len(time) - 1)
     inside = (clock >= time[0]) & (clock <= time[-1])
-    near = time[after] - time[before] <= _longest_gap(time)
+    near = time[after] - time[before] <= longest_gap(time)
     return np.asarray(inside & near, dtype=np.bool_)
 
 

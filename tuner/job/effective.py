@@ -261,13 +261,18 @@ def _effects(names: Sequence[str]) -> tuple[str, ...]:
 
 
 def pose_rmse(flights: Iterable[AxesRmse]) -> PoseRmse:
-    """Return the root mean square over flights of what each misses."""
+    """Return the root mean square over flights of what each misses; a crash leaves none of it.
+
+    That of attitude is over the flights that predict it, and follow it not.
+    """
     rows = list(flights)
+    crashed = any(row.x is None for row in rows)
 
     def together(*axes: str) -> float | None:
-        values = [getattr(row, axis) for row in rows for axis in axes]
-        if not values or None in values:
+        of_flights = [[getattr(row, axis) for axis in axes] for row in rows]
+        known = [values for values in of_flights if None not in values]
+        if crashed or not known:
             return None
-        return float(np.sqrt(np.sum(np.square(values)) / len(rows)))
+        return float(np.sqrt(np.sum(np.square(known)) / len(known)))
 
     return PoseRmse(position=together("x", "y", "z"), attitude=together("roll", "pitch", "yaw"))

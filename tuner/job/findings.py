@@ -143,18 +143,25 @@ def inputs_late(job: Job) -> tuple[Finding, ...]:
     )
 
 
-def turning_unexplained(explained: Mapping[str, float]) -> tuple[Finding, ...]:
+def turning_unexplained(job: Job, explained: Mapping[str, float]) -> tuple[Finding, ...]:
     """Warn where recorded inputs explain too little of how fitted flights turn.
+
+    Where no moment of inertia is fitted, as where attitudes are followed, there is nothing to warn
+    of.
 
     Noise of the inputs, and the loop's own answer to what disturbs the vehicle, shrink the torque
     that a fit finds behind an input, by up to the share that it explains (errors in variables).
 
     Parameters
     ----------
+    job
+        Which flights are fitted, and what is free.
     explained
         Flight -> share of the squared change of body rate that is predicted.
     """
-    share = float(np.median(list(explained.values()))) if explained else 1.0
+    of_fitted = [explained[flight.name] for flight in job.fitted if flight.name in explained]
+    turns = any(name.startswith("inertia_") for name in job.space.names)
+    share = float(np.median(of_fitted)) if of_fitted and turns else 1.0
     if share >= EXPLAINED:
         return ()
     numbers = {"explained": share}

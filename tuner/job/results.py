@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
+import jax.numpy as jnp
 import numpy as np
 from pydantic import JsonValue
 
@@ -25,7 +26,7 @@ from tuner.job.best_fit import (
 from tuner.job.held_out import Validation
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
-from tuner.objective.initial_conditions import ROWS
+from tuner.objective.initial_conditions import ROWS, whole
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.segments import OFFSETS
 from tuner.recordings import Recording
@@ -130,7 +131,7 @@ def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
     freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
     if freedom is None or states is None:
         return {}
-    moved = np.asarray(states) * np.asarray(freedom)
+    moved = np.asarray(whole(jnp.asarray(states) * freedom, fitted.objective.segments.freed))
     return {name: float(np.sqrt(np.mean(moved[rows] ** 2))) for name, rows in ROWS.items()}
 
 

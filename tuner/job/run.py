@@ -265,7 +265,7 @@ def _validated(
         validation = validate(job, fitted, vehicle)
     worse = (
         *flights_worse(validation.initial, validation.best),
-        *(inertia or turning_unexplained(validation.turning_explained)),
+        *(inertia or turning_unexplained(job, validation.turning_explained)),
     )
     _report(worse, listener, force=True)
     return replace(fitted, findings=(*worse, *fitted.findings)), validation

@@ -51,6 +51,12 @@ def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
     )
 
 
+def whole(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:
+    """Return the change of all N numbers of a start, of which only some rows change."""
+    changed, none = dict(zip(rows, change, strict=True)), jnp.zeros_like(change[0])
+    return jnp.stack([changed.get(row, none) for row in range(_ENDS[-1])])
+
+
 def moved(start: Start, change: Float[Array, "L F"]) -> Start:
     """Return a start that differs from a recorded one by so much, in the units of `STATES`."""
     parts = {name: change[rows] for name, rows in ROWS.items()}

@@ -25,7 +25,7 @@ from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
-from tuner.objective.initial_conditions import moved, spun_up, trimmed
+from tuner.objective.initial_conditions import moved, spun_up, trimmed, whole
 from tuner.objective.markers import markers_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
 
@@ -164,8 +164,9 @@ def beginning_of(
     if segments.turning is not None:
         start = spun_up(start, model.vehicle, segments.turning)
     if states is not None and segments.freedom is not None:
-        start = moved(start, states * segments.freedom)
-        inlet = trimmed(inlet, model.vehicle, states * segments.freedom)
+        change = whole(states * segments.freedom, segments.freed)
+        start = moved(start, change)
+        inlet = trimmed(inlet, model.vehicle, change)
     return start, inlet, environment
 
 

@@ -87,7 +87,9 @@ class Segments(eqx.Module):
     wander: Float[Array, "L F"] | None = None
     """How far from rest each hover was at its end (`tuner.objective.wander`); None at rest."""
     freedom: Float[Array, "L F"] | None = None
-    """Standard deviations of the start (`tuner.objective.initial_conditions`); None if known."""
+    """Standard deviations of what is free of the start; None if it is known."""
+    freed: tuple[int, ...] = eqx.field(static=True, default=())
+    """What that is: L rows of a whole start's (`tuner.objective.initial_conditions`)."""
 
     @property
     def windowed(self) -> bool:
@@ -209,11 +211,11 @@ def window_segments(
     ]
     start = start_of([piece.initial for piece in pieces], resting=False)
     names = [inlets[number] for number, _ in cut]
-    freedom = None
+    freedom, freed = None, np.arange(0)
     if free_starts:
-        freedom = jnp.asarray(
-            np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
-        )
+        of_all = np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
+        freed = np.flatnonzero(of_all.any(axis=1))
+        freedom = jnp.asarray(of_all[freed])
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
@@ -235,6 +237,7 @@ def window_segments(
             [flights[number] for number, _ in cut], [window for _, window in cut], schedule
         ),
         freedom=freedom,
+        freed=tuple(freed.tolist()),
     )
 
 

@@ -366,6 +366,13 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     ),
     Code.INLET_CHOSEN: (_inlet_chosen, _inlet_remedy),
+    Code.ATTITUDE_FOLLOWED: (
+        (
+            "The recorded attitude of all fitted flights is followed, so that nothing is fitted of "
+            "how the vehicle turns: that of this flight is followed, too."
+        ),
+        "",
+    ),
     Code.DISTURBANCES_FOLLOWED: (_disturbances_followed, ""),
     Code.INERTIA_BALANCED: (_inertia_balanced, ""),
     Code.INERTIA_NOT_BALANCED: (

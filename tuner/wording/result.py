@@ -97,9 +97,11 @@ def effective_in_words(effective: EffectiveResult) -> str:
 
 
 def rmse_in_words(rmse: PoseRmse) -> str:
-    """Return an RMSE with units of a readable size."""
-    if rmse.position is None or rmse.attitude is None:
+    """Return an RMSE with units of a readable size; of an attitude that is followed, nothing."""
+    if rmse.position is None:
         return "a crash"
+    if rmse.attitude is None:
+        return metres(rmse.position)
     return f"{metres(rmse.position)} and {rmse.attitude:.2g}°"
 
 

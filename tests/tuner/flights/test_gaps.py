@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.flights.flight import Series
+from tuner.flights.load import gaps_in
 from tuner.flights.resample import GAP, without_gaps
 
 TIME = np.arange(0.0, 6.0, 0.01)
@@ -57,3 +58,16 @@ def test_an_unknown_sample_counts_as_lost() -> None:
     np.testing.assert_allclose(got.values, circling(TIME), atol=1e-3)
     unknown = Series(TIME, np.full((len(TIME), 3), np.nan))
     assert without_gaps(unknown) is unknown
+
+
+@pytest.mark.parametrize(
+    ("hertz", "lost", "is_said"), [(2.0, 0.45, False), (2.0, 2.0, True), (100.0, 0.3, True)]
+)
+def test_a_signal_is_unknown_only_beyond_what_its_rate_leaves_open(
+    hertz: float, lost: float, *, is_said: bool
+) -> None:
+    clock = np.arange(0.0, 20.0, 0.01)
+    sampled = Series(np.arange(0.0, 20.0, 1.0 / hertz), np.ones((int(20 * hertz), 1)))
+    values = np.where(clock < lost, np.nan, 16.0)[:, None]
+    notes = gaps_in({"battery_voltage": values}, {"battery_voltage": sampled}, 100.0)
+    assert bool(notes) is is_said

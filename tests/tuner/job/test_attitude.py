@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.job.test_windows import stage_for
+from tuner import recordings
 from tuner.config import ControllerFile, JobFile, Options, settle, values_of, with_values
 from tuner.config.job import FlightSettings, Search
 from tuner.findings import Code
@@ -14,7 +15,7 @@ from tuner.job.prepare import job_of
 from tuner.job.search import search
 from tuner.objective.choice import choose_inlet
 from tuner.objective.inlets import TURNING
-from tuner.recordings import recordings_of
+from tuner.recordings import read_usable, recordings_of
 from tuner.wording.findings import one_line
 
 EXPONENT = 0.8
@@ -82,13 +83,17 @@ def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, update
     assert choose_inlet(sparse, "actuator", updated, ControllerFile()).inlet == "actuator"
 
 
-def test_auto_keeps_commands_that_explain_the_turns(full_flight, updated):
+@pytest.fixture(scope="module")
+def dense(full_flight):
     names = ("position", "attitude", "velocity", "body_rate", "command")
-    dense = replace(
+    return replace(
         full_flight,
         series={name: full_flight.series[name] for name in names},
         signals={name: full_flight.signals[name] for name in names},
     )
+
+
+def test_auto_keeps_commands_that_explain_the_turns(dense, updated):
     assert choose_inlet(dense, "auto", updated, ControllerFile()).because is None
     assert choose_inlet(dense, "auto", updated, ControllerFile()).inlet == "actuator"
 
@@ -112,6 +117,23 @@ def test_thrust_drag_and_battery_come_back_from_a_sparse_log(sparse, updated, fu
     assert found["rotor_drag_coefficient"] == pytest.approx(
         truth["rotor_drag_coefficient"], rel=0.05
     )
+
+
+def test_a_flight_held_out_is_followed_where_all_fitted_ones_are(
+    sparse, dense, updated, full_bag, monkeypatch
+):
+    monkeypatch.setattr(recordings, "load_flights", lambda *_, **__: [sparse, dense])
+    settings = settings_of(updated, full_bag)
+    (fitted, held_out), findings = read_usable(settings, holdout=[dense.name])
+    assert fitted.inlet == held_out.inlet == "attitude"
+    (followed,) = (finding for finding in findings if finding.subject == dense.name)
+    assert followed.code is Code.ATTITUDE_FOLLOWED
+    both, _ = read_usable(settings, holdout=[])
+    assert [recording.inlet for recording in both] == ["attitude", "actuator"]
+    asked = settings_of(updated, full_bag, flights={dense.name: FlightSettings(inlet="actuator")})
+    (_, held_out), findings = read_usable(asked, holdout=[dense.name])
+    assert held_out.inlet == "actuator"
+    assert not any(finding.subject == dense.name for finding in findings)
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from tuner.job.effective import (
 from tuner.job.extension import extended
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
-from tuner.result import AxesRmse
+from tuner.result import AxesRmse, PoseRmse
 
 DRAG = 0.04
 
@@ -128,4 +128,8 @@ def test_the_rmse_over_flights_is_of_distances_and_a_crash_stays_one():
     assert both.position == pytest.approx(np.sqrt((25 + 1) / 2))
     assert both.attitude == pytest.approx(5.0)
     assert pose_rmse([axes(*[None] * 6)]).position is None
+    followed = axes(0.0, 0.0, 1.0, None, None, None)  # its attitude, which is no crash
+    assert pose_rmse([axes(3.0, 4.0, 0.0, 1.0, 0.0, 0.0), followed]).attitude == 1.0
+    assert pose_rmse([followed, followed]) == PoseRmse(position=1.0, attitude=None)
+    assert pose_rmse([followed, axes(*[None] * 6)]).position is None
     assert pose_rmse([]).attitude is None

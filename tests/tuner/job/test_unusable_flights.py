@@ -1,6 +1,7 @@
 """Flights as real loggers leave them: what cannot be used is named, and no line is said in vain."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -170,7 +171,14 @@ def test_what_no_loop_takes_out_is_free_where_inputs_are_fed_in(updated):
 
 
 def test_inputs_that_hardly_explain_how_a_flight_turns_are_named():
-    (weak,) = turning_unexplained({"a": 0.4, "b": 0.5, "c": 0.99})
+    def job(*free):
+        fitted = [SimpleNamespace(name=name) for name in "abc"]
+        return SimpleNamespace(fitted=fitted, space=SimpleNamespace(names=free))
+
+    turning = job("inertia_xx", "motor_constant")
+    shares = {"a": 0.4, "b": 0.5, "c": 0.99, "held out": 0.1}
+    (weak,) = turning_unexplained(turning, shares)
     assert (weak.code, weak.numbers["explained"]) == (Code.TURNING_UNEXPLAINED, 0.5)
-    assert turning_unexplained({"a": 0.97}) == ()
-    assert turning_unexplained({}) == ()
+    assert turning_unexplained(turning, {"a": 0.97, "held out": 0.1}) == ()
+    assert turning_unexplained(turning, {}) == ()
+    assert turning_unexplained(job("motor_constant"), shares) == ()

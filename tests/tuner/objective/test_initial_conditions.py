@@ -8,7 +8,13 @@ from sim_jax.state import hover
 from sim_jax.vector import Vec3
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
 from tuner.model import model_of
-from tuner.objective.initial_conditions import eliminated, freedom_of, moved, spun_up
+from tuner.objective.initial_conditions import (
+    eliminated,
+    freedom_of,
+    moved,
+    spun_up,
+    whole,
+)
 
 COUNT = len(freedom_of(()))
 
@@ -60,6 +66,14 @@ def test_a_start_moves_by_what_it_is_told(still):
 def test_what_cannot_matter_is_not_free():
     free = freedom_of(("rotor_speed",))
     assert np.count_nonzero(free) == COUNT - 4
+
+
+def test_what_is_free_of_a_start_takes_its_place_in_all_of_it():
+    change = jnp.asarray([[1.0, 2.0], [3.0, 4.0]])
+    all_of_it = np.asarray(whole(change, (1, COUNT - 1)))
+    assert all_of_it.shape == (COUNT, 2)
+    np.testing.assert_array_equal(all_of_it[[1, COUNT - 1]], change)
+    assert np.count_nonzero(all_of_it) == 4
 
 
 def test_a_rotor_without_tachometer_turns_as_its_command_asks(still):

@@ -10,6 +10,7 @@ from sim_jax.schedule import Schedule
 from tuner.errors import RecordingError
 from tuner.flights.flight import Series
 from tuner.objective.choice import inlet_for
+from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 from tuner.objective.segments import window_segments
@@ -91,8 +92,16 @@ def test_the_actuator_inlet_holds_what_was_recorded(flight):
     assert fed == pytest.approx(recorded, abs=0.02)
 
 
-@pytest.mark.parametrize("inlet", ["body_rate", "actuator", "rotor_speed"])
-def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet):
+@pytest.mark.parametrize(
+    ("inlet", "known"),
+    [
+        ("body_rate", {"trim"}),
+        ("actuator", {"rate_integral"}),
+        ("rotor_speed", {"rotor_speed", "rate_integral"}),
+        ("attitude", {"attitude", "body_rate", "rate_integral", "trim"}),
+    ],
+)
+def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet, known):
     segments = window_segments(
         [flight],
         inlets=[inlet],
@@ -102,6 +111,10 @@ def test_every_inlet_gives_segments_whose_starts_are_free(flight, inlet):
         noise={"position": 1e-3, "body_rate": 0.02, "rotor_speed": 2.0, "command": 1e-3},
     )
     assert segments.freedom is not None
+    assert np.all(np.asarray(segments.freedom) > 0.0)
+    of_known = {row for name in known for row in range(100)[ROWS[name]]}
+    rows = range(max(row.stop for row in ROWS.values()))
+    assert segments.freed == tuple(row for row in rows if row not in of_known)
     assert ("command" in segments.measured) == (inlet == "body_rate")
-    assert ("rotor_speed" in segments.measured) == (inlet != "rotor_speed")
+    assert ("rotor_speed" in segments.measured) == (inlet not in ("rotor_speed", "attitude"))
     assert segments.begins.tolist() == pytest.approx(list(range(segments.count)), abs=0.02)

@@ -66,6 +66,7 @@ MADE = {
         {"correlation": 0.02, "recorded": 45, "gyro": 49},
         ("attitude", "command"),
     ),
+    Code.ATTITUDE_FOLLOWED: Finding(Code.ATTITUDE_FOLLOWED, "info", "a", names=("actuator",)),
     Code.SETPOINTS_SCALED: Finding(
         Code.SETPOINTS_SCALED,
         "warning",

@@ -32,6 +32,7 @@ def test_the_second_answer_is_said_with_what_it_costs():
 def test_a_crash_and_a_metre_are_said_as_such():
     assert rmse_in_words(PoseRmse(position=None, attitude=None)) == "a crash"
     assert rmse_in_words(PoseRmse(position=2.345, attitude=12.0)) == "2.35 m and 12°"
+    assert rmse_in_words(PoseRmse(position=2.345, attitude=None)) == "2.35 m"  # it is followed
 
 
 def test_what_a_target_holds_is_not_lost_there():
