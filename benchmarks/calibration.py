@@ -261,7 +261,6 @@ def fitted(objective: Objective) -> Fitted:
         method="gradient",
         evaluations=progress.evaluations,
         wall_time=0.0,
-        loss_initial=float("nan"),
         loss_best=float(progress.losses[0]),
         converged=progress.converged,
     )

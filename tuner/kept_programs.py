@@ -17,6 +17,7 @@ import importlib
 import json
 import logging
 import platform
+import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib.metadata import version
@@ -40,6 +41,9 @@ OURS = ("sim_jax", "tuner")
 TRACED_BY = ("jax", "jaxlib", "equinox", "numpy")
 SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision")
 _DIGEST = hashlib.sha256().digest_size
+_TRACING = threading.RLock()
+"""Held while a program is traced. Python does one thing at a time: of two threads that trace, each
+takes as long as both, and the search waits for what is only made ready for later."""
 _UNSURE = ("<function", "<lambda", " at 0x")
 """What a structure's text holds where it says too little of what stands there."""
 
@@ -134,7 +138,8 @@ def _traced(
         results.append(jax.tree.structure(result))
         return jax.tree.leaves(result)
 
-    exported = export.export(jax.jit(flat))(*map(_like, leaves))
+    with _TRACING:
+        exported = export.export(jax.jit(flat))(*map(_like, leaves))
     described = _described(jax.tree.unflatten(results[0], exported.out_avals))
     program = _callable(exported, described)
     content = json.dumps(described).encode() + b"\n" + bytes(exported.serialize())

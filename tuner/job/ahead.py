@@ -1,10 +1,11 @@
-"""Programs that come after the search, made ready while it goes on.
+"""Programs of the search's steps and of what comes after it, made ready beside it.
 
 The selection of terms and the examination differentiate flights by more than the search does, each
 by a program of its own. To compile one takes a core some twenty seconds where it is not in the
 cache, and a second where it is, in which the other core has little to do. So another thread asks
 for both, about the vehicle that the search begins with and a horizon of one sample: nothing but the
-program comes of it.
+program comes of it. Before, it compiles what a step computes beside flights, while the search's own
+program is compiled.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import numpy as np
 
 from tuner.examination.examination import examine
 from tuner.job.prepare import Job
+from tuner.job.search import starting_vectors
 from tuner.job.selection import Selection
 from tuner.job.terms import candidates_of
 from tuner.objective.alternatives import alternatives_of
@@ -27,7 +29,8 @@ from tuner.objective.criterion import Criterion
 from tuner.objective.flight_batches import portions
 from tuner.runtime import AHEAD
 from tuner.search.fitted import Fitted
-from tuner.search.progress import beginning, criterion_of, point_of
+from tuner.search.levenberg_marquardt import make_ready
+from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 
@@ -46,6 +49,7 @@ class ProgramsAhead:
     def __init__(self, job: Job) -> None:
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=AHEAD)
         fitted = _not_fitted(job)
+        self._begun(lambda: _step(job))
         few = _fits(full_problem_of(fitted.objective, fitted.point), fitted.criterion)
         selects = few and bool(candidates_of(job))
         self._selection = self._begun(lambda: _select(job, fitted)) if selects else None
@@ -98,12 +102,10 @@ def _not_fitted(job: Job) -> Fitted:
     """Return the start of a job's search as a fit to one sample of each flight."""
     objective = job.objective
     start = beginning(objective, job.space.initial[None])
-    stage = Stage("ahead", 1, 1.0, False, False, 1, 1.0, False, False)
-    offsets = np.asarray(start.points.offsets[0])
     return Fitted(
         objective=objective,
         point=point_of(start.points, 0),
-        criterion=criterion_of(stage, start.scales, offsets, start.states),
+        criterion=_first_criterion(start),
         noise=job.noise,
         scales={flight.name: dict.fromkeys(start.scales, 1.0) for flight in job.fitted},
         iterations=(),
@@ -111,10 +113,22 @@ def _not_fitted(job: Job) -> Fitted:
         method="none",
         evaluations=0,
         wall_time=0.0,
-        loss_initial=np.inf,
         loss_best=np.inf,
         converged=False,
     )
+
+
+def _first_criterion(progress: Progress) -> Criterion:
+    """Return a criterion of one sample, for what a search begins with."""
+    stage = Stage("ahead", 1, 1.0, False, False, 1, 1.0, False, False)
+    offsets = np.asarray(progress.points.offsets[0])
+    return criterion_of(stage, progress.scales, offsets, progress.states)
+
+
+def _step(job: Job) -> None:
+    objective = job.windows or job.objective
+    progress = beginning(objective, starting_vectors(job))
+    make_ready(objective, progress.points, _first_criterion(progress))
 
 
 def _select(job: Job, fitted: Fitted) -> None:

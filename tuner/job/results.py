@@ -43,6 +43,7 @@ from tuner.result import (
     Status,
 )
 from tuner.search.fitted import Fitted
+from tuner.search.normal_equations import normal_equations
 from tuner.selection.table import SelectionRow
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import Sources
@@ -102,7 +103,7 @@ def result_of(
             evaluations=fitted.evaluations,
             iterations=len(fitted.iterations),
             wall_time=fitted.wall_time,
-            cost_initial=fitted.loss_initial,
+            cost_initial=_loss_at_start(job, fitted),
             cost_best=fitted.loss_best,
             converged=fitted.converged,
             message=Ending.NO_FURTHER_GAIN if fitted.converged else Ending.ITERATION_LIMIT,
@@ -111,6 +112,16 @@ def result_of(
         effective=effective,
         next_log=next_log,
     )
+
+
+def _loss_at_start(job: Job, fitted: Fitted) -> float:
+    """Return the loss with the initial coefficients, as the fit's last stage counts it."""
+    objective, criterion = fitted.objective, fitted.criterion
+    start = objective.start(job.space.initial)
+    flight = np.asarray(objective.segments.flight)
+    sums = objective.sums(start, criterion)
+    loss, _, _ = normal_equations(objective.space, flight, start, criterion, sums)
+    return float(loss)
 
 
 def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:

@@ -15,13 +15,11 @@ from tuner.findings import Code, Finding
 from tuner.job.checkpoint import fingerprint, load, save
 from tuner.job.findings import findings_at, unmatched
 from tuner.job.prepare import Job
-from tuner.objective.criterion import Criterion, Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted, Outcome
-from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import Free
 from tuner.search.progress import (
     Progress,
@@ -206,7 +204,6 @@ class _Attempt:
             method=self.method,
             evaluations=progress.evaluations,
             wall_time=seconds,
-            loss_initial=_loss_at(objective, objective.start(starts[0]), criterion),
             loss_best=float(progress.losses[best]),
             converged=progress.converged,
         )
@@ -257,15 +254,6 @@ def free_offsets(job: Job) -> NDArray[np.bool_]:
 
 def _origin(number: int) -> str:
     return "vehicle file" if number == 0 else "random"
-
-
-def _loss_at(objective: Objective, point: Point, criterion: Criterion) -> float:
-    """Return the loss at a point, as the search counts it."""
-    sums = objective.sums(point, criterion)
-    loss, _, _ = normal_equations(
-        objective.space, np.asarray(objective.segments.flight), point, criterion, sums
-    )
-    return float(loss)
 
 
 def parameters_of(job: Job, progress: Progress) -> Mapping[str, float]:

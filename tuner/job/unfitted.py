@@ -52,7 +52,6 @@ def unfitted(job: Job) -> Fitted:
         method="none",
         evaluations=len(matches),
         wall_time=0.0,
-        loss_initial=match.loss,
         loss_best=match.loss,
         converged=True,
         findings=tuple(

@@ -60,7 +60,7 @@ class Fitted:
         Simulated batches, Jacobians included.
     wall_time
         s.
-    loss_initial, loss_best
+    loss_best
         In the final weights.
     converged
         Whether the last stage stopped because its steps gained nothing, not at its limit.
@@ -84,7 +84,6 @@ class Fitted:
     method: str
     evaluations: int
     wall_time: float
-    loss_initial: float
     loss_best: float
     converged: bool
     polished: bool = True

@@ -28,7 +28,6 @@ def fitted(scale: float) -> Fitted:
         method="gradient",
         evaluations=0,
         wall_time=0.0,
-        loss_initial=1.0,
         loss_best=1.0,
         converged=True,
     )

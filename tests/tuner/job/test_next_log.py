@@ -43,7 +43,6 @@ def at_truth(job, updated):
         method="gradient",
         evaluations=0,
         wall_time=0.0,
-        loss_initial=0.0,
         loss_best=0.0,
         converged=True,
     )

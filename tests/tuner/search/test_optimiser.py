@@ -10,10 +10,11 @@ import pytest
 
 from tests.tuner.uncertainty.making import problem, truth, with_data
 from tuner.objective.segments import OFFSETS
+from tuner.search import levenberg_marquardt
 from tuner.search.continuation import grow
-from tuner.search.normal_equations import linear_residuals, residuals_at
+from tuner.search.normal_equations import linear_residuals, normal_equations, residuals_at
 from tuner.search.optimiser import OPTIMISERS, Free
-from tuner.search.progress import beginning
+from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
@@ -88,13 +89,24 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
     assert all(iteration.damping is None for iteration in progress.iterations)
 
 
-def test_least_squares_reports_its_damping():
+def test_least_squares_reports_its_damping_and_computes_what_was_made_ready(monkeypatch):
     fit = with_data(problem(FREE), truth(problem(FREE)))
     stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
+    start = beginning(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]])
+    traced = []
+
+    def traced_equations(*arguments):
+        traced.append(arguments)
+        return normal_equations(*arguments)
+
+    monkeypatch.setattr(levenberg_marquardt, "normal_equations", traced_equations)
+    criterion = criterion_of(stage, start.scales, np.asarray(start.points.offsets[0]))
+    levenberg_marquardt.make_ready(fit, start.points, criterion)
+    assert len(traced) == 1
     progress = grow(
         fit,
         (stage,),
-        beginning(fit, np.asarray(fit.space.initial)[None] + 0.05),
+        start,
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         clipped=False,
         on_progress=lambda _: None,
@@ -102,6 +114,7 @@ def test_least_squares_reports_its_damping():
     first, second, *_ = (iteration.damping for iteration in progress.iterations)
     assert first == 1.0
     assert second == pytest.approx(0.2)  # the model predicted well: five times longer a step
+    assert len(traced) == 1
 
 
 def test_the_linear_residuals_have_the_normal_equations():

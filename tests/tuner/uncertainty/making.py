@@ -161,7 +161,6 @@ def fitted_of(objective: Objective, point: Point) -> Fitted:
         method="gradient",
         evaluations=0,
         wall_time=0.0,
-        loss_initial=1.0,
         loss_best=1.0,
         converged=True,
     )
