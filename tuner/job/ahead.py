@@ -41,18 +41,17 @@ MOST = 2**28
 
 
 class ProgramsAhead:
-    """Makes the programs of a job's selection and examination ready, one after the other.
+    """Makes the programs of a job's steps, selection and examination ready, one after the other.
 
-    Nothing is made ready for many flights. What fails here fails, and is said, where it is needed.
+    For many flights the last two are not. What fails here fails, and is said, where it is needed.
     """
 
     def __init__(self, job: Job) -> None:
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=AHEAD)
         fitted = _not_fitted(job)
-        self._begun(lambda: _step(job))
         few = _fits(full_problem_of(fitted.objective, fitted.point), fitted.criterion)
         selects = few and bool(candidates_of(job))
-        self._selection = self._begun(lambda: _select(job, fitted)) if selects else None
+        self._selection = self._begun(lambda: _search_and_select(job, fitted, selects=selects))
         self._examination = self._begun(lambda: _examine(fitted)) if few else None
 
     def __enter__(self) -> Self:
@@ -125,10 +124,12 @@ def _first_criterion(progress: Progress) -> Criterion:
     return criterion_of(stage, progress.scales, offsets, progress.states)
 
 
-def _step(job: Job) -> None:
+def _search_and_select(job: Job, fitted: Fitted, *, selects: bool) -> None:
     objective = job.windows or job.objective
     progress = beginning(objective, starting_vectors(job))
     make_ready(objective, progress.points, _first_criterion(progress))
+    if selects:
+        _select(job, fitted)
 
 
 def _select(job: Job, fitted: Fitted) -> None:
