@@ -48,7 +48,7 @@ class ProgramsAhead:
 
     def __init__(self, job: Job) -> None:
         self._executor = ThreadPoolExecutor(max_workers=1, thread_name_prefix=AHEAD)
-        fitted = _not_fitted(job)
+        fitted = self._fitted = _not_fitted(job)
         few = _fits(full_problem_of(fitted.objective, fitted.point), fitted.criterion)
         selects = few and bool(candidates_of(job))
         self._selection = self._begun(lambda: _search_and_select(job, fitted, selects=selects))
@@ -68,21 +68,30 @@ class ProgramsAhead:
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def await_selection(self) -> None:
-        """Return once the selection's program is ready, or left to whoever needs it."""
+        """Return once the selection's program is ready, or left to whoever needs it.
+
+        While the other thread is at it, this one would wait: it makes the examination's ready.
+        """
+        examination = self._examination
+        if self._selection.running() and examination is not None and examination.cancel():
+            self._examination = None
+            _attempt(lambda: _examine(self._fitted))
         _await(self._selection)
 
     def await_examination(self) -> None:
         """Return once the examination's program is ready, or left to whoever needs it."""
         _await(self._examination)
+        self._examination = None
 
     def _begun(self, make: Callable[[], object]) -> Future[None]:
-        def attempt() -> None:
-            try:
-                make()
-            except Exception as reason:  # such a start may be no vehicle; the search knows better
-                logger.debug("a program was not made ready: %s", reason)
+        return self._executor.submit(_attempt, make)
 
-        return self._executor.submit(attempt)
+
+def _attempt(make: Callable[[], object]) -> None:
+    try:
+        make()
+    except Exception as reason:  # such a start may be no vehicle; the search knows better
+        logger.debug("a program was not made ready: %s", reason)
 
 
 def _await(program: Future[None] | None) -> None:

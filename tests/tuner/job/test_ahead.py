@@ -57,6 +57,31 @@ def test_what_has_not_begun_is_left_to_whoever_needs_it(monkeypatch: pytest.Monk
     assert not examined
 
 
+def test_who_waits_for_the_selection_makes_the_examination_ready(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few_groups(monkeypatch)
+    begun, examined = threading.Event(), threading.Event()
+    threads = []
+
+    def select(*_: object) -> None:
+        begun.set()
+        assert examined.wait(60.0)
+
+    def examine(*_: object) -> None:
+        threads.append(threading.current_thread())
+        examined.set()
+
+    monkeypatch.setattr(ahead, "_select", select)
+    monkeypatch.setattr(ahead, "_examine", examine)
+    job, _ = unfitted_with(0.0, seed=0)
+    with ProgramsAhead(job) as programs:
+        assert begun.wait(60.0)
+        programs.await_selection()
+        programs.await_examination()
+    assert threads == [threading.current_thread()]
+
+
 def test_what_fails_ahead_is_left_to_whoever_needs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     few_groups(monkeypatch)
 
