@@ -191,7 +191,7 @@ def flights_worse(
 
 
 def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Warn of lags whose intervals hold the noise alone, and not that physics runs in steps."""
+    """Warn of lags that are known more finely than simulators of other physics steps agree."""
     names = [
         name
         for name, estimate in uncertainty.estimates.items()

@@ -255,8 +255,8 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.FINER_THAN_STEPS: (
         (
-            "The 95 % intervals hold the measurement noise alone: simulators with another physics "
-            "step differ by {milliseconds:g} ms."
+            "The 95 % intervals say how well these lags of this simulator are known: simulators "
+            "with another physics step differ by {milliseconds:g} ms."
         ),
         "Take these values as known to {twice:g} ms.",
     ),
