@@ -162,10 +162,6 @@ def _date(nanoseconds: int) -> str | None:
     return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat(timespec="seconds")
 
 
-def _rate(time: Array) -> float:
-    return 1 / float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-
-
 def _measured(series: Series) -> tuple[int, ...]:
     return tuple(int(i) for i in np.flatnonzero(np.isfinite(series.values).any(axis=0)))
 
@@ -182,7 +178,7 @@ def _signals(series: Mapping[str, Series], places: Mapping[str, Place]) -> tuple
             places[name].topic,
             SIGNALS[name][1],
             len(samples.time),
-            _rate(samples.time),
+            samples.rate,
             _measured(samples),
         )
         for name, samples in series.items()

@@ -59,6 +59,16 @@ class Series:
         if len(self.time) > 1 and not np.all(np.diff(self.time) > 0):
             raise ValueError("time is not strictly increasing")
 
+    @property
+    def rate(self) -> float:
+        """Hz, the median; 0 of a single sample."""
+        return 1.0 / float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
+
+    def between(self, start: float, end: float) -> Series:
+        """Return the samples from one time to another, in s, both included."""
+        inside = (self.time >= start) & (self.time <= end)
+        return Series(self.time[inside], self.values[inside])
+
 
 @dataclass(frozen=True)
 class InitialState:

@@ -83,9 +83,10 @@ def informed(
     rates = _spread(series, "body_rate", missions)
     command = float(np.max(_spread(series, "command", missions), initial=0.0))
     speed = max(mission.top_speed for mission in missions)
-    climb = float(_largest(series, "velocity", missions)[2]) if "velocity" in series else 0.0
+    vertical = _during(series["velocity"], missions)[:, 2] if "velocity" in series else np.zeros(1)
+    climb = float(np.nanmax(np.abs(vertical))) if len(vertical) else 0.0
     driven = bool(has & {"command", "rotor_speed", "rate_setpoint", "reference_position"})
-    quick = {n for n in ("command", "rotor_speed") if n in series and _rate(series[n]) >= QUICK}
+    quick = {n for n in ("command", "rotor_speed") if n in series and series[n].rate >= QUICK}
     tachometer, commands = "rotor_speed" in has, "command" in has
 
     def turning(axis: int, limit: float, name: str) -> tuple[str, str]:
@@ -144,10 +145,6 @@ def _graded(value: float, limit: float, why: str) -> tuple[str, str]:
     return how, why
 
 
-def _rate(series: Series) -> float:
-    return 1 / float(np.median(np.diff(series.time))) if len(series.time) > 1 else 0.0
-
-
 def _during(series: Series, missions: Sequence[MissionReport]) -> Array:
     inside = np.zeros(len(series.time), dtype=np.bool_)
     for mission in missions:
@@ -167,8 +164,3 @@ def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionR
         return np.zeros(values.shape[1])
     largest = np.nanmax(np.abs(values), axis=0)
     return np.asarray(np.maximum(np.nanstd(values, axis=0), 0.25 * largest))
-
-
-def _largest(series: Mapping[str, Series], name: str, missions: Sequence[MissionReport]) -> Array:
-    values = np.abs(_during(series[name], missions))
-    return np.asarray(np.nanmax(values, axis=0)) if len(values) else np.zeros(values.shape[1])

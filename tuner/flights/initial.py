@@ -48,7 +48,7 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
 
 def in_hover(series: Mapping[str, Series]) -> bool:
     """Return whether the vehicle hovers through the last second before time 0."""
-    position = _window(series["position"], -HOVER, 0.0)
+    position = series["position"].between(-HOVER, 0.0)
     if len(position.time) < 5 or position.time[0] > -0.8 * HOVER:
         return False
     slope = np.polyfit(position.time, position.values, 1)[0]
@@ -57,18 +57,13 @@ def in_hover(series: Mapping[str, Series]) -> bool:
         return False
     if "body_rate" not in series:
         return True
-    rates = _window(series["body_rate"], -HOVER, 0.0).values
+    rates = series["body_rate"].between(-HOVER, 0.0).values
     return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < STILL)
-
-
-def _window(series: Series, start: float, end: float) -> Series:
-    inside = (series.time >= start) & (series.time <= end)
-    return Series(series.time[inside], series.values[inside])
 
 
 def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: int = 0) -> float:
     """Return one column, or its derivative, at time 0."""
-    near = _window(series, -HOVER, 0.0) if hover else _window(series, -AROUND, AROUND)
+    near = series.between(-HOVER, 0.0) if hover else series.between(-AROUND, AROUND)
     measured = np.isfinite(near.values[:, column])
     time, values = near.time[measured], near.values[measured, column]
     if len(time) == 0:

@@ -54,7 +54,8 @@ def make_flight(
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
     around = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
-    mission_series = {name: _until(data, mission.end - start) for name, data in around.items()}
+    until = mission.end - start + 1e-6
+    mission_series = {name: data.between(-np.inf, until) for name, data in around.items()}
     mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
     ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
@@ -112,13 +113,8 @@ def _mission_grid(series: Mapping[str, Series], mission: Mission, rate: float) -
 
 
 def _from_start(series: Series, start: float, end: float) -> Series:
-    kept = (series.time >= start - BEFORE) & (series.time <= end + 1e-6)
-    return Series(series.time[kept] - start, series.values[kept])
-
-
-def _until(series: Series, end: float) -> Series:
-    kept = series.time <= end + 1e-6
-    return Series(series.time[kept], series.values[kept])
+    kept = series.between(start - BEFORE, end + 1e-6)
+    return Series(kept.time - start, kept.values)
 
 
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:

@@ -60,7 +60,7 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
     setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
     missions = []
     if setpoints is not None and len(setpoints.time) > 1:
-        spans = _bouts(setpoints.time)
+        spans = stretches(setpoints.time, np.ones(len(setpoints.time), np.bool_), bridged=PAUSE)
         whole = len(spans) == 1 and spans[0][0] < first + FROM_THE_START
         if not whole:
             for start, end in spans:
@@ -86,14 +86,6 @@ def _motion_or_flight(series: Mapping[str, Series], up: float, down: float) -> t
 
 def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
     return tuple(m for m in missions if m.end - m.start >= SHORTEST)
-
-
-def _bouts(time: Array) -> list[tuple[float, float]]:
-    """Return the stretches of stamps between pauses."""
-    breaks = np.flatnonzero(np.diff(time) > PAUSE)
-    starts = np.concatenate([[0], breaks + 1])
-    ends = np.concatenate([breaks, [len(time) - 1]])
-    return [(float(time[a]), float(time[b])) for a, b in zip(starts, ends, strict=True)]
 
 
 def _reference_end(series: Mapping[str, Series], last: float) -> float:
@@ -169,26 +161,22 @@ def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
     """Return the height of the ground at each time: where the vehicle last stood, or will stand."""
     where = np.flatnonzero(idle)
     before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
-    levels = np.array([np.median(part) for part in _runs(height, where)])
-    run_of = np.cumsum(np.concatenate([[0], np.diff(where) > 1]))
+    gaps = np.diff(where) > 1
+    runs = np.split(height[where], np.flatnonzero(gaps) + 1)
+    levels = np.array([np.median(run) for run in runs])
+    run_of = np.cumsum(np.concatenate([[0], gaps]))
     return np.asarray(levels[run_of[before]])
 
 
-def _runs(height: Array, where: NDArray[np.intp]) -> list[Array]:
-    return np.split(height[where], np.flatnonzero(np.diff(where) > 1) + 1)
-
-
-def stretches(time: Array, up: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """Return the stretches in which a condition holds, breaks of a moment bridged."""
-    index = np.flatnonzero(up)
-    if len(index) == 0:
+def stretches(
+    time: Array, up: NDArray[np.bool_], *, bridged: float = MOMENT
+) -> list[tuple[float, float]]:
+    """Return the stretches in which a condition holds, breaks of up to some s bridged."""
+    holds = time[up]
+    if len(holds) == 0:
         return []
-    breaks = np.flatnonzero(np.diff(time[index]) > MOMENT)
-    starts = np.concatenate([[0], breaks + 1])
-    ends = np.concatenate([breaks, [len(index) - 1]])
-    return [
-        (float(time[index[a]]), float(time[index[b]])) for a, b in zip(starts, ends, strict=True)
-    ]
+    runs = np.split(holds, np.flatnonzero(np.diff(holds) > bridged) + 1)
+    return [(float(run[0]), float(run[-1])) for run in runs]
 
 
 @dataclass(frozen=True)

@@ -52,14 +52,18 @@ def rotate(q: Array, v: Array) -> Array:
 
 def body_rate_of(q: Array) -> Array:
     """Return the (n, 3) body rate, rad/s, of (n, 4) attitudes on the clock."""
-    dq = derivative(q)
+    return body_rate_from(q, derivative(q))
+
+
+def body_rate_from(q: Array, turning: Array) -> Array:
+    """Return the (n, 3) body rate, rad/s, of (n, 4) attitudes that turn so: 2 q* ⊗ dq/dt."""
     w, x, y, z = q.T
-    a, b, c, d = dq.T
-    return 2 * np.column_stack(
+    dw, dx, dy, dz = turning.T
+    return 2.0 * np.column_stack(
         [
-            w * b - x * a - y * d + z * c,
-            w * c + x * d - y * a - z * b,
-            w * d - x * c + y * b - z * a,
+            w * dx - x * dw - y * dz + z * dy,
+            w * dy + x * dz - y * dw - z * dx,
+            w * dz - x * dy + y * dx - z * dw,
         ]
     )
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tuner.flights.flight import SIGNALS, Array, InitialState, Series
+from tuner.flights.motion import body_rate_from
 
 AROUND = 0.03
 """s on either side of a time from which its state is filtered."""
@@ -84,7 +85,7 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
     body_rate = read("body_rate")
     if not np.isfinite(body_rate).all():
         turning = filtered(series["attitude"], times, derivative=1)
-        body_rate = np.where(np.isfinite(body_rate), body_rate, _rate_of(attitude, turning))
+        body_rate = np.where(np.isfinite(body_rate), body_rate, body_rate_from(attitude, turning))
     return States(
         time=np.asarray(times, float),
         position=read("position"),
@@ -93,19 +94,6 @@ def states_at(series: Mapping[str, Series], times: Array) -> States:
         body_rate=body_rate,
         rotor_speed=read("rotor_speed"),
         command=read("command"),
-    )
-
-
-def _rate_of(attitude: Array, turning: Array) -> Array:
-    """Return the body rates (n, 3) of attitudes (n, 4) and their derivatives: 2 q* ⊗ dq/dt."""
-    w, x, y, z = attitude.T
-    dw, dx, dy, dz = turning.T
-    return 2.0 * np.column_stack(
-        [
-            w * dx - x * dw - y * dz + z * dy,
-            w * dy - y * dw - z * dx + x * dz,
-            w * dz - z * dw - x * dy + y * dx,
-        ]
     )
 
 

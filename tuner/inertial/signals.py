@@ -62,7 +62,7 @@ def stretches_of(
 ) -> tuple[Stretch, ...]:
     """Return the stretches in the air on the clock of the slowest of the three signals."""
     names = ("body_rate", "acceleration", "command")
-    rate = min(FASTEST, *(1.0 / float(np.median(np.diff(series[name].time))) for name in names))
+    rate = min(FASTEST, *(series[name].rate for name in names))
     if rate < SLOWEST:
         return ()
     stretches = []
