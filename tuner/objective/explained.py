@@ -15,6 +15,7 @@ import numpy as np
 
 from tuner.config import VehicleFile
 from tuner.flights.flight import Array, Flight, Series
+from tuner.objective.recorded_inputs import linear_interpolation
 
 Source = Literal["command", "rotor_speed"]
 
@@ -72,8 +73,8 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained
         source,
         (best[0], best[1], best[2]),
         delay * step,
-        _rate(flight.series[source]),
-        _rate(flight.series["body_rate"]),
+        flight.series[source].rate,
+        flight.series["body_rate"].rate,
     )
 
 
@@ -82,7 +83,7 @@ def common_clock(
 ) -> Array | None:
     """Return a uniform clock at the gyro's rate over what both signals cover of a span in s."""
     gyro, rotors = series["body_rate"], series[source]
-    rate = min(FASTEST, _rate(gyro))
+    rate = min(FASTEST, gyro.rate)
     begin = max(span[0], gyro.time[0], rotors.time[0])
     end = min(span[1], gyro.time[-1], rotors.time[-1])
     count = int((end - begin) * rate)
@@ -94,9 +95,9 @@ def turning_and_torque(
 ) -> tuple[Array, Array]:
     """Return angular acceleration (n, 3) in rad/s² and torque (n, 3) over motor_constant."""
     gyro, rotors = series["body_rate"], series[source]
-    rates = smoothed(values_on(clock, gyro))
+    rates = smoothed(linear_interpolation(gyro, clock))
     turning = np.gradient(rates, clock, axis=0)
-    squares = squared_speed(vehicle, source, values_on(clock, rotors))
+    squares = squared_speed(vehicle, source, linear_interpolation(rotors, clock))
     return turning, smoothed(squares) @ levers(vehicle)
 
 
@@ -133,16 +134,3 @@ def _correlation(turning: Array, torque: Array, delay: int) -> tuple[float, ...]
     a, b = late - late.mean(axis=0), early - early.mean(axis=0)
     size = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
     return tuple(((a * b).sum(axis=0) / np.where(size > 0, size, np.inf)).tolist())
-
-
-def values_on(clock: Array, series: Series) -> Array:
-    """Return a signal (n, k), linear between its samples."""
-    columns = []
-    for column in series.values.T:
-        known = np.isfinite(column)
-        columns.append(np.interp(clock, series.time[known], column[known]))
-    return np.column_stack(columns)
-
-
-def _rate(series: Series) -> float:
-    return float(1.0 / np.median(np.diff(series.time)))

@@ -23,8 +23,8 @@ from tuner.objective.explained import (
     levers,
     smoothed,
     squared_speed,
-    values_on,
 )
+from tuner.objective.recorded_inputs import linear_interpolation
 
 LAGS = (0.005, 0.015, 0.03, 0.06)
 """s of the rotors' lag that are tried."""
@@ -85,8 +85,8 @@ def motor_order(
     if clock is None or len(vehicle.rotors) != 4:
         return None
     step = float(clock[1] - clock[0])
-    turning = np.gradient(smoothed(values_on(clock, series["body_rate"])), step, axis=0)
-    squares = squared_speed(vehicle, source, values_on(clock, series[source]))
+    turning = np.gradient(smoothed(linear_interpolation(series["body_rate"], clock)), step, axis=0)
+    squares = squared_speed(vehicle, source, linear_interpolation(series[source], clock))
     if 0.5 / step < 4.0 * SLOW:
         return None
     turning = _without_slow(turning, step)

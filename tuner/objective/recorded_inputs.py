@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.flights.flight import SIGNALS, Array, Flight, Series
+from tuner.flights.motion import body_rate_from
 
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""
@@ -53,15 +54,7 @@ def with_body_rate(flight: Flight) -> Flight:
     if flight.has("body_rate"):
         return flight
     turns = flight.series["attitude"]
-    w, x, y, z = turns.values.T
-    dw, dx, dy, dz = np.gradient(turns.values, turns.time, axis=0).T
-    rate = 2.0 * np.column_stack(
-        [
-            w * dx - x * dw - y * dz + z * dy,
-            w * dy + x * dz - y * dw - z * dx,
-            w * dz - x * dy + y * dx - z * dw,
-        ]
-    )
+    rate = body_rate_from(turns.values, np.gradient(turns.values, turns.time, axis=0))
     return replace(flight, series={**flight.series, "body_rate": Series(turns.time, rate)})
 
 

@@ -45,31 +45,6 @@ class Trace(eqx.Module):
     crash_time: Float[Array, " F"]
 
 
-def fly(
-    model: Model,
-    segments: Segments,
-    schedule: Schedule,
-    *,
-    samples: int,
-    horizon: Int[Array, ""] | None,
-    limits: Limits,
-    states: Float[Array, "L F"] | None = None,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> Trace:
-    """Simulate every segment, and keep what it is compared by; as `simulate_segments` takes it."""
-    flown = simulate_segments(
-        model,
-        segments,
-        schedule,
-        samples=samples,
-        horizon=horizon,
-        limits=limits,
-        states=states,
-        conditions=conditions,
-    )
-    return trace_of(flown, model, segments, conditions)
-
-
 def trace_of(
     flown: Rollout,
     model: Model,

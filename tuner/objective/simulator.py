@@ -25,7 +25,7 @@ from tuner.objective.criterion import (
 )
 from tuner.objective.initial_conditions import eliminated
 from tuner.objective.loss import count, gauss_newton, robust_loss
-from tuner.objective.residuals import Trace, fly, residuals
+from tuner.objective.residuals import Trace, residuals, simulate_segments, trace_of
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.tunable import Tunable
 from tuner.parallel import piece_that_fits
@@ -89,8 +89,9 @@ class Simulator:
             surroundings = {
                 name: conditions[row] * units[row] for row, name in enumerate(self.conditions)
             }
-        return fly(
-            model.at(coefficients),
+        moved = model.at(coefficients)
+        flown = simulate_segments(
+            moved,
             segments,
             self.schedule,
             samples=self.capacity,
@@ -99,6 +100,7 @@ class Simulator:
             states=states,
             conditions=surroundings,
         )
+        return trace_of(flown, moved, segments, surroundings)
 
     def conditions_in(self, offsets: Array) -> Array | None:
         """Return what surrounds the segments, (conditions, F), of their rows of a point."""

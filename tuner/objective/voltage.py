@@ -5,10 +5,9 @@ with some tens of millivolts of noise, a hundredth of which would be thrust if i
 stands. What the voltage itself does is a slow decline, and a sag with the load: the current of a
 rotor goes with its power, the cube of its speed. The sag follows rotor speeds or motor commands,
 which are recorded often and well, and one resistance per set of flights is all that is estimated of
-it (a partially linear model, Speckman 1988). The decline that is left is a polynomial in the charge
-drawn, of the degree that the readings support (Schwarz 1978). Where no load was recorded, decline
-and sag together are a smoothing spline, its stiffness chosen by generalised cross-validation
-(Craven and Wahba 1979).
+it (a partially linear model, Speckman 1988), beside a decline that is a polynomial in the charge
+drawn. The decline that is flown, or decline and sag together where no load was recorded, is a
+smoothing spline, its stiffness chosen by generalised cross-validation (Craven and Wahba 1979).
 """
 
 from __future__ import annotations
@@ -136,7 +135,7 @@ def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:
     falls, varied = [np.empty(0)], [np.empty(0)]
     for reading, load in pairs:
         drawn = np.interp(reading.time, load.time, _charge(load))
-        trend = _polynomials(drawn, drawn, _order(reading.time))
+        trend = _polynomials(drawn, _order(reading.time))
         if len(reading.time) < trend.shape[1] + FEWEST:
             continue
         there = np.interp(reading.time, load.time, load.values[:, 0])
@@ -177,32 +176,11 @@ def _order(time: Numbers) -> int:
     return 1 + int(np.ceil(float(np.ptp(time)) / TREND))
 
 
-def _polynomials(span: Numbers, at: Numbers, order: int) -> Numbers:
-    """Return Legendre's polynomials over a span, at places clipped to it, (m, order + 1)."""
+def _polynomials(span: Numbers, order: int) -> Numbers:
+    """Return Legendre's polynomials over a span, (n, order + 1)."""
     middle, half = 0.5 * (span[0] + span[-1]), max(0.5 * (span[-1] - span[0]), 1e-9)
-    place = np.clip((at - middle) / half, -1.0, 1.0)
+    place = np.clip((span - middle) / half, -1.0, 1.0)
     return np.asarray(np.polynomial.legendre.legvander(place, order))
-
-
-def _polynomial(span: Numbers, values: Numbers, at: Numbers, order: int) -> Numbers:
-    """Return, at other places, the polynomial through noisy values whose degree they support.
-
-    That of the least n·log(sum of squares) + degree·log(n), the Bayesian information criterion.
-    """
-    count = len(span)
-    basis = _polynomials(span, span, max(0, min(order, count - FEWEST)))
-    left, best, chosen = values.astype(float), np.inf, np.zeros(1)
-    orthogonal, triangle = np.linalg.qr(basis)
-    shares = orthogonal.T @ values
-    for degree, share in enumerate(shares):
-        left = left - share * orthogonal[:, degree]
-        squares = max(float(left @ left), 1e-12 * float(values @ values), 1e-300)
-        criterion = count * np.log(squares) + degree * np.log(count)
-        if criterion < best:
-            best, chosen = criterion, shares[: degree + 1]
-    terms = len(chosen)
-    weights = np.linalg.solve(triangle[:terms, :terms], chosen)
-    return np.asarray(_polynomials(span, at, terms - 1) @ weights)
 
 
 def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:

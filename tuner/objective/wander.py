@@ -184,9 +184,8 @@ def _predicted(mean: Array, covariance: Array, step: float) -> tuple[Array, Arra
     """Return means (2, S, 5) and covariances (2, S, 5, 5) a step in s later."""
     ahead = np.tile(np.eye(5), (2, 1, 1, 1))
     ahead[..., POSITION, VELOCITY] = ahead[..., TILT, RATE] = step
-    push = (
-        GRAVITY * step * np.array([1.0, -1.0])[:, None]
-    )  # pitch pushes forward, roll to the right
+    # pitch pushes forward, roll to the right
+    push = GRAVITY * step * np.array([1.0, -1.0])[:, None]
     ahead[..., VELOCITY, TILT], ahead[..., VELOCITY, STEADY] = push, -push
     ahead[..., POSITION, TILT] = 0.5 * step * push
     ahead[..., POSITION, STEADY] = -0.5 * step * push
