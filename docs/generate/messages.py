@@ -104,7 +104,7 @@ def messages_page() -> str:
     parts.append(FINDINGS)
     for code in Code:
         text, remedy = TEXTS[code]
-        if not isinstance(text, str):
+        if code in IN_OTHER_WORDS or not isinstance(text, str):
             text, remedy = IN_OTHER_WORDS.get(code, IN_ITS_OWN), ""
         line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, f"{text} {remedy}".strip()))
         parts.append(f'- <a id="{code}"></a>`{code}`: {line}')

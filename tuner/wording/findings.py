@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 from tuner.findings import Code, Finding
-from tuner.flights.damage import Cause, Damage
-from tuner.flights.notes import Note, NoteCode
-from tuner.wording.notes import damage_sentence, note_in_words
+from tuner.wording import composed
 from tuner.wording.phrases import as_sentence, listed, percent
 
 GIVE_VEHICLE = (
@@ -17,127 +14,10 @@ GIVE_VEHICLE = (
 )
 
 
-def _recording(finding: Finding) -> str:
-    code, topic, *names = finding.names
-    numbers = dict(finding.numbers)
-    count = int(numbers.pop("count"))
-    text = note_in_words(Note(NoteCode(code), "warning", topic, count, numbers, tuple(names)))
-    return f"{topic}: {text}." if topic else as_sentence(text)
-
-
-def _left_out(finding: Finding) -> str:
-    what, _ = finding.names
-    return f"The flight is left out: it {what}."
-
-
-def _salvaged(finding: Finding) -> str:
-    cause, subject = finding.names
-    numbers: Mapping[str, Any] = finding.numbers
-    damage = damage_sentence(Damage(Cause(cause), subject, **numbers))
-    return f"The recording is broken, and the flight is what was salvaged of it: {damage}."
-
-
-def _saturation_feedback(finding: Finding) -> str:
-    does = "stops" if finding.numbers["feedback"] else "does not stop"
-    return (
-        "Rotors were clipped at their lower limit, and the recordings agree with a rate integrator "
-        f"that {does} then, other than the controller file has it; it was simulated so."
-    )
-
-
-def _saturation_remedy(finding: Finding) -> str:
-    flag = str(bool(finding.numbers["feedback"])).lower()
-    return f"Set mixer.saturation_feedback: {flag} in the controller file."
-
-
-def _inlet_chosen(finding: Finding) -> str:
-    inlet, signal = finding.names
-    what = signal.replace("_", " ")
-    followed = {
-        "attitude": "its recorded attitude is followed and only its translation simulated",
-        "rotor_speed": "it is simulated from its rotor speeds",
-    }[inlet]
-    return (
-        f"The {what}, logged at {finding.numbers['recorded']:.0f} Hz, does not explain how the "
-        f"vehicle turned (correlation {finding.numbers['correlation']:.2f} with its angular "
-        f"acceleration), so that {followed}."
-    )
-
-
-def _inlet_remedy(finding: Finding) -> str:
-    _, signal = finding.names
-    return f"Log the {signal.replace('_', ' ')} as often as its loop runs."
-
-
-def _setpoints_scaled(finding: Finding) -> str:
-    axis, law = finding.names
-    so = f", as those of the {law} law would be" if law else ""
-    factor = f"{finding.numbers['gain']:.1f}"
-    return f"The recorded {axis} rate set-points are {factor} times the controller file's{so}."
-
-
-def _setpoints_remedy(finding: Finding) -> str:
-    _, law = finding.names
-    if law:
-        return f"Set attitude.law: {law} in the controller file."
-    return "Check the gains of position and attitude control in the controller file."
-
-
-def _setpoints_foreign(finding: Finding) -> str:
-    alike = " and ".join(f"{value:.2f} in {axis}" for axis, value in finding.numbers.items())
-    return (
-        "The recorded rate set-points do not follow from reference, state and controller file "
-        f"(correlation {alike}): another controller flew, or another reference."
-    )
-
-
-def _inertia_balanced(finding: Finding) -> str:
-    values = listed(
-        [
-            f"{name} {finding.numbers[f'{name}_balanced']:.3g} instead of "
-            f"{finding.numbers[f'{name}_fitted']:.3g} kg m²"
-            for name in finding.names
-        ]
-    )
-    error = finding.numbers["error"]
-    if finding.code is Code.INERTIA_BALANCED:
-        return (
-            "Errors in the measured rotor speeds would pass for inertia, so that it is the one at "
-            f"which recorded motion and rotor speeds balance: {values}. All else is fitted to what "
-            "flies, with drag that stands in for what the errors drive. Flights that are left out "
-            f"are predicted with {error:.2f} times the error."
-        )
-    return (
-        "Errors in the measured rotor speeds pass for inertia and damping: recorded motion and "
-        f"rotor speeds balance at {values}. What predicts these flights is kept, for flights that "
-        f"are left out would be predicted with {error:.2f} times the error."
-    )
-
-
-def _disturbances_followed(finding: Finding) -> str:
-    numbers = finding.numbers
-    return (
-        "The residuals hold more than measurement noise, as gusts leave it: a Kalman filter "
-        f"follows a push of {100.0 * numbers['gust']:.2g} % of the weight that lasts "
-        f"{numbers['gust_seconds']:.2g} s, and thrust that wanders by "
-        f"{100.0 * numbers['thrust']:.2g} % for {1e3 * numbers['thrust_seconds']:.0f} ms. The "
-        "coefficients are those that then predict every sample best from the ones before."
-    )
-
-
-def _flight_unmatched(finding: Finding) -> str:
-    multiples = ", ".join(
-        f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
-    )
-    return (
-        "The simulation does not match this flight: its residuals in multiples of the measurement "
-        f"noise are {multiples}, and its weight in the fit was lowered accordingly."
-    )
-
-
 Text = str | Callable[[Finding], str]
-"""With the finding's numbers in braces, ``names`` for its names, ``first`` for the first of them,
-``subject`` for its subject; or what makes a sentence of a finding."""
+"""With the finding's numbers in braces, ``names``, ``first`` and ``last`` for its names in words,
+``coefficients`` and ``given`` for them as they stand, ``subject`` for its subject; or what makes a
+sentence of a finding."""
 #: Code -> what was noticed, and what to do about it.
 TEXTS: Mapping[Code, tuple[Text, Text]] = {
     Code.FLIGHT_WORSE: (
@@ -216,10 +96,10 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.SINGULAR_DIRECTION: (
         (
-            "The flights do not distinguish {names}: a common change of them leaves every recorded "
-            "signal as it is."
+            "The flights do not distinguish {coefficients}: a common change of them leaves every "
+            "recorded signal as it is."
         ),
-        "Fix one of them to its weighed or measured value (--fix {first}).",
+        "Fix one of them to its weighed or measured value (--fix {given}).",
     ),
     Code.CLOCK_OFFSET: (
         "The {first} clock is {milliseconds:+.2f} ms late, which the fit takes into account.",
@@ -357,15 +237,25 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "",
     ),
-    Code.RECORDING: (_recording, ""),
-    Code.LEFT_OUT: (_left_out, lambda finding: as_sentence(finding.names[1])),
-    Code.SALVAGED: (_salvaged, "Record the flight again if what was lost matters."),
-    Code.SATURATION_FEEDBACK: (_saturation_feedback, _saturation_remedy),
+    Code.RECORDING: (composed.recording, ""),
+    Code.LEFT_OUT: (
+        "The flight is left out: it {given}.",
+        lambda finding: as_sentence(finding.names[1]),
+    ),
+    Code.SALVAGED: (composed.salvaged, "Record the flight again if what was lost matters."),
+    Code.SATURATION_FEEDBACK: (
+        (
+            "Rotors were clipped at their lower limit, and the recordings agree with a rate "
+            "integrator that {stops} then, other than the controller file has it; it was simulated "
+            "so."
+        ),
+        "Set mixer.saturation_feedback: {flag} in the controller file.",
+    ),
     Code.FLIGHT_UNMATCHED: (
-        _flight_unmatched,
+        composed.flight_unmatched,
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     ),
-    Code.INLET_CHOSEN: (_inlet_chosen, _inlet_remedy),
+    Code.INLET_CHOSEN: (composed.inlet_chosen, "Log the {last} as often as its loop runs."),
     Code.ATTITUDE_FOLLOWED: (
         (
             "The recorded attitude of all fitted flights is followed, so that nothing is fitted of "
@@ -373,15 +263,15 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "",
     ),
-    Code.DISTURBANCES_FOLLOWED: (_disturbances_followed, ""),
-    Code.INERTIA_BALANCED: (_inertia_balanced, ""),
+    Code.DISTURBANCES_FOLLOWED: (composed.disturbances_followed, ""),
+    Code.INERTIA_BALANCED: (composed.inertia_balanced, ""),
     Code.INERTIA_NOT_BALANCED: (
-        _inertia_balanced,
+        composed.inertia_balanced,
         "Take these inertias for effective ones, and measure them on the ground (tune bench).",
     ),
-    Code.SETPOINTS_SCALED: (_setpoints_scaled, _setpoints_remedy),
+    Code.SETPOINTS_SCALED: (composed.setpoints_scaled, composed.setpoints_remedy),
     Code.SETPOINTS_FOREIGN: (
-        _setpoints_foreign,
+        composed.setpoints_foreign,
         "Give the controller that flew (--controller), or enter below it (inlet: body_rate).",
     ),
 }
@@ -407,17 +297,15 @@ def _worded(text: Text, finding: Finding) -> str:
 
 
 def _values(finding: Finding) -> dict[str, object]:
-    names = [name.replace("_", " ") for name in finding.names]
-    if finding.code is Code.SINGULAR_DIRECTION:  # coefficients, as a user types them
-        names = list(finding.names)
-    values: dict[str, object] = {"subject": finding.subject, **finding.numbers}
+    names, numbers = [name.replace("_", " ") for name in finding.names], finding.numbers
+    values: dict[str, object] = {"subject": finding.subject, **numbers}
     if names:
-        values |= {"names": listed(names), "first": names[0]}
-        values["coefficients"] = listed(finding.names)
-    seconds = finding.numbers.get("seconds", 0.0)
-    values["unit"] = finding.names[-1] if finding.names else ""
-    values["explained_percent"] = percent(max(finding.numbers.get("explained", 0.0), 0.0))
+        values |= {"names": listed(names), "first": names[0], "last": names[-1]}
+        values |= {"coefficients": listed(finding.names), "given": finding.names[0]}
+        values["unit"] = finding.names[-1]
+    seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
+    values["explained_percent"] = percent(max(numbers.get("explained", 0.0), 0.0))
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
-    changed = finding.numbers.get("changed")
-    lower = "ended lower, and its result was kept" if changed else "ended no lower"
+    values |= {"stops": "stops" if feedback else "does not stop", "flag": str(feedback).lower()}
+    lower = "ended lower, and its result was kept" if numbers.get("changed") else "ended no lower"
     return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}

@@ -1,0 +1,119 @@
+"""Sentences of findings that take more than a text with the finding's numbers in it.
+
+Each is named after its code in `tuner.findings.Code`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from tuner.findings import Code, Finding
+from tuner.flights.damage import Cause, Damage
+from tuner.flights.notes import Note, NoteCode
+from tuner.wording.notes import damage_sentence, note_in_words
+from tuner.wording.phrases import as_sentence, listed
+
+
+def recording(finding: Finding) -> str:
+    """Return what was found or changed while the recording was read."""
+    code, topic, *names = finding.names
+    numbers = dict(finding.numbers)
+    count = int(numbers.pop("count"))
+    text = note_in_words(Note(NoteCode(code), "warning", topic, count, numbers, tuple(names)))
+    return f"{topic}: {text}." if topic else as_sentence(text)
+
+
+def salvaged(finding: Finding) -> str:
+    """Return how the recording is broken, and what was salvaged."""
+    cause, subject = finding.names
+    numbers: Mapping[str, Any] = finding.numbers
+    damage = damage_sentence(Damage(Cause(cause), subject, **numbers))
+    return f"The recording is broken, and the flight is what was salvaged of it: {damage}."
+
+
+def inlet_chosen(finding: Finding) -> str:
+    """Return why a flight enters further down the loop than it was recorded for."""
+    inlet, signal = finding.names
+    what = signal.replace("_", " ")
+    followed = {
+        "attitude": "its recorded attitude is followed and only its translation simulated",
+        "rotor_speed": "it is simulated from its rotor speeds",
+    }[inlet]
+    return (
+        f"The {what}, logged at {finding.numbers['recorded']:.0f} Hz, does not explain how the "
+        f"vehicle turned (correlation {finding.numbers['correlation']:.2f} with its angular "
+        f"acceleration), so that {followed}."
+    )
+
+
+def setpoints_scaled(finding: Finding) -> str:
+    """Return by what factor set-points differ, and the law that would explain it."""
+    axis, law = finding.names
+    so = f", as those of the {law} law would be" if law else ""
+    factor = f"{finding.numbers['gain']:.1f}"
+    return f"The recorded {axis} rate set-points are {factor} times the controller file's{so}."
+
+
+def setpoints_remedy(finding: Finding) -> str:
+    """Return what to do about set-points that differ by a factor."""
+    _, law = finding.names
+    if law:
+        return f"Set attitude.law: {law} in the controller file."
+    return "Check the gains of position and attitude control in the controller file."
+
+
+def setpoints_foreign(finding: Finding) -> str:
+    """Return on which axes set-points do not follow."""
+    alike = " and ".join(f"{value:.2f} in {axis}" for axis, value in finding.numbers.items())
+    return (
+        "The recorded rate set-points do not follow from reference, state and controller file "
+        f"(correlation {alike}): another controller flew, or another reference."
+    )
+
+
+def inertia_balanced(finding: Finding) -> str:
+    """Return at which inertia motion and rotor speeds balance, and what became of it."""
+    values = listed(
+        [
+            f"{name} {finding.numbers[f'{name}_balanced']:.3g} instead of "
+            f"{finding.numbers[f'{name}_fitted']:.3g} kg m²"
+            for name in finding.names
+        ]
+    )
+    error = finding.numbers["error"]
+    if finding.code is Code.INERTIA_BALANCED:
+        return (
+            "Errors in the measured rotor speeds would pass for inertia, so that it is the one at "
+            f"which recorded motion and rotor speeds balance: {values}. All else is fitted to what "
+            "flies, with drag that stands in for what the errors drive. Flights that are left out "
+            f"are predicted with {error:.2f} times the error."
+        )
+    return (
+        "Errors in the measured rotor speeds pass for inertia and damping: recorded motion and "
+        f"rotor speeds balance at {values}. What predicts these flights is kept, for flights that "
+        f"are left out would be predicted with {error:.2f} times the error."
+    )
+
+
+def disturbances_followed(finding: Finding) -> str:
+    """Return how strong what pushed the flights is, and how long it lasts."""
+    numbers = finding.numbers
+    return (
+        "The residuals hold more than measurement noise, as gusts leave it: a Kalman filter "
+        f"follows a push of {100.0 * numbers['gust']:.2g} % of the weight that lasts "
+        f"{numbers['gust_seconds']:.2g} s, and thrust that wanders by "
+        f"{100.0 * numbers['thrust']:.2g} % for {1e3 * numbers['thrust_seconds']:.0f} ms. The "
+        "coefficients are those that then predict every sample best from the ones before."
+    )
+
+
+def flight_unmatched(finding: Finding) -> str:
+    """Return by how much each channel of a flight is missed."""
+    multiples = ", ".join(
+        f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
+    )
+    return (
+        "The simulation does not match this flight: its residuals in multiples of the measurement "
+        f"noise are {multiples}, and its weight in the fit was lowered accordingly."
+    )
