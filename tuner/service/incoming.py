@@ -23,8 +23,6 @@ BUFFER = 2**20
 """bytes that are gathered before they are hashed and written"""
 FIELD = "file"
 REMEDY = f"send it as multipart/form-data with a field '{FIELD}'"
-OVERHEAD = 2**16
-"""bytes of a request besides its file"""
 
 
 @dataclass(frozen=True)
