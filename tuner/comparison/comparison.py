@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -35,7 +36,7 @@ from tuner.config.job import InletName
 from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of, with_terms_computed
 from tuner.objective.battery import with_reference_voltage
-from tuner.objective.criterion import Criterion, Point, units_of
+from tuner.objective.criterion import Point, units_of
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
@@ -57,6 +58,7 @@ from tuner.objective.windows import Window, windows_of
 from tuner.parallel import padded_size
 from tuner.recordings import Recording
 from tuner.search.continuation import FAR
+from tuner.search.progress import plain_criterion
 from tuner.simulation.forces import Forces, acting, in_order
 from tuner.simulation.table import roll_pitch_yaw
 
@@ -319,18 +321,13 @@ class _Group:
         ]
         none = np.zeros((len(OFFSETS), flights))
         point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
+        loose = {name: np.full(flights, LOOSE) for name in segments.measured}
+        criterion = plain_criterion(objective, self._samples, loose)
         trial = best = np.zeros(segments.freedom.shape)
         least = np.full(trial.shape[1], np.inf)
         for _ in range(ROUNDS + 1):  # the last one judges the step before it
-            criterion = Criterion(
-                horizon=jnp.asarray(self._samples),
-                scale={name: jnp.full(flights, LOOSE) for name in segments.measured},
-                reference_offset=jnp.zeros((len(CLOCKS), flights)),
-                huber=jnp.asarray(jnp.inf),
-                prior=jnp.asarray(1.0),
-                states=jnp.asarray(trial),
-            )
-            sums = objective.sums(point, criterion, derivatives=False)
+            there = replace(criterion, states=jnp.asarray(trial))
+            sums = objective.sums(point, there, derivatives=False)
             squares = np.sum([np.asarray(each) for each in sums.squares.values()], axis=0)
             misfit = np.nan_to_num(squares / LOOSE**2 + (trial**2).sum(axis=0), nan=np.inf)
             better = misfit <= least

@@ -30,8 +30,7 @@ from tuner.objective.flight_batches import portions
 from tuner.runtime import AHEAD
 from tuner.search.fitted import Fitted
 from tuner.search.levenberg_marquardt import make_ready
-from tuner.search.progress import Progress, beginning, criterion_of, point_of
-from tuner.search.stages import Stage
+from tuner.search.progress import beginning, plain_criterion
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 
 logger = logging.getLogger(__name__)
@@ -109,13 +108,13 @@ def _fits(problem: FullProblem, criterion: Criterion) -> bool:
 def _not_fitted(job: Job) -> Fitted:
     """Return the start of a job's search as a fit to one sample of each flight."""
     objective = job.objective
-    start = beginning(objective, job.space.initial[None])
+    criterion = plain_criterion(objective, 1)
     return Fitted(
         objective=objective,
-        point=point_of(start.points, 0),
-        criterion=_first_criterion(start),
+        point=objective.start(job.space.initial),
+        criterion=criterion,
         noise=job.noise,
-        scales={flight.name: dict.fromkeys(start.scales, 1.0) for flight in job.fitted},
+        scales={flight.name: dict.fromkeys(criterion.scale, 1.0) for flight in job.fitted},
         iterations=(),
         outcomes=(),
         method="none",
@@ -126,17 +125,10 @@ def _not_fitted(job: Job) -> Fitted:
     )
 
 
-def _first_criterion(progress: Progress) -> Criterion:
-    """Return a criterion of one sample, for what a search begins with."""
-    stage = Stage("ahead", 1, 1.0, False, False, 1, 1.0, False, False)
-    offsets = np.asarray(progress.points.offsets[0])
-    return criterion_of(stage, progress.scales, offsets, progress.states)
-
-
 def _search_and_select(job: Job, fitted: Fitted, *, selects: bool) -> None:
     objective = job.windows or job.objective
-    progress = beginning(objective, starting_vectors(job))
-    make_ready(objective, progress.points, _first_criterion(progress))
+    points = beginning(objective, starting_vectors(job)).points
+    make_ready(objective, points, plain_criterion(objective, 1))
     if selects:
         _select(job, fitted)
 

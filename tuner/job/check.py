@@ -21,8 +21,7 @@ from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.motor_order import order_findings
 from tuner.objective.recorded_inputs import sparse
 from tuner.objective.setpoints import setpoint_findings
-from tuner.search.progress import beginning, criterion_of, point_of
-from tuner.search.stages import Stage
+from tuner.search.progress import plain_criterion
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""
@@ -126,8 +125,7 @@ def _sparse_inputs(job: Job) -> Iterator[Finding]:
         signal, *_ = INLETS[inlet].needs
         rate = INLETS[inlet].update_rate(job.objective.schedule)
         if rate is not None and sparse([flight], signal, rate):
-            recorded = round(1.0 / float(np.median(np.diff(flight.series[signal].time))))
-            numbers = {"recorded": recorded, "needed": float(rate)}
+            numbers = {"recorded": round(flight.series[signal].rate), "needed": float(rate)}
             yield Finding(Code.SPARSE_INPUT, "warning", flight.name, numbers, (signal,))
 
 
@@ -238,10 +236,8 @@ def information(job: Job) -> NDArray[np.float64]:
     objective = job.objective
     rate = float(objective.schedule.log_rate)
     horizon = min(round(HORIZON * rate), objective.samples)
-    stage = Stage("check", horizon, 1.0, False, False, 1, 1.0, False, False)
-    start = beginning(objective, job.space.initial[None])
-    criterion = criterion_of(stage, start.scales, np.asarray(start.points.offsets[0]), start.states)
-    sums = objective.sums(point_of(start.points, 0), criterion)
+    point = objective.start(job.space.initial)
+    sums = objective.sums(point, plain_criterion(objective, horizon))
     count = len(job.space)
     hessian = np.asarray(sums.hessian).sum(axis=-1)[:count, :count]
     slope = job.space.slope(job.space.initial)

@@ -24,8 +24,7 @@ from tuner.objective.inlets import INLETS, STEADY_TORQUE, TURNING
 from tuner.objective.normal import Objective
 from tuner.recordings import Recording
 from tuner.search.fitted import Fitted
-from tuner.search.progress import beginning, criterion_of, point_of
-from tuner.search.stages import WHOLE, Stage
+from tuner.search.progress import plain_criterion
 from tuner.uncertainty.information import information_at
 
 WORTH_LOGGING = 0.9
@@ -115,12 +114,10 @@ def _fed(job: Job, fitted: Fitted) -> list[LogProposal]:
     best = job.space.numbers(fitted.point.coefficients)
     vector = fed.space.vector_of(values | {name: best[name] for name in best if name in values})
     objective = fed.objective
-    stage = Stage(WHOLE, objective.samples, 1.0, False, False, 1, 1.0, False, False)
-    start = beginning(objective, vector[None])
     beyond = beyond_noise(fitted.criterion)
     scales = {name: np.full(objective.flights, beyond) for name in objective.segments.measured}
-    criterion = criterion_of(stage, scales, np.asarray(start.points.offsets[0]), start.states)
-    information = information_at(objective, point_of(start.points, 0), criterion)
+    criterion = plain_criterion(objective, objective.samples, scales)
+    information = information_at(objective, objective.start(vector), criterion)
     shares = errors_of(information.total) / errors_of(information.prior)
     shrinks = {name: float(shares[fed.space.names.index(name)]) for name in names}
     return [LogProposal(signal="command", change="fed", rate=FED_IN, shrinks=shrinks)] * bool(names)

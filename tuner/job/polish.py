@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.job.prepare import Job
+from tuner.job.search import stages_of
 from tuner.objective.criterion import Point
-from tuner.objective.normal import Objective
 from tuner.search.continuation import grow
-from tuner.search.fitted import Fitted
+from tuner.search.fitted import Fitted, by_flight
 from tuner.search.optimiser import Free
 from tuner.search.progress import (
     Progress,
@@ -23,7 +23,7 @@ from tuner.search.progress import (
     point_of,
     with_feedback,
 )
-from tuner.search.stages import Stage, plan
+from tuner.search.stages import Stage
 
 
 def polished(
@@ -73,7 +73,7 @@ def polished(
         job,
         fitted,
         progress,
-        _stages(fitted.objective, job)[-stages:],
+        stages_of(job, fitted.objective)[-stages:],
         free=free,
         clipped=False,
         title=title,
@@ -102,7 +102,7 @@ def searched_again(
         evaluations=fitted.evaluations,
         feedback=feedback_of(job.objective),
     )
-    stages = _stages(fitted.objective, job)[:-1]
+    stages = stages_of(job, fitted.objective)[:-1]
     return _grown(
         job,
         fitted,
@@ -112,19 +112,6 @@ def searched_again(
         clipped=job.clipped,
         title=title,
         on_progress=on_progress,
-    )
-
-
-def _stages(objective: Objective, job: Job) -> tuple[Stage, ...]:
-    """Return the stages of least squares."""
-    settings = job.settings.job.search
-    return plan(
-        "gradient",
-        objective.samples,
-        float(objective.schedule.log_rate),
-        windows=objective.segments.windowed,
-        robust=settings.robust == "huber",
-        steps=settings.max_iterations,
     )
 
 
@@ -151,10 +138,7 @@ def _grown(
         objective=with_feedback(objective, progress.feedback),
         point=point,
         criterion=criterion_of(last, progress.scales, np.asarray(point.offsets), progress.states),
-        scales={
-            flight.name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
-            for i, flight in enumerate(job.fitted)
-        },
+        scales=by_flight(progress.scales, job.fitted),
         iterations=progress.iterations,
         evaluations=progress.evaluations,
         loss_best=float(progress.losses[0]),

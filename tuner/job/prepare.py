@@ -14,13 +14,13 @@ from tuner.comparison.errors import limits_of
 from tuner.config import CHANNELS, JobFile, Settings
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, Series
+from tuner.flights.flight import Flight
 from tuner.model import model_of, schedule_of
 from tuner.objective.battery import require_voltage, with_reference_voltage
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
-from tuner.objective.segments import Segments, segments_of, window_segments
+from tuner.objective.segments import Segments, on_time, segments_of, window_segments
 from tuner.objective.start import begins_gently
 from tuner.objective.voltage import VOLTAGE
 from tuner.recordings import Recording
@@ -138,7 +138,10 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
         require_voltage(fitted)
     schedule = schedule_of(settings.controller)
-    on_time = [_shifted(recording.flight, recording.time_offset or 0.0) for recording in to_fit]
+    compared = [
+        on_time(r.flight, [n for n in CHANNELS if n in r.flight.series], r.time_offset or 0.0)
+        for r in to_fit
+    ]
     closed = all(INLETS[inlet].closed_loop for inlet in inlets)
     longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
     model = model_of(settings.vehicle, settings.controller)
@@ -162,7 +165,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     stride = None if free_starts else OVERLAP * seconds
     if not closed or not all(begins_gently(flight) for flight in fitted):
         segments = window_segments(
-            on_time,
+            compared,
             inlets=inlets,
             seconds=seconds,
             schedule=schedule,
@@ -176,7 +179,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         windows = problem(segments, min(longest, seconds + 1.0 / fitted[0].rate), AIRBORNE)
     if closed:
         whole = segments_of(
-            on_time,
+            compared,
             noise=noise,
             weights=_weights(settings, fitted, whole=True),
             schedule=schedule,
@@ -196,18 +199,6 @@ def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
     if "acceleration" in channels:
         named.add("accelerometer")
     return tuple(name for name, row in conditions().items() if named & {name, row.group})
-
-
-def _shifted(flight: Flight, late: float) -> Flight:
-    """Return a flight whose measurements are stamped as if its clocks had not been late."""
-    if late == 0.0:
-        return flight
-    shifted = {
-        name: Series(series.time - late, series.values)
-        for name, series in flight.series.items()
-        if name in CHANNELS
-    }
-    return replace(flight, series={**flight.series, **shifted})
 
 
 def _weights(

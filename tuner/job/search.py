@@ -19,7 +19,7 @@ from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.fitted import Fitted, Outcome
+from tuner.search.fitted import Fitted, Outcome, by_flight
 from tuner.search.optimiser import Free
 from tuner.search.progress import (
     Progress,
@@ -172,7 +172,7 @@ class _Attempt:
 
     def _stages(self) -> tuple[Stage, ...]:
         """Return the method's stages; flights that windows prepare are flown whole at once."""
-        stages = _plan(self.job, self.job.objective, self.method)
+        stages = stages_of(self.job, self.job.objective, self.method)
         if self.job.windows is None:
             return stages
         return tuple(stage for stage in stages if stage.horizon == self.job.objective.samples)
@@ -189,16 +189,12 @@ class _Attempt:
             Outcome(vectors[i], starts[i], float(progress.losses[i]), _origin(i))
             for i in range(len(starts))
         )
-        scales = {
-            flight.name: {channel: float(scale[i]) for channel, scale in progress.scales.items()}
-            for i, flight in enumerate(job.fitted)
-        }
         fitted = Fitted(
             objective=objective,
             point=point,
             criterion=criterion,
             noise=job.noise,
-            scales=scales,
+            scales=by_flight(progress.scales, job.fitted),
             iterations=progress.iterations,
             outcomes=outcomes,
             method=self.method,
@@ -210,7 +206,7 @@ class _Attempt:
         return replace(fitted, findings=(*self.findings, *findings_at(job, fitted)))
 
 
-def _plan(job: Job, objective: Objective, method: str) -> tuple[Stage, ...]:
+def stages_of(job: Job, objective: Objective, method: str = "gradient") -> tuple[Stage, ...]:
     """Return a method's stages for an objective of the job."""
     settings = job.settings.job.search
     return plan(
@@ -228,7 +224,7 @@ def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArr
     assert job.windows is not None
     progress = grow(
         job.windows,
-        _plan(job, job.windows, "gradient")[:-1],
+        stages_of(job, job.windows)[:-1],
         beginning(job.windows, starts),
         free=free,
         clipped=False,

@@ -15,9 +15,8 @@ from tuner.job.prepare import Job
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.continuation import FEEDBACK_GAIN
-from tuner.search.fitted import Fitted
-from tuner.search.progress import beginning, criterion_of, with_feedback
-from tuner.search.stages import WHOLE, schedule_of
+from tuner.search.fitted import Fitted, by_flight
+from tuner.search.progress import beginning, plain_criterion, with_feedback
 from tuner.search.weights import misfit, root_mean_squares
 
 
@@ -43,10 +42,7 @@ def unfitted(job: Job) -> Fitted:
         point=match.point,
         criterion=match.criterion,
         noise=job.noise,
-        scales={
-            name: {channel: float(by_flight[i]) for channel, by_flight in match.scale.items()}
-            for i, name in enumerate(names)
-        },
+        scales=by_flight(match.scale, job.fitted),
         iterations=(),
         outcomes=(),
         method="none",
@@ -73,18 +69,11 @@ class _Match:
 
 def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
     """Return a problem whose noise is scaled to the residuals where these are larger."""
-    rate = float(objective.schedule.log_rate)
-    (*_, whole) = (
-        stage
-        for stage in schedule_of(objective.samples, rate, robust=False, steps=1)
-        if stage.name == WHOLE
-    )
-    fresh, point = beginning(objective, vector[None]), objective.start(vector)
-    offsets = np.asarray(point.offsets)
-    unscaled = criterion_of(whole, fresh.scales, offsets, fresh.states)
-    sums = objective.sums_of(fresh.points, unscaled, derivatives=False)
-    scale = misfit(root_mean_squares(objective, fresh.losses, sums))
-    criterion = criterion_of(whole, scale, offsets, fresh.states)
+    point, start = objective.start(vector), beginning(objective, vector[None])
+    unscaled = plain_criterion(objective, objective.samples)
+    sums = objective.sums_of(start.points, unscaled, derivatives=False)
+    scale = misfit(root_mean_squares(objective, start.losses, sums))
+    criterion = plain_criterion(objective, objective.samples, scale)
     return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
 
 

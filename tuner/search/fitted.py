@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.findings import Finding
+from tuner.flights.flight import Flight
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.iteration import Iteration
@@ -89,3 +90,13 @@ class Fitted:
     polished: bool = True
     findings: tuple[Finding, ...] = field(default=())
     held: Mapping[str, str] = field(default_factory=dict)
+
+
+def by_flight(
+    scales: Mapping[str, NDArray[np.float64]], flights: Sequence[Flight]
+) -> dict[str, dict[str, float]]:
+    """Return flight name -> channel -> number, of channel -> (N,) numbers."""
+    return {
+        flight.name: {channel: float(scale[i]) for channel, scale in scales.items()}
+        for i, flight in enumerate(flights)
+    }

@@ -122,6 +122,20 @@ def criterion_of(
     return cast(Criterion, on_host(criterion))
 
 
+def plain_criterion(
+    objective: Objective, horizon: int, scales: dict[str, NDArray[np.float64]] | None = None
+) -> Criterion:
+    """Return the criterion of plain squares up to a horizon in samples, no clock late.
+
+    Residuals count in multiples of the noise, or of ``scales`` times the noise, as in a `Progress`.
+    """
+    stage = Stage("plain", horizon, 1.0, False, False, 1, 1.0, False, False)
+    start = beginning(objective, objective.space.initial[None])
+    return criterion_of(
+        stage, scales or start.scales, np.asarray(start.points.offsets[0]), start.states
+    )
+
+
 def point_of(points: Point, start: int) -> Point:
     """Return one of S points."""
     picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
