@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -75,29 +76,13 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
 
 def _without_pose(signals: Signals) -> Inspection:
     """Return what a recording of gyro, accelerometer and motor commands alone holds."""
-    samples = signals.contents.samples
-    times = [s.receive for s in samples.values() if len(s.receive)]
-    first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
-    measured = {name: _measured(series) for name, series in signals.series.items()}
     flown = sum(end - begin for begin, end in flying(signals))
     note = Note(NoteCode.WITHOUT_POSE, "info", numbers={"seconds": float(flown)})
-    return Inspection(
-        path=str(signals.recording.path),
-        format=signals.recording.format,
-        size=_size(signals.recording.path),
-        started=_date(first),
-        duration=(last - first) * 1e-9,
-        topic_map=signals.topic_map.name,
+    return replace(
+        _with_signals(signals, signals.contents.samples),
         problem=None if flown else "nothing flies in it: the motors only idle",
-        topics=_topics(signals.recording, signals.places, samples),
-        signals=_signals(signals.series, signals.places),
-        missions=(),
-        inlets=inlets(measured, trajectory=False),
-        coefficients=(),
-        clock={},
-        battery=_battery(signals.series),
+        inlets=inlets(_columns(signals.series), trajectory=False),
         notes=(note, *signals.notes),
-        damage=signals.damage,
     )
 
 
@@ -114,41 +99,45 @@ def _without_flight(recording: Recording, problem: RecordingError) -> Inspection
             TopicReport(topic.name, topic.type, topic.count, None, None, None, None, ())
             for topic in recording.topics
         ),
-        signals=(),
-        missions=(),
         inlets=inlets({}, trajectory=False),
-        coefficients=(),
-        clock={},
-        battery=None,
-        notes=(),
-        damage=(),
     )
 
 
 def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
-    recording = content.recording
-    times = [s.receive for s in content.samples.values() if len(s.receive)]
-    first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
-    measured = {name: _measured(series) for name, series in content.series.items()}
+    measured = _columns(content.series)
+    return replace(
+        _with_signals(content, content.samples),
+        problem=None if missions else "nothing flies in it: no mission was found",
+        missions=missions,
+        inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
+        coefficients=informed(content.series, measured, missions),
+        clock=_clock(content),
+        notes=content.notes,
+    )
+
+
+def _with_signals(read: Content | Signals, samples: Mapping[str, Samples]) -> Inspection:
+    """Return what is said of a recording's topics and signals, whatever they make."""
+    recording, times = read.recording, [s.receive for s in samples.values() if len(s.receive)]
+    first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
     return Inspection(
         path=str(recording.path),
         format=recording.format,
         size=_size(recording.path),
         started=_date(first),
         duration=(last - first) * 1e-9,
-        topic_map=content.topic_map.name,
-        problem=None if missions else "nothing flies in it: no mission was found",
-        topics=_topics(recording, content.places, content.samples),
-        signals=_signals(content.series, content.places),
-        missions=missions,
-        inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
-        coefficients=informed(content.series, measured, missions),
-        clock=_clock(content),
-        battery=_battery(content.series),
-        notes=content.notes,
-        damage=content.damage,
+        topic_map=read.topic_map.name,
+        problem=None,
+        topics=_topics(recording, read.places, samples),
+        signals=_signals(read.series, read.places),
+        battery=_battery(read.series),
+        damage=read.damage,
     )
+
+
+def _columns(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]]:
+    return {name: _measured(samples) for name, samples in series.items()}
 
 
 def _size(path: Path) -> int:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -185,14 +185,14 @@ class Inspection:
     topic_map: str
     problem: str | None
     topics: tuple[TopicReport, ...]
-    signals: tuple[SignalReport, ...]
-    missions: tuple[MissionReport, ...]
-    inlets: tuple[Inlet, ...]
-    coefficients: tuple[Informed, ...]
-    clock: Mapping[str, float]
-    battery: tuple[float, float] | None
-    notes: tuple[Note, ...]
-    damage: tuple[Damage, ...]
+    signals: tuple[SignalReport, ...] = ()
+    missions: tuple[MissionReport, ...] = ()
+    inlets: tuple[Inlet, ...] = ()
+    coefficients: tuple[Informed, ...] = ()
+    clock: Mapping[str, float] = field(default_factory=dict)
+    battery: tuple[float, float] | None = None
+    notes: tuple[Note, ...] = ()
+    damage: tuple[Damage, ...] = ()
 
 
 def inspect_recordings(

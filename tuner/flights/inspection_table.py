@@ -47,8 +47,12 @@ def _number(value: float | None, form: str, scale: float = 1.0) -> str:
     return "" if value is None else format(value * scale, form)
 
 
+def _titled(title: str) -> Table:
+    return Table(title=title, title_justify="left", title_style="bold", box=None)
+
+
 def _topics(inspection: Inspection) -> Table:
-    table = Table(title="topics", title_justify="left", title_style="bold", box=None)
+    table = _titled("topics")
     for name in ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for"):
         right = name not in ("topic", "type", "used for")
         table.add_column(name, justify="right" if right else "left", no_wrap=name == "topic")
@@ -68,11 +72,10 @@ def _topics(inspection: Inspection) -> Table:
 
 
 def _missions(inspection: Inspection) -> Table:
-    table = Table(title="missions", title_justify="left", title_style="bold", box=None)
-    for name in ("start s", "s", "begins with", "laps", "mean m/s", "top m/s", "tilt °"):
-        table.add_column(name, justify="left" if name == "begins with" else "right")
-    for name in ("turn rad/s", "height m", "pose known", "remark"):
-        table.add_column(name, justify="left" if name == "remark" else "right")
+    table = _titled("missions")
+    numbers = ("laps", "mean m/s", "top m/s", "tilt °", "turn rad/s", "height m", "pose known")
+    for name in ("start s", "s", "begins with", *numbers, "remark"):
+        table.add_column(name, justify="left" if name in ("begins with", "remark") else "right")
     for mission in inspection.missions:
         table.add_row(
             f"{mission.start:.2f}",
@@ -116,7 +119,7 @@ def _clock_and_battery(inspection: Inspection) -> Text:
 
 
 def _inlets(inspection: Inspection) -> Table:
-    table = Table(title="inlets", title_justify="left", title_style="bold", box=None)
+    table = _titled("inlets")
     table.add_column("inlet")
     table.add_column("can be fed from this recording")
     for inlet in inspection.inlets:
@@ -127,12 +130,7 @@ def _inlets(inspection: Inspection) -> Table:
 
 
 def _coefficients(inspection: Inspection) -> Table:
-    table = Table(
-        title="could inform",
-        title_justify="left",
-        title_style="bold",
-        box=None,
-    )
+    table = _titled("could inform")
     for name in ("coefficient", "", "because"):
         table.add_column(name)
     for finding in inspection.coefficients:
