@@ -110,31 +110,24 @@ _ROWS = (
             "px4": _FROM_SPEEDS,
         },
     ),
-    Coefficient(
-        name="time_constant_up",
-        unit="s",
-        meaning="lag of a rotor that speeds up",
-        source="thesis Eq. 5.3; SDF <timeConstantUp>",
-        place=("motor", "time_constant_up"),
-        bounds=20.0,
-        prior_sd=0.7,
-        free=True,
-        exported_as={"sdf": Written("timeConstantUp", "motor"), "px4": Written("SIH_T_TAU")},
-        informed_by="rotor lag",
-        plausible=(0.001, 1.0),
-    ),
-    Coefficient(
-        name="time_constant_down",
-        unit="s",
-        meaning="lag of a rotor that slows down",
-        source="thesis Eq. 5.3; SDF <timeConstantDown>",
-        place=("motor", "time_constant_down"),
-        bounds=20.0,
-        prior_sd=0.7,
-        free=True,
-        exported_as={"sdf": Written("timeConstantDown", "motor"), "px4": Written("SIH_T_TAU")},
-        informed_by="rotor lag",
-        plausible=(0.001, 1.0),
+    *(
+        Coefficient(
+            name=f"time_constant_{way}",
+            unit="s",
+            meaning=f"lag of a rotor that {changes}",
+            source=f"thesis Eq. 5.3; SDF <{tag}>",
+            place=("motor", f"time_constant_{way}"),
+            bounds=20.0,
+            prior_sd=0.7,
+            free=True,
+            exported_as={"sdf": Written(tag, "motor"), "px4": Written("SIH_T_TAU")},
+            informed_by="rotor lag",
+            plausible=(0.001, 1.0),
+        )
+        for way, changes, tag in (
+            ("up", "speeds up", "timeConstantUp"),
+            ("down", "slows down", "timeConstantDown"),
+        )
     ),
     # from rotor speed and air velocity to force and moment
     Coefficient(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried
+from functools import partial
+
+from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Scope
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
 _OUTSIDE = {"sdf": _OF_SETUP, "px4": _OF_SETUP}
@@ -30,39 +32,34 @@ def _marker(name: str, unit: str, meaning: str) -> Coefficient:
     )
 
 
-def _of_flight(
-    name: str, unit: str, prior_sd: float, meaning: str, source: str, *, group: str = ""
+def _around(
+    name: str,
+    unit: str,
+    prior_sd: float,
+    meaning: str,
+    source: str,
+    *,
+    scope: Scope,
+    group: str = "",
+    count: int = 1,
 ) -> Coefficient:
-    """Return the row of what is constant during a flight, and zero unless that flight says so."""
+    """Return the row of what is zero unless each flight, or each window, says otherwise."""
     return Coefficient(
         name=name,
         unit=unit,
         meaning=meaning,
         source=source,
-        scope="flight",
+        scope=scope,
         scale="linear",
         prior_sd=prior_sd,
         neutral=0.0,
         group=group,
-    )
-
-
-def _of_window(
-    name: str, unit: str, prior_sd: float, meaning: str, source: str, *, count: int = 3
-) -> Coefficient:
-    """Return the row of what a window's start differs by from the recording."""
-    return Coefficient(
-        name=name,
-        unit=unit,
-        meaning=meaning,
-        source=source,
-        scope="window",
-        scale="linear",
-        prior_sd=prior_sd,
-        neutral=0.0,
         count=count,
     )
 
+
+_of_flight = partial(_around, scope="flight")
+_of_window = partial(_around, scope="window", count=3)
 
 SURROUNDING_ROWS = (
     # what the set-up adds
