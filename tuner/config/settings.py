@@ -223,11 +223,11 @@ def _holdout(
     """Return the held-out flights' names and the recordings that are named only as such."""
     names = {flight.stem for flight in flights}
     if options.holdout is None:
-        return tuple(name for name in job.holdout if _is_among(name, names)), ()
+        return tuple(name for name in job.holdout if is_among(name, names)), ()
     holdout: list[str] = []
     extra: list[Path] = []
     for word in options.holdout:
-        if _is_among(word, names):
+        if is_among(word, names):
             holdout.append(word)
         elif exists(Path(word)) or glob.has_magic(word):
             for path in find_flights([word]):
@@ -263,7 +263,7 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
     return job.replace(**changes)
 
 
-def _is_among(name: str, recordings: Collection[str]) -> bool:
+def is_among(name: str, recordings: Collection[str]) -> bool:
     """Return whether a flight is of one of these recordings: the only mission, or ``NAME-2``."""
     return name in recordings or re.sub(r"-\d+$", "", name) in recordings
 
@@ -284,7 +284,7 @@ def _check_flight_names(job: JobFile, job_path: Path | None, flights: tuple[Path
     folders = {flight.parent for flight in flights} | ({job_path.parent} if job_path else set())
     known = {file.stem for folder in folders for file in folder.glob("*")} | set(given)
     for name in (*job.holdout, *job.flights):
-        if not _is_among(name, known):
+        if not is_among(name, known):
             raise ConfigError(
                 job_path or "flights",
                 f"names a flight '{name}' that does not exist",

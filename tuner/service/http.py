@@ -189,14 +189,8 @@ def get_jobs(
     """Return a page of jobs, the newest first."""
     if vehicle is not None and not vehicle.isprintable():
         return JobPage(jobs=[], next=None)
-    rows = jobs.page(
-        service.database, vehicle=vehicle, state=state, after=after, limit=jobs.PAGE + 1
-    )
-    shown = rows[: jobs.PAGE]
-    return JobPage(
-        jobs=[JobAnswer.model_validate(row) for row in shown],
-        next=shown[-1].id if len(rows) > len(shown) else None,
-    )
+    rows, following = jobs.page(service.database, vehicle=vehicle, state=state, after=after)
+    return JobPage(jobs=[JobAnswer.model_validate(row) for row in rows], next=following)
 
 
 @api.get("/jobs/{job}", responses=NOT_FOUND)

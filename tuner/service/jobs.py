@@ -175,8 +175,8 @@ def page(
     state: State | None = None,
     after: str | None = None,
     limit: int = PAGE,
-) -> Sequence[JobRow]:
-    """Return jobs with their files, the newest first.
+) -> tuple[Sequence[JobRow], str | None]:
+    """Return jobs with their files, the newest first, and after which the next page begins.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def page(
     NotKnownError
         There is no job ``after``.
     """
-    statement = select(JobRow).order_by(JobRow.number.desc()).limit(limit)
+    statement = select(JobRow).order_by(JobRow.number.desc()).limit(limit + 1)
     if vehicle is not None:
         statement = statement.where(JobRow.vehicle == vehicle)
     if state is not None:
@@ -202,7 +202,8 @@ def page(
     with database.reading() as session:
         if after is not None:
             statement = statement.where(JobRow.number < _row(session, after).number)
-        return session.scalars(statement.options(selectinload(JobRow.files))).all()
+        rows = session.scalars(statement.options(selectinload(JobRow.files))).all()
+    return rows[:limit], rows[limit - 1].id if len(rows) > limit else None
 
 
 def job(database: Database, name: str) -> JobRow:

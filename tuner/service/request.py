@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -13,6 +12,7 @@ from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
 from tuner.config import ControllerFile, Options, VehicleFile, settle
 from tuner.config.job import JobFile, Method
+from tuner.config.settings import is_among
 from tuner.errors import ConfigError, InputError, did_you_mean
 from tuner.flights.topics import TopicMap
 from tuner.service.naming import last_part, stems
@@ -220,16 +220,11 @@ def _holdout(names: Sequence[str] | None, flights: Sequence[str]) -> tuple[str, 
     known = stems(flights)
     chosen = []
     for name in names:
-        stem = next((s for s in (name, *stems([last_part(name)])) if _is_among(s, known)), None)
+        stem = next((s for s in (name, *stems([last_part(name)])) if is_among(s, known)), None)
         if stem is None:
             raise InputError("holdout", f"there is no flight '{name}'", did_you_mean(name, known))
         chosen.append(stem)
     return tuple(chosen)
-
-
-def _is_among(name: str, recordings: Collection[str]) -> bool:
-    """Return whether a flight is of one of these recordings, the second mission of one included."""
-    return name in recordings or re.sub(r"-\d+$", "", name) in recordings
 
 
 def _shipped(kind: Kind) -> list[str]:

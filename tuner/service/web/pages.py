@@ -94,7 +94,7 @@ def _start(
         given=blank | dict(given),
         key=secrets.token_hex(16),
         problem=problem,
-        jobs=jobs.page(service.database, limit=5),
+        jobs=jobs.page(service.database, limit=5)[0],
         limit=size_in_words(service.settings.limits.upload_bytes),
     )
 
@@ -190,17 +190,12 @@ def list_jobs(
 ) -> Response:
     """Show a page of jobs; as a fragment its table alone."""
     wanted = State(state) if state in set(State) else None
-    rows = jobs.page(
-        service.database,
-        vehicle=vehicle or None,
-        state=wanted,
-        after=after or None,
-        limit=jobs.PAGE + 1,
+    rows, following = jobs.page(
+        service.database, vehicle=vehicle or None, state=wanted, after=after or None
     )
-    shown = rows[: jobs.PAGE]
     values = {
-        "jobs": shown,
-        "next": shown[-1].id if len(rows) > len(shown) else None,
+        "jobs": rows,
+        "next": following,
         "by": {"vehicle": vehicle, "state": state, "after": after},
     }
     if fragment:
@@ -213,11 +208,8 @@ def list_jobs(
 def show_job(service: Served, job: str) -> Response:
     """Show a job: live until it ends, then with its report."""
     row = jobs.job(service.database, job)
-    others = [
-        other
-        for other in jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
-        if other.id != row.id
-    ]
+    done, _ = jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
+    others = [other for other in done if other.id != row.id]
     return render("job.html.jinja", others=others, **_live(service, row))
 
 

@@ -105,18 +105,3 @@ def upgrade() -> None:
         sa.ForeignKeyConstraint(["job"], ["jobs.number"], name=op.f("fk_points_job")),
         sa.PrimaryKeyConstraint("job", "coefficient", name=op.f("pk_points")),
     )
-
-
-def downgrade() -> None:
-    """Drop them."""
-    op.drop_table("points")
-    op.drop_index(op.f("ix_flights_sha256"), table_name="flights")
-    op.drop_table("flights")
-    op.drop_table("files")
-    op.drop_table("events")
-    op.drop_table("tokens")
-    op.drop_index(op.f("ix_recordings_uploaded"), table_name="recordings")
-    op.drop_table("recordings")
-    op.drop_index("ix_jobs_vehicle_number", table_name="jobs")
-    op.drop_index("ix_jobs_state_number", table_name="jobs")
-    op.drop_table("jobs")
