@@ -64,14 +64,7 @@ class Connection:
 
     def find(self, path: str) -> Any:
         """Return what a GET answers, None where there is nothing."""
-        try:
-            answer = self._client.get(API + path)
-        except self._errors as error:
-            raise self._unreachable(error) from None
-        if answer.status_code == 404:
-            return None
-        self._check(answer)
-        return answer.json()
+        return self._json("GET", path, may_lack=True)
 
     def post(self, path: str, body: object = None, headers: Mapping[str, str] | None = None) -> Any:
         """Return what a POST of JSON answers."""
@@ -120,11 +113,13 @@ class Connection:
                     raise self._unreachable(error) from None
             time.sleep(1.0)
 
-    def _json(self, method: str, path: str, **more: Any) -> Any:
+    def _json(self, method: str, path: str, *, may_lack: bool = False, **more: Any) -> Any:
         try:
             answer = self._client.request(method, API + path, **more)
         except self._errors as error:
             raise self._unreachable(error) from None
+        if may_lack and answer.status_code == 404:
+            return None
         self._check(answer)
         try:
             return answer.json()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tuner.config import Options, Settings, VehicleFile, read_vehicle, settle
-from tuner.config.controller import ControllerFile, read_controller
+from tuner.config import Options, Settings, read_vehicle, settle
+from tuner.config.controller import read_controller
 from tuner.errors import InputError
 from tuner.flights.topics import load_topic_map
 from tuner.yaml_files.document import read_yaml
@@ -27,8 +28,8 @@ def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:
     settled = settle(options)
     request: dict[str, Any] = {
         "settings": _settings(settled),
-        "vehicle": _vehicle(options.vehicle),
-        "controller": _controller(options.controller),
+        "vehicle": _content_of("vehicles", read_vehicle, options.vehicle, Path()),
+        "controller": _content_of("controllers", read_controller, options.controller, Path()),
         "holdout": None if options.holdout is None else list(settled.job.holdout),
         "mass": options.mass,
         "fit": None if options.fit is None else list(options.fit),
@@ -63,26 +64,22 @@ def _settings(settled: Settings) -> dict[str, Any]:
             "leave it out, and use tune export --into on what you fetch",
         )
     if (named := settings.get("vehicle")) is not None:
-        settings["vehicle"] = _vehicle(str(find_config("vehicles", str(named), base)))
+        settings["vehicle"] = _content_of("vehicles", read_vehicle, str(named), base)
     if (named := settings.get("controller")) is not None:
-        settings["controller"] = _controller(str(find_config("controllers", str(named), base)))
+        settings["controller"] = _content_of("controllers", read_controller, str(named), base)
     if (named := settings.get("topics")) is not None:
         settings["topics"] = _topics(find_config("topics", str(named), base))
     return settings
 
 
-def _vehicle(named: str | VehicleFile | None) -> Any:
-    if named is None or isinstance(named, VehicleFile):
+def _content_of(
+    kind: Kind, read: Callable[[Path], Section], named: str | Section | None, base: Path
+) -> str | dict[str, Any] | None:
+    """Return what a server is told of a file: the name of one that it has, or its content."""
+    if not isinstance(named, str):
         return _content(named)
-    path = find_config("vehicles", named, Path())
-    return _shipped("vehicles", path) or _content(read_vehicle(path))
-
-
-def _controller(named: str | ControllerFile | None) -> Any:
-    if named is None or isinstance(named, ControllerFile):
-        return _content(named)
-    path = find_config("controllers", named, Path())
-    return _shipped("controllers", path) or _content(read_controller(path))
+    path = find_config(kind, named, base)
+    return _shipped(kind, path) or _content(read(path))
 
 
 def _topics(path: Path) -> Any:
