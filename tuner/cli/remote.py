@@ -161,9 +161,7 @@ def jobs(
     json
         Print JSON instead of a table.
     """
-    from rich.table import Table
-
-    from tuner.cli.tables import console
+    from tuner.cli.tables import columns_of, console
 
     with client_of(server, token) as client:
         page = client.jobs(vehicle=vehicle, state=state, after=after)
@@ -172,15 +170,14 @@ def jobs(
 
         print(dumps(page, indent=2))
         return
-    table = Table(box=None)
-    for column in ("job", "state", "vehicle", "name", "submitted", "RMSE mm", ""):
-        table.add_column(column, justify="right" if column == "RMSE mm" else "left")
+    words = ("job", "state", "vehicle", "name", "submitted")
+    table = columns_of(left=words, right=("RMSE mm",), then=("",))
     for job in page["jobs"]:
         rmse = "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}"
         about = job["error"] or (job["stage"] if job["state"] == "running" else "") or ""
         submitted = job["submitted"][:16].replace("T", " ")
-        words = (job["id"], job["state"], job["vehicle"], job["name"], submitted, rmse, about)
-        table.add_row(*(_plain(word) for word in words))
+        cells = (job["id"], job["state"], job["vehicle"], job["name"], submitted, rmse, about)
+        table.add_row(*(_plain(cell) for cell in cells))
     screen = console()
     screen.print(table)
     if page["next"]:

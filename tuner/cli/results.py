@@ -82,9 +82,8 @@ def print_sensitivity(result: SensitivityResult) -> None:
     from tuner.wording.verdicts import direction_in_words, judgement_in_words
 
     screen = console()
-    table = columns_of("Coefficients", left=("coefficient",), right=("value", "±"))
-    for column in ("unit", "+1 % moves position by", "how well it is known"):
-        table.add_column(column)
+    then = ("unit", "+1 % moves position by", "how well it is known")
+    table = columns_of("Coefficients", left=("coefficient",), right=("value", "±"), then=then)
     for name, known in result.knowledge.coefficients.items():
         error = "" if known.std_error is None else f"{known.std_error:.2g}"
         judgement = judgement_in_words(known.verdict, known.reason)
@@ -124,9 +123,8 @@ def _largest_change(result: SensitivityResult, name: str) -> str:
 def _coefficients(result: RunResult) -> Table:
     from tuner.wording.verdicts import judgement_in_words
 
-    table = columns_of("Coefficients", left=("coefficient",), right=("initial", "best", "±"))
-    for column in ("unit", "how well it is known"):
-        table.add_column(column)
+    numbers, then = ("initial", "best", "±"), ("unit", "how well it is known")
+    table = columns_of("Coefficients", left=("coefficient",), right=numbers, then=then)
     for name, coefficient in result.coefficients.items():
         table.add_row(
             name,
@@ -154,10 +152,8 @@ def _print_selection(screen: Console, result: RunResult) -> None:
     """Print what each group of terms beyond the base model is worth."""
     from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
-    gains_in = ("gain in the fit", "gain held out")
-    table = columns_of("Terms beyond the motor model", left=("term",), right=gains_in)
-    for column in ("in the model", "why"):
-        table.add_column(column)
+    gains_in, then = ("gain in the fit", "gain held out"), ("in the model", "why")
+    table = columns_of("Terms beyond the motor model", left=("term",), right=gains_in, then=then)
     for row in result.selection:
         gains = gain_in_words(row.gain_fit), gain_in_words(row.gain_holdout)
         table.add_row(row.group, *gains, "yes" if row.kept else "no", reason_in_words(row))
@@ -169,8 +165,8 @@ def _print_effective(screen: Console, result: RunResult, effective: EffectiveRes
     """Print with which coefficients Gazebo flies most like the vehicle, where they differ."""
     from tuner.wording.result import effective_in_words, rmse_in_words
 
-    table = columns_of("In Gazebo", left=("coefficient",), right=("physical", "effective"))
-    table.add_column("unit")
+    answers = ("physical", "effective")
+    table = columns_of("In Gazebo", left=("coefficient",), right=answers, then=("unit",))
     for name, value in effective.coefficients.items():
         row = result.coefficients.get(name)
         if row is not None and value != row.best:

@@ -28,13 +28,21 @@ def console() -> Console:
     return fitting if fitting.width >= WIDTH else Console(highlight=False, width=WIDTH)
 
 
-def columns_of(title: str = "", *, left: Sequence[str] = (), right: Sequence[str] = ()) -> Table:
-    """Return a table without rows: columns of words, then columns of numbers."""
+def columns_of(
+    title: str = "",
+    *,
+    left: Sequence[str] = (),
+    right: Sequence[str] = (),
+    then: Sequence[str] = (),
+) -> Table:
+    """Return a table without rows: columns of words, then of numbers, then of words again."""
     table = Table(box=None, title=title or None, title_justify="left")
     for name in left:
         table.add_column(name)
     for name in right:
         table.add_column(name, justify="right")
+    for name in then:
+        table.add_column(name)
     return table
 
 
@@ -71,9 +79,7 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     """Print a vehicle's coefficients by scaling laws, how crude each is, and where they lie."""
     from tuner.coefficients import COEFFICIENTS
 
-    table = Table(box=None)
-    for name in ("coefficient", "value", "±", "unit", "source"):
-        table.add_column(name, justify="right" if name in ("value", "±") else "left")
+    table = columns_of(left=("coefficient",), right=("value", "±"), then=("unit", "source"))
     for name, estimate in estimates.items():
         table.add_row(
             name,

@@ -207,13 +207,7 @@ def _chart(
         )
         for axis, title in enumerate(AXES)
     ]
-    return Chart(
-        f"{flight}_{quantity}",
-        f"{flight}: {quantity}",
-        panels,
-        x_title="time since the mission's start [s]",
-        height=520,
-    )
+    return Chart(f"{flight}_{quantity}", f"{flight}: {quantity}", panels, x_title=TIME, height=520)
 
 
 def _look(number: int) -> Look:
