@@ -65,7 +65,6 @@ def examine(
     fitted: Fitted,
     *,
     names: Sequence[str] | None = None,
-    offsets_fitted: NDArray[np.bool_] | None = None,
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
     in_doubt: Mapping[str, float] = MappingProxyType({}),
     predictor: Predictor | None = None,
@@ -81,8 +80,6 @@ def examine(
         A search's result.
     names
         Of the fitted flights in the order of the objective; those of ``fitted.scales`` by default.
-    offsets_fitted
-        (offsets, N) which offsets were fitted; by default those that are not exactly zero.
     otherwise
         What might be simulated differently -> the problem so simulated, for the parts of errors.
     in_doubt
@@ -103,7 +100,6 @@ def examine(
         batch = portion(objective, point, criterion, flights)
         jacobian = batch[0].jacobian(*batch[1:], columns=full_problem.columns)
         flight_names = [names[number] for number in flights]
-        free = None if offsets_fitted is None else offsets_fitted[:, flights]
         moved = {
             name: residuals_at(
                 *portion(replace(other, space=objective.space), point, criterion, flights)
@@ -111,9 +107,9 @@ def examine(
             for name, other in otherwise.items()
         }
         informations.append(
-            information_from_jacobian(*batch, jacobian, offsets_fitted=free, otherwise=moved)
+            information_from_jacobian(*batch, jacobian, otherwise=moved)
             if predictor is None
-            else predictor.among(flights).information(*batch, jacobian, free)
+            else predictor.among(flights).information(*batch, jacobian)
         )
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)

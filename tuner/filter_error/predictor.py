@@ -163,7 +163,6 @@ class Predictor:
         point: Point,
         criterion: Criterion,
         simulated: Jacobian,
-        offsets_fitted: NDArray[np.bool_] | None = None,
     ) -> FisherInformation:
         """Return what the innovations say of all coefficients.
 
@@ -176,10 +175,9 @@ class Predictor:
             The problem of these flights, and where it is examined.
         simulated
             Its Jacobian there.
-        offsets_fitted
-            As of `information_from_jacobian`.
         """
-        moved = np.flatnonzero(~hidden(objective.space.names))
+        upstream = hidden(objective.space.names)
+        moved = np.flatnonzero(~upstream)
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.feed.offsets)
         predicted = information_from_jacobian(
@@ -187,7 +185,6 @@ class Predictor:
             own,
             unscaled(criterion),
             self.jacobian(objective, own, [*moved, *offsets]),
-            offsets_fitted=offsets_fitted,
         )
         looped = information_from_jacobian(
             objective,
@@ -198,9 +195,7 @@ class Predictor:
                 residuals={name: simulated.residuals[name] for name in self.rows},
                 columns={name: simulated.columns[name] for name in self.rows},
             ),
-            offsets_fitted=offsets_fitted,
         )
-        upstream = hidden(objective.space.names)
         both = np.outer(upstream, upstream)
         return replace(
             predicted,
