@@ -221,15 +221,7 @@ def _logged(flown: Rollout) -> dict[str, Array]:
 def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
     """Return the reference in force at each instant of a clock."""
     tick = np.floor(clock * control_rate + 1e-9).astype(int)
-    points = reference.inlet.points
-    parts = {
-        "reference_position": points.position,
-        "reference_velocity": points.velocity,
-        "reference_acceleration": points.acceleration,
-    }
-    sent = {
-        name: np.asarray(part.stacked(), dtype=np.float64).T[tick] for name, part in parts.items()
-    }
+    sent = {name: values[tick] for name, values in reference.signals.items()}
     return sent | {"lap": reference.lap[tick, None].astype(np.float64)}
 
 

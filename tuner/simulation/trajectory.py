@@ -40,6 +40,17 @@ class Published:
         first: Vec3 = jax.tree.map(lambda axis: np.asarray(axis)[0], self.inlet.points.position)
         return first
 
+    @property
+    def signals(self) -> dict[str, NDArray[np.float64]]:
+        """The reference at each control tick, (ticks, 3) each, in m, m/s and m/s²."""
+        points = self.inlet.points
+        parts = {
+            "reference_position": points.position,
+            "reference_velocity": points.velocity,
+            "reference_acceleration": points.acceleration,
+        }
+        return {n: np.asarray(part.stacked(), dtype=np.float64).T for n, part in parts.items()}
+
 
 def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
     """Return the reference of a trajectory from rest.
@@ -80,16 +91,7 @@ def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight
     The publisher is taken to have started with the mission.
     """
     sent = published(settings, duration=flight.duration, control_rate=flight.rate)
-    points = sent.inlet.points
-    count = len(flight.time)
-    parts = {
-        "reference_position": points.position,
-        "reference_velocity": points.velocity,
-        "reference_acceleration": points.acceleration,
-    }
-    reference = {
-        name: np.asarray(part.stacked(), dtype=np.float64).T[:count] for name, part in parts.items()
-    }
+    reference = {name: values[: len(flight.time)] for name, values in sent.signals.items()}
     spins = shapes()[settings.name].spins
     spin = settings.yaw_rate if spins else flight.yaw_rate_setpoint
     return replace(flight, signals={**flight.signals, **reference}, yaw_rate_setpoint=spin)
