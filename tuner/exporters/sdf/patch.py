@@ -11,29 +11,11 @@ import numpy as np
 from tuner.config import VehicleFile
 from tuner.errors import ExportError
 from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.sdf import spans, tags
 from tuner.exporters.sdf.composite import Array, Inertial, base_for, together
 from tuner.exporters.sdf.model import Model, inertials, read_model
 from tuner.exporters.sdf.read_back import rotor_origin, values_in
-from tuner.exporters.sdf.spans import (
-    Edit,
-    Element,
-    append_child,
-    apply,
-    content,
-    number,
-    set_value,
-)
-from tuner.exporters.sdf.tags import (
-    MOTOR_CONSTANT,
-    as_flown,
-    as_text,
-    carried_values,
-    center_of_mass,
-    lost_in,
-    motor_constants,
-    of_rotor,
-    values,
-)
+from tuner.exporters.sdf.spans import Edit, Element
 from tuner.exporters.sdf.template import blanked, rendered
 
 #: Products of inertia below this part of the trace are taken as none.
@@ -68,21 +50,21 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     whole = read_model(rendered(text, path), path, rotors)
     base = _base(whole, vehicle)
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
-    if center_of_mass(vehicle) is not None:
+    if tags.center_of_mass(vehicle) is not None:
         edits += _pose_edits(model, whole, base)
     edits = [_through_variable(text, blank, edit, path) for edit in edits]
     edits.append(_provenance_edit(text, model, provenance))
     edits = list(dict.fromkeys(edits))
     _refuse_contradictions(edits, path)
-    patched = apply(text, edits)
-    wanted = carried_values(vehicle, channels=bool(whole.channels()))
+    patched = spans.apply(text, edits)
+    wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
     written_values = values_in(rendered(patched, path), path, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
     return Draft(
         patched,
-        as_flown(vehicle, written_values),
+        tags.as_flown(vehicle, written_values),
         tuple(_notes(whole, vehicle, base)),
         lambda written: differences(
             wanted, values_in(rendered(read_file(written), written), written, vehicle)
@@ -96,7 +78,7 @@ def _base(model: Model, vehicle: VehicleFile) -> Inertial:
     It moves only for a vehicle whose centre of mass is not where rotor positions count from.
     """
     others = [body for link, body in inertials(model) if link is not model.base]
-    inertia, offset, centre = vehicle.inertia, center_of_mass(vehicle), None
+    inertia, offset, centre = vehicle.inertia, tags.center_of_mass(vehicle), None
     if offset is not None:
         origin = rotor_origin(model, vehicle)
         if origin is None:
@@ -152,12 +134,12 @@ def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
     inertial = model.base.find("inertial")
     assert inertial is not None, "its mass was set"
     pose = inertial.find("pose")
-    angles = content(pose, model.text).split()[3:] if pose else ["0", "0", "0"]
+    angles = spans.content(pose, model.text).split()[3:] if pose else ["0", "0", "0"]
     written = " ".join([*(repr(float(number)) for number in place), *(angles or ["0", "0", "0"])])
     if pose is None:
-        yield append_child(inertial, model.text, "pose", written)
-    elif content(pose, model.text) != written:
-        yield set_value(pose, model.text, written)
+        yield spans.append_child(inertial, model.text, "pose", written)
+    elif spans.content(pose, model.text) != written:
+        yield spans.set_value(pose, model.text, written)
 
 
 def _refuse_contradictions(edits: Sequence[Edit], path: Path) -> None:
@@ -178,9 +160,9 @@ def _refuse_contradictions(edits: Sequence[Edit], path: Path) -> None:
 
 
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
-    uneven = motor_constants(vehicle)
+    uneven = tags.motor_constants(vehicle)
     for motor in model.motors():
-        wanted = values(vehicle, "motor")
+        wanted = tags.values(vehicle, "motor")
         if uneven is not None:
             index = model.motor_number(motor)
             if index is None:
@@ -189,10 +171,10 @@ def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:
                     "draws its rotors from a template, and this vehicle's differ in motor_constant",
                     "give each rotor a plugin of its own",
                 )
-            wanted[MOTOR_CONSTANT] = uneven[of_rotor(index)]
+            wanted[tags.MOTOR_CONSTANT] = uneven[tags.of_rotor(index)]
         yield from _set(motor, model.text, wanted)
     for channel in model.channels():
-        yield from _set(channel, model.text, values(vehicle, "channel"))
+        yield from _set(channel, model.text, tags.values(vehicle, "channel"))
 
 
 def _set(parent: Element, text: str, values: dict[str, float]) -> Iterator[Edit]:
@@ -200,11 +182,11 @@ def _set(parent: Element, text: str, values: dict[str, float]) -> Iterator[Edit]
     for tag, value in values.items():
         child = parent.find(tag)
         if child is None:
-            yield append_child(parent, text, tag, as_text(value))
+            yield spans.append_child(parent, text, tag, tags.as_text(value))
         else:
-            now = number(child, text)
-            if now is None or as_text(now) != as_text(value):
-                yield set_value(child, text, as_text(value))
+            now = spans.number(child, text)
+            if now is None or tags.as_text(now) != tags.as_text(value):
+                yield spans.set_value(child, text, tags.as_text(value))
 
 
 def _through_variable(text: str, blank: str, edit: Edit, path: Path) -> Edit:
@@ -247,8 +229,8 @@ def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
     if others:
         names = ", ".join(link.attributes.get("name", "") for link, _ in others)
         yield (
-            f"the vehicle's {as_text(vehicle.mass)} kg and inertia are those of all links "
-            f"together: '{name}' gets {as_text(base.mass)} kg and what inertia {names} leave"
+            f"the vehicle's {tags.as_text(vehicle.mass)} kg and inertia are those of all links "
+            f"together: '{name}' gets {tags.as_text(base.mass)} kg and what inertia {names} leave"
         )
     if model.included:
         yield f"the mass of what the model includes is not counted: {', '.join(model.included)}"
@@ -267,16 +249,16 @@ def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
             f"SIM_GZ_EC_MIN1..{last} to {low:.0f} and SIM_GZ_EC_MAX1..{last} to "
             f"{low + motor.input_scaling:.0f}, as the px4 export does"
         )
-    if center_of_mass(vehicle) is not None:
-        place = ", ".join(as_text(round(number, 9)) for number in base.pose.position)
+    if tags.center_of_mass(vehicle) is not None:
+        place = ", ".join(tags.as_text(round(number, 9)) for number in base.pose.position)
         yield f"the inertial of '{name}' moves to ({place}) m for the vehicle's centre of mass"
-    yield from lost_in(vehicle)
+    yield from tags.lost_in(vehicle)
 
 
 def _rotor_places(model: Model, vehicle: VehicleFile, centre: Array) -> Iterator[tuple[str, str]]:
     """Yield the rotors whose place from the centre of mass is not the vehicle file's."""
     links = {link.attributes.get("name"): link for link in model.links}
-    offset = np.array(center_of_mass(vehicle) or (0.0, 0.0, 0.0))
+    offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
     for index, rotor in enumerate(vehicle.rotors):
         link = links.get(f"rotor_{index}")
         if link is not None:
