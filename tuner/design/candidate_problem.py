@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.rigid_body import Motion
 from sim_jax.state import Start, hover
 from sim_jax.trajectory import shapes
 from sim_jax.vector import Vec3
@@ -62,12 +61,7 @@ def candidate_problem(
         )
         for flight in flights
     ]
-    starts = Vec3(
-        *(
-            jnp.stack([getattr(flown.start, axis) for flown in references])
-            for axis in ("x", "y", "z")
-        )
-    )
+    starts: Vec3 = jax.tree.map(lambda *places: jnp.stack(places), *(r.start for r in references))
     samples = round(seconds * schedule.log_rate)
     longer = samples > padded_size(objective.samples)
     spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
@@ -127,7 +121,6 @@ def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
     wide: Start = jax.tree.map(
         lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (count,)), start
     )
-    assert isinstance(wide.motion, Motion)
     return wide
 
 

@@ -18,7 +18,6 @@ import numpy as np
 from tuner.bench.measurement import Curve, Measurement, Remark
 from tuner.config import ControllerFile, VehicleFile
 from tuner.errors import RecordingError
-from tuner.flights.flight import Array
 from tuner.flights.inertial import InertialFlight
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import SLOWEST, stretches_of
@@ -164,8 +163,4 @@ def agreeing(
     ratio = chi_square / freedom if freedom > 0 else 1.0
     if ratio <= 1.0:
         return tuple(measurements)
-    return tuple(replace(m, covariance=_scaled(m.covariance, ratio)) for m in measurements)
-
-
-def _scaled(covariance: Array, ratio: float) -> Array:
-    return np.asarray(covariance * ratio)
+    return tuple(replace(m, covariance=np.asarray(m.covariance * ratio)) for m in measurements)
