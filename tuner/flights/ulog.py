@@ -11,6 +11,7 @@ import contextlib
 import io
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -185,19 +186,19 @@ def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int
     """Count the messages of each subscription, and the bytes behind the last whole record."""
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
-    counts: dict[int, int] = {}
+    counts: Counter[int] = Counter()
     data, added = ord("D"), ord("A")
     reached = start
     for kind, buffer, at, end in _records(path, start):
         if kind == data and end - at >= 2:
             number = buffer[at] | buffer[at + 1] << 8
-            counts[number] = counts.get(number, 0) + 1
+            counts[number] += 1
         elif kind == added and end - at >= 4:
             instance, number = struct.unpack_from("<BH", buffer, at)
             kinds[number] = buffer[at + 3 : end].decode(errors="replace")
             names[number] = kinds[number] if instance == 0 else f"{kinds[number]}[{instance}]"
         reached += 3 + end - at
-    counted = {number: (name, counts.get(number, 0)) for number, name in names.items()}
+    counted = {number: (name, counts[number]) for number, name in names.items()}
     return counted, kinds, path.stat().st_size - reached
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -139,16 +140,15 @@ class Bag1:
         stream.seek(start)
         records = [_connection(*_record(stream, CONNECTION)) for _ in range(connections)]
         infos = [_chunk_info(*_record(stream, CHUNK_INFO)) for _ in range(chunks)]
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         for position, info in infos:
             stream.seek(position)
             header = _header(stream, CHUNK)
             (packed,) = struct.unpack("<I", _read(stream, 4))
             self._chunks.append(replace(_chunk(header, stream.tell(), packed), **info))
-            for number, count in info["counts"].items():
-                counts[number] = counts.get(number, 0) + count
+            counts.update(info["counts"])
         self.connections = {
-            number: Connection(number, topic, kind, text, counts.get(number, 0))
+            number: Connection(number, topic, kind, text, counts[number])
             for number, topic, kind, text in records
         }
 
@@ -156,7 +156,7 @@ class Bag1:
         """Learn connections and chunks from front to end, as far as records can be followed."""
         self._indexed = False
         self._chunks, self.connections = [], {}
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         size = self.path.stat().st_size
         stream.seek(first)
         reached, unread = first, 0
@@ -177,12 +177,11 @@ class Bag1:
                 unread += chunk.packed - read if chunk.compression in ("none", "") else 0
                 last = last if chunk.end is None else max(last or 0.0, chunk.end)
                 self._chunks.append(chunk)
-                for number, count in chunk.counts.items():
-                    counts[number] = counts.get(number, 0) + count
+                counts.update(chunk.counts)
             reached = min(position + length, size)
             stream.seek(reached)
         self.connections = {
-            number: Connection(number, c.topic, c.type, c.definition, counts.get(number, 0))
+            number: Connection(number, c.topic, c.type, c.definition, counts[number])
             for number, c in self.connections.items()
         }
         self.damage.append(
@@ -196,7 +195,7 @@ class Bag1:
 
     def _scan(self, content: Bytes, chunk: _Chunk) -> tuple[_Chunk, int]:
         """Learn connections and count messages inside a chunk; return it and the bytes read."""
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         last, read = None, 0
         for header, start, end in _inside(content):
             op = header.get(b"op")
@@ -206,7 +205,7 @@ class Bag1:
                 self.connections.setdefault(number, Connection(number, topic, kind, text, 0))
             elif op == bytes([MESSAGE]):
                 number = _number(header, b"conn", 4)
-                counts[number] = counts.get(number, 0) + 1
+                counts[number] += 1
                 last = max(last or 0, _time(header.get(b"time", b"")))
             read = end
         return replace(chunk, counts=counts, end=None if last is None else last * 1e-9), read

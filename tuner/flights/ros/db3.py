@@ -9,6 +9,7 @@ only iterates over its raw messages in 0.36 s.
 from __future__ import annotations
 
 import sqlite3
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -123,10 +124,8 @@ class Db3:
                 ).fetchall()
             )
         except BROKEN:
-            counts: dict[int, int] = {}
-            for number, _ in self._rows("topic_id, timestamp FROM messages WHERE", ()):
-                counts[number] = counts.get(number, 0) + 1
-            return counts
+            rows = self._rows("topic_id, timestamp FROM messages WHERE", ())
+            return Counter(number for number, _ in rows)
 
     def _learn(self, database: sqlite3.Connection, has_definitions: bool) -> None:
         texts = {}

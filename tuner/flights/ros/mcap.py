@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -160,7 +161,7 @@ class Mcap:
     def _walk(self, stream: BinaryIO, cause: Cause) -> None:
         """Learn channels and messages from front to end, as far as records can be followed."""
         self._chunks, self.connections = [], {}
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         size = self.path.stat().st_size
         at, unread = len(MAGIC), 0
         last: float | None = None
@@ -177,13 +178,12 @@ class Mcap:
                 unread += missed
                 last = last if chunk.end is None else max(last or 0.0, chunk.end)
                 self._chunks.append(chunk)
-                for number, count in in_chunk.items():
-                    counts[number] = counts.get(number, 0) + count
+                counts.update(in_chunk)
             elif op == MESSAGE and length >= 22:
                 number, _, time = _HEAD.unpack(stream.read(14))
                 self._loose.setdefault(number, []).append((at, end, time))
                 last = max(last or 0.0, time * 1e-9)
-                counts[number] = counts.get(number, 0) + 1
+                counts[number] += 1
             elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
                 with contextlib.suppress(DamagedError):
                     self._learn(op, stream.read(length))
@@ -204,13 +204,13 @@ class Mcap:
             content = self._content(stream, chunk)
         except DamagedError:
             return chunk, {}, chunk.length
-        counts: dict[int, int] = {}
+        counts: Counter[int] = Counter()
         last, read = None, 0
         for op, at, end in _records(content):
             read = end
             if op == MESSAGE and end - at >= 22:
                 number, _, time = _HEAD.unpack_from(content, at)
-                counts[number] = counts.get(number, 0) + 1
+                counts[number] += 1
                 last = max(last or 0, time)
             elif op in (SCHEMA, CHANNEL):
                 with contextlib.suppress(DamagedError):

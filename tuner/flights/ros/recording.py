@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -61,10 +62,9 @@ class RosRecording:
         self._container = container
         texts = {c.type: c.definition for c in container.connections.values()}
         self._definitions = Definitions(path, texts, messages, standard=container.aligned)
-        counts: dict[tuple[str, str], int] = {}
+        counts: Counter[tuple[str, str]] = Counter()
         for connection in container.connections.values():
-            key = (connection.topic, connection.type)
-            counts[key] = counts.get(key, 0) + connection.count
+            counts[connection.topic, connection.type] += connection.count
         self.topics = tuple(
             Topic(name, kind, count) for (name, kind), count in sorted(counts.items())
         )
