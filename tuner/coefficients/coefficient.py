@@ -93,6 +93,8 @@ class Coefficient:
         others of its kind and is never chosen by itself.
     stands_in
         Of an effect: whether it describes as a whole what other terms do one by one.
+    reads
+        Of an effect: the recorded signal that its law reads beside the simulated state, if any.
     exported_as
         Export target -> where the coefficient stands in it, or why it does not.
     informed_by
@@ -123,6 +125,7 @@ class Coefficient:
     neutral: float | None = None
     group: str = ""
     stands_in: bool = False
+    reads: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None
     plausible: tuple[float, float] | None = None

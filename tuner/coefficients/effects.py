@@ -26,6 +26,7 @@ def _effect(
     mass_exponent: int = 0,
     informed_by: str | None = None,
     stands_in: bool = False,
+    reads: str = "",
 ) -> Coefficient:
     """Return the row of an effect that vanishes at zero and is searched between ±limit.
 
@@ -46,6 +47,7 @@ def _effect(
         neutral=0.0,
         group=group,
         stands_in=stands_in,
+        reads=reads,
         exported_as={"sdf": in_sdf, "px4": NotCarried(px4, 0.0)},
         informed_by=informed_by,
     )
@@ -90,6 +92,7 @@ EFFECT_ROWS = (
         limit=3.0,
         prior_sd=0.5,
         step=0.2,
+        reads="battery_voltage",
         gazebo="the motor plugins know no battery",
         px4="the SIH model's thrust does not depend on the battery",
     ),

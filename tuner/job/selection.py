@@ -38,6 +38,7 @@ from tuner.selection.candidates import (
     coefficients_in,
     conditions_in,
     is_stand_in,
+    reads_recording,
     start_of,
     with_terms,
 )
@@ -184,6 +185,7 @@ class Selection:
             candidates=len(self.candidates),
             neutral=self._neutral,
             stand_ins=[group for group in state.added if is_stand_in(group)],
+            measured=[group for group in state.added if reads_recording(group)],
         )
         if not taken or not kept:
             return state if kept else replace(state, added={})
@@ -335,6 +337,7 @@ class Selection:
             self._columns(self.candidates[group]),
             candidates=len(self.candidates),
             neutral=self._neutral if group in state.added else None,
+            reads_recording=reads_recording(group),
         )
 
     def _rows(

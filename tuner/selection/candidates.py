@@ -80,6 +80,11 @@ def is_stand_in(group: str) -> bool:
     return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
 
 
+def reads_recording(group: str) -> bool:
+    """Return whether a group's law reads a recorded signal, which gusts do not shape."""
+    return any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
+
+
 def start_of(names: Sequence[str]) -> dict[str, float]:
     """Return the neutral value of each coefficient of a term."""
     values = {}

@@ -69,6 +69,7 @@ def score(
     candidates: int,
     neutral: NDArray[np.float64] | None = None,
     gone: Columns | None = None,
+    reads_recording: bool = False,
 ) -> Score:
     """Return what a group is worth beside a model.
 
@@ -79,6 +80,10 @@ def score(
 
     A group with columns for each flight is nothing that other flights could predict: sections of
     the flight's own do, and flights count alike however strongly each shows it.
+
+    Where sections, or no flights for sure, speak for a group, a gust during one manoeuvre might do
+    what it would; so the stretches that scatter most are all that chance is judged by. What a
+    recorded signal says a gust does not know.
 
     Parameters
     ----------
@@ -95,6 +100,8 @@ def score(
         its neutral values there.
     gone
         Columns of coefficients that go to their neutral values with the group and without it.
+    reads_recording
+        Whether the group's law reads a recorded signal.
     """
     columns = (model, np.concatenate([model, group]))
     to_neutral = np.zeros(len(linear.scaled)) if neutral is None else neutral - linear.scaled
@@ -122,7 +129,8 @@ def score(
     minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
     chance = _chance(linear, model, group, minima)
     stays = inside and held_out.share > -patience * held_out.scatter  # nothing contradicts it
-    if reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure):
+    of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure)
+    if of_few and not reads_recording:
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
@@ -143,6 +151,7 @@ def surviving(
     candidates: int,
     neutral: NDArray[np.float64],
     stand_ins: Collection[str] = (),
+    measured: Collection[str] = (),
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
@@ -162,6 +171,8 @@ def surviving(
         Group -> columns.
     stand_ins
         Names of groups that describe as a whole what others do one by one.
+    measured
+        Names of groups whose laws read a recorded signal.
     """
     left, taken = dict(groups), dict[str, Score]()
     while True:
@@ -170,7 +181,13 @@ def surviving(
         for name, columns in left.items():
             others = _joined([model, *(c for other, c in left.items() if other != name)])
             scores[name] = score(
-                linear, others, columns, candidates=candidates, neutral=neutral, gone=gone
+                linear,
+                others,
+                columns,
+                candidates=candidates,
+                neutral=neutral,
+                gone=gone,
+                reads_recording=name in measured,
             )
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:

@@ -179,6 +179,30 @@ def test_what_is_in_the_model_stays_where_flights_left_out_are_of_two_minds():
     assert shared.reason is SelectionCode.NOT_SIGNIFICANT
 
 
+def test_a_gust_that_does_what_a_term_would_is_not_feared_where_a_recorded_signal_says_when():
+    """Two flights show it, in gusts that are worst in a few stretches."""
+    both = np.concatenate([MODEL, FIRST])
+    after = moved_to_minimum(linear_fit(0.8, seed=33, gusts=True, shown_by=2), both)
+    groups, of = {"first": FIRST}, {"candidates": 14, "neutral": np.zeros(4)}
+    kept, taken = surviving(after, MODEL, groups, **of)
+    assert not kept
+    assert taken["first"].reason is SelectionCode.NOT_SIGNIFICANT
+    kept, taken = surviving(after, MODEL, groups, **of, measured=["first"])
+    assert not taken
+    assert kept["first"].reason is SelectionCode.PREDICTS_SECTIONS
+    assert kept["first"].chance < 1e-12
+
+
+def test_gusts_let_a_term_stay_whose_signal_was_recorded_hardly_more_often():
+    """Of neutral terms in the model: one in two hundred, where one in fourteen hundred was let."""
+    both, stayed = np.concatenate([MODEL, FIRST]), []
+    for seed in range(200):
+        after = moved_to_minimum(linear_fit(0.0, seed=seed, gusts=True), both)
+        found = score(after, MODEL, FIRST, candidates=14, neutral=np.zeros(4), reads_recording=True)
+        stayed.append(found.earns_place)
+    assert np.mean(stayed) <= 0.01
+
+
 @pytest.mark.parametrize(
     ("gains", "stays"), [((0.5, 0.5, 0.5, -4), True), ((-1, -1, -2, 0), False)]
 )

@@ -1,13 +1,17 @@
 """The whole selection on short simulated flights whose truth holds a term, or does not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from tests.tuner.selection.making import BASE, job_with, unfitted_with
 from tests.tuner.uncertainty.making import FLIGHTS
+from tuner.coefficients import term_groups
 from tuner.config import JobFile
 from tuner.examination.examination import examine
 from tuner.job import selection, terms
+from tuner.job.selected import Standing
 from tuner.job.terms import with_terms_selected
 from tuner.objective.criterion import units_of
 from tuner.selection.table import SelectionCode
@@ -111,6 +115,25 @@ def test_a_term_that_does_not_predict_flights_left_out_once_refitted_is_dropped(
     known = covariance.error
     assert np.any(wrong > 1.96 * known / covariance.beyond_noise)  # what noise would say
     assert np.all(wrong < 1.96 * np.maximum(doubt, known)), (wrong, doubt, known)
+
+
+def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_drives(
+    monkeypatch,
+):
+    judged = []
+
+    def surviving(*_, measured, **__):
+        judged.extend(measured)
+        return {}, {}
+
+    monkeypatch.setattr(selection, "surviving", surviving)
+    monkeypatch.setattr(selection.Selection, "_neutral", None)
+    monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
+    groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
+    job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
+    standing = Standing(None, groups, None)
+    selection.Selection(job, None, groups, print, print)._pruned(standing)
+    assert judged == ["battery"]
 
 
 @pytest.mark.slow
