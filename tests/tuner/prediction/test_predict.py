@@ -8,6 +8,7 @@ import pytest
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, with_values
 from tuner.flights.flight import Series
+from tuner.flights.states import AROUND
 from tuner.prediction.predict import UNITS, hold, predict, summary
 from tuner.recordings import Recording
 
@@ -80,27 +81,40 @@ def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
 @pytest.mark.parametrize("inlet", ["body_rate", "actuator", "attitude"])
 def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
     position = full_flight.series["position"]
-    ahead = (position.time > 3.1) & (position.time < 3.4)
-    shifted = Series(position.time, position.values + np.where(ahead, 1.0, 0.0)[:, None])
+    ahead = (position.time > 3.0 + 1.1 * AROUND) & (position.time < 3.4)
+    away = 0.02  # m: as far as a start might have been from where it was recorded
+    shifted = Series(position.time, position.values + np.where(ahead, away, 0.0)[:, None])
     elsewhere = replace(full_flight, series=dict(full_flight.series) | {"position": shifted})
     wrong = with_values(updated, {"motor_constant": 0.98 * updated.aerodynamics.motor_constant})
 
     def errors(flight):
-        of_windows = Comparison([Recording(flight, inlet)], ControllerFile()).fly(wrong)
-        predicted = predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
-        return of_windows[flight.name], predicted
+        comparison = Comparison([Recording(flight, inlet)], ControllerFile())
+        name, predicted = flight.name, predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
+        return (
+            comparison.fly(wrong)[name],
+            comparison.fly_from_fitted_starts(wrong)[name],
+            predicted,
+        )
 
-    (windows, predicted), (windows_moved, moved) = errors(full_flight), errors(elsewhere)
+    (windows, met, predicted), (windows_moved, met_moved, moved) = map(
+        errors, (full_flight, elsewhere)
+    )
+    there = (windows.position.time > 3.0 + 1.1 * AROUND) & (windows.position.time < 3.4)
+    only_recorded = np.where(there, -away, 0.0)[:, None].repeat(3, 1)
     change = windows_moved.position.error - windows.position.error
-    there = (windows.position.time > 3.1) & (windows.position.time < 3.4)
-    np.testing.assert_allclose(change, np.where(there, -1.0, 0.0)[:, None].repeat(3, 1), atol=1e-9)
+    np.testing.assert_allclose(change, only_recorded, atol=1e-9)
     np.testing.assert_allclose(windows_moved.attitude.error, windows.attitude.error, atol=1e-9)
+    followed = met_moved.position.error - met.position.error - only_recorded
+    assert np.abs(followed).max() > 0.1 * away  # the test would see a start that is fitted
     begun = np.flatnonzero(np.isclose(predicted.begins, 3.0))
+    behind = predicted.ahead > 0.4 + 2.0 * AROUND  # where the path is as recorded again
     for name in set(predicted.errors) - {"position"}:
         np.testing.assert_allclose(
             moved.errors[name][:, begun], predicted.errors[name][:, begun], rtol=1e-9
         )
-    assert moved.errors["position"][29, begun] > 1.0 > predicted.errors["position"][29, begun]
+    change = moved.errors["position"][:, begun] - predicted.errors["position"][:, begun]
+    np.testing.assert_allclose(change[behind], 0.0, atol=1e-9)
+    assert np.abs(change[~behind]).max() > 0.5 * away
 
 
 def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(full_flight, updated):
