@@ -3,6 +3,9 @@
 Coefficients that trade off exactly keep their product however far they drift. Setting each back to
 its initial value would worsen the fit; so one of every such group, the stand-in, is held, and the
 others are fitted given its value.
+
+A term that nobody asked for, that the flights do not identify and that ends at a bound is in the
+model by chance: it goes back to where it began, whatever the fitted flights gained by it.
 """
 
 from __future__ import annotations
@@ -80,7 +83,37 @@ def with_undetermined_held(
             break
         fitted = rest
         examination = examined(fitted)
+    for _ in range(MAX_ROUNDS):
+        idle = _idle_terms(job, fitted, examination.uncertainty)
+        if not idle:
+            break
+        on_message(
+            f"The flights do not identify {listed(idle)}, which ended at a bound: taken out of the "
+            "model, and the others are fitted again."
+        )
+        stand_ins = dict(fitted.held) | {name: name for name in idle}
+        fitted = hold(job, fitted, stand_ins, on_progress)
+        examination = examined(fitted)
     return fitted, examination
+
+
+def _idle_terms(job: Job, fitted: Fitted, uncertainty: Uncertainty) -> tuple[str, ...]:
+    """Return what was free of terms that the job does not ask for, and ended undetermined.
+
+    At a bound, that is: elsewhere it may be of use, though nobody can say how large it is.
+    """
+    settings, held = job.settings.job, set(fitted.held.values())
+    asked = set(settings.free or ())
+    if not isinstance(settings.terms, str):
+        asked.update(name for names in job.first_terms.values() for name in names)
+    return tuple(
+        name
+        for name in uncertainty.names
+        if COEFFICIENTS[name].group
+        and name not in held | asked
+        and not uncertainty.estimates[name].reason.identifiable
+        and uncertainty.estimates[name].reason.bound is not None
+    )
 
 
 def _rises(fitted: Fitted, other: Fitted) -> float:

@@ -149,7 +149,7 @@ def run(
         validation,
         sources=sources,
         command=command,
-        selection=selected.rows,
+        selection=selected.rows_given(fitted.held),
         effective=None if effective is None else effective.result,
         next_log=next_log,
     )

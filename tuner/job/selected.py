@@ -11,7 +11,8 @@ from tuner.job.prepare import Job
 from tuner.search.fitted import Fitted
 from tuner.selection.candidates import Groups
 from tuner.selection.linear import Linear
-from tuner.selection.table import SelectionRow
+from tuner.selection.score import EARNING
+from tuner.selection.table import SelectionCode, SelectionRow
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,18 @@ class Selected:
     fitted: Fitted
     rows: tuple[SelectionRow, ...] = ()
     in_doubt: Mapping[str, float] = field(default_factory=dict)
+
+    def rows_given(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
+        """Return the table once coefficients are held: a term that was chosen and is, is out.
+
+        ``held`` is a coefficient -> its stand-in, as of `tuner.search.fitted.Fitted`.
+        """
+        return tuple(
+            row.model_copy(update={"kept": False, "reason": SelectionCode.NO_INFORMATION})
+            if row.reason in EARNING and all(held.get(name) == name for name in row.names)
+            else row
+            for row in self.rows
+        )
 
 
 @dataclass(frozen=True)

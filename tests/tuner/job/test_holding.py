@@ -5,8 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from tuner.config import JobFile
 from tuner.job import holding
 from tuner.job.holding import stand_ins_of, with_undetermined_held
+from tuner.job.selected import Selected
+from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.uncertainty.verdict import Reason, ReasonCode
 
 
@@ -49,7 +52,8 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     traded = {"motor_constant": "input_scaling", "input_scaling": "input_scaling"}
     alone = {"time_constant_up": "time_constant_up"}  # open by itself: predicting fits keep it
     monkeypatch.setattr(holding, "alternatives_of", lambda _: None)
-    monkeypatch.setattr(holding, "examine", lambda *_, **__: SimpleNamespace(uncertainty=None))
+    nothing = SimpleNamespace(uncertainty=SimpleNamespace(names=()))
+    monkeypatch.setattr(holding, "examine", lambda *_, **__: nothing)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded | alone)
 
     def hold(_, fitted, stand_ins, __):
@@ -58,6 +62,59 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
 
     monkeypatch.setattr(holding, "hold", hold)
     said = []
-    rest, _ = with_undetermined_held(None, fitted, lambda *_: None, said.append)
+    job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()))
+    rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
     assert rest.held == (traded if is_held else {})
     assert ("all keep their values" in said[-1]) is not is_held
+
+
+IDLE = {"name": "ground_effect", "bound": "upper", "code": ReasonCode.NULL_DIRECTION}
+
+
+@pytest.mark.parametrize("freedom", [None, 1.0], ids=["recorded starts", "free starts"])
+@pytest.mark.parametrize(
+    ("idle", "file", "goes"),
+    [
+        (IDLE, JobFile(), True),
+        (IDLE | {"bound": None}, JobFile(), False),
+        (IDLE | {"code": ReasonCode.INTERVAL}, JobFile(), False),
+        (IDLE, JobFile(terms=["ground_effect"]), False),
+        (IDLE, JobFile(free=["ground_effect"]), False),
+        (IDLE | {"name": "motor_constant"}, JobFile(), False),
+    ],
+    ids=["idle", "inside", "identified", "named", "asked to be free", "of the base model"],
+)
+def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
+    monkeypatch, freedom, idle, file, goes
+):
+    """Though the fitted flights lose by it, and though it is held for another one already."""
+    name, objective = idle["name"], SimpleNamespace(segments=SimpleNamespace(windowed=True))
+    objective.segments.freedom = freedom
+    traded = {name: "input_scaling", "input_scaling": "input_scaling"}
+    fitted = SimpleNamespace(objective=objective, held=traded)
+    estimate = SimpleNamespace(reason=Reason(code=idle["code"], bound=idle["bound"]))
+    examined = SimpleNamespace(
+        uncertainty=SimpleNamespace(names=(name,), estimates={name: estimate})
+    )
+    monkeypatch.setattr(holding, "alternatives_of", lambda _: None)
+    monkeypatch.setattr(holding, "examine", lambda *_, **__: examined)
+    monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded)
+
+    def hold(_, fitted, stand_ins, __):
+        return SimpleNamespace(**vars(fitted) | {"held": stand_ins})
+
+    monkeypatch.setattr(holding, "hold", hold)
+    terms = {"ground_effect": ("ground_effect",)}
+    job, said = SimpleNamespace(settings=SimpleNamespace(job=file), first_terms=terms), []
+    rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
+    assert rest.held == (traded | {name: name} if goes else traded)
+    assert any("taken out of the model" in line for line in said) is goes
+
+    chosen = SelectionRow(
+        group=name, names=(name,), kept=True, reason=SelectionCode.PREDICTS_SECTIONS
+    )
+    asked = chosen.model_copy(update={"reason": SelectionCode.ASKED_FOR})
+    after, *others = Selected(job, rest, (chosen, asked)).rows_given(rest.held)
+    assert after.kept is not goes
+    assert (after.reason is SelectionCode.NO_INFORMATION) is goes
+    assert others == [asked]
