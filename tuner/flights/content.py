@@ -46,8 +46,8 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Content:
-    """A recording once read: its signals cleaned, on one clock, and the missions in them.
+class Signals:
+    """The signals of a recording, cleaned, before a pose is asked for.
 
     Attributes
     ----------
@@ -59,69 +59,31 @@ class Content:
         Signal -> where it was found.
     samples
         Topic -> its messages as recorded.
+    topics
+        Signal -> topic.
     series
-        Signal -> cleaned samples, in seconds since the first pose.
-    epoch
-        Nanoseconds of that first pose, by the recording's clock.
-    missions
-        What was flown.
+        Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
     notes
         What was dropped, repaired or doubted.
     damage
-        What the file has lost, with times as those of `series`.
+        What the file has lost, with times as those of ``series``.
     """
 
     recording: Recording
     topic_map: TopicMap
     places: Mapping[str, Place]
     samples: Mapping[str, Samples]
+    topics: Mapping[str, str]
     series: Mapping[str, Series]
-    epoch: int
-    missions: tuple[Mission, ...]
     notes: tuple[Note, ...]
     damage: tuple[Damage, ...]
 
 
 @dataclass(frozen=True)
-class Signals:
-    """The signals of a recording, cleaned, before a pose is asked for.
+class Content(Signals):
+    """A recording once read: its signals on one clock and in one frame, and what was flown."""
 
-    Attributes
-    ----------
-    recording, topic_map, places, epoch, notes, damage
-        As of `Content`.
-    contents
-        The messages.
-    raw
-        Signal -> its values as recorded.
-    series
-        Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
-    """
-
-    recording: Recording
-    topic_map: TopicMap
-    places: Mapping[str, Place]
-    contents: Contents
-    raw: Mapping[str, Raw]
-    series: Mapping[str, Series]
-    epoch: int
-    notes: tuple[Note, ...]
-
-    @property
-    def topics(self) -> dict[str, str]:
-        """Signal -> topic."""
-        return {signal: data.topic for signal, data in self.raw.items()}
-
-    @property
-    def damage(self) -> tuple[Damage, ...]:
-        """What the file has lost, from the recorder's clock to that of the stamps."""
-        first = "position" if "position" in self.raw else min(self.raw, default=None)
-        if first is None:
-            return self.contents.damage
-        arrival = self.contents.samples[self.raw[first].topic].receive
-        stamps = float(np.median(self.raw[first].time))
-        later = stamps - float(np.median(arrival)) - self.epoch
-        return tuple(part.later(later * 1e-9) for part in self.contents.damage)
+    missions: tuple[Mission, ...]
 
 
 def read_signals(
@@ -172,7 +134,21 @@ def read_signals(
         *noticed,
     ]
     series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
-    return Signals(recording, chosen, places, contents, raw, series, epoch, (*notes, *dropped))
+    topics = {signal: data.topic for signal, data in raw.items()}
+    damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
+    notes += dropped
+    return Signals(
+        recording, chosen, places, contents.samples, topics, series, tuple(notes), damage
+    )
+
+
+def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
+    """Return the s from the recorder's clock to that of the stamps since some nanoseconds."""
+    first = "position" if "position" in raw else min(raw, default=None)
+    if first is None:
+        return 0.0
+    arrival = contents.samples[raw[first].topic].receive
+    return (float(np.median(raw[first].time)) - float(np.median(arrival)) - epoch) * 1e-9
 
 
 def read_content(
@@ -206,17 +182,9 @@ def read_content(
         missions = _missions(series, sidecar)
     else:
         series = cut
-    return Content(
-        signals.recording,
-        signals.topic_map,
-        signals.places,
-        signals.contents.samples,
-        series,
-        signals.epoch,
-        missions,
-        (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics)),
-        signals.damage,
-    )
+    notes = (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics))
+    read = vars(signals) | {"series": series, "notes": notes}
+    return Content(**read, missions=missions)
 
 
 def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | None:

@@ -79,7 +79,7 @@ def _without_pose(signals: Signals) -> Inspection:
     flown = sum(end - begin for begin, end in flying(signals))
     note = Note(NoteCode.WITHOUT_POSE, "info", numbers={"seconds": float(flown)})
     return replace(
-        _with_signals(signals, signals.contents.samples),
+        _with_signals(signals),
         problem=None if flown else "nothing flies in it: the motors only idle",
         inlets=inlets(_columns(signals.series), trajectory=False),
         notes=(note, *signals.notes),
@@ -107,7 +107,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
     measured = _columns(content.series)
     return replace(
-        _with_signals(content, content.samples),
+        _with_signals(content),
         problem=None if missions else "nothing flies in it: no mission was found",
         missions=missions,
         inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
@@ -117,9 +117,10 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     )
 
 
-def _with_signals(read: Content | Signals, samples: Mapping[str, Samples]) -> Inspection:
+def _with_signals(read: Signals) -> Inspection:
     """Return what is said of a recording's topics and signals, whatever they make."""
-    recording, times = read.recording, [s.receive for s in samples.values() if len(s.receive)]
+    recording, samples = read.recording, read.samples
+    times = [s.receive for s in samples.values() if len(s.receive)]
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
     return Inspection(
         path=str(recording.path),
