@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.bench.combine import Combination
+from tuner.bench.combine import Combination, Conflict
 from tuner.bench.measurement import Curve, Measurement
 from tuner.coefficients import COEFFICIENTS
 from tuner.coefficients.joint_prior import JointPrior
@@ -50,16 +50,6 @@ class ExperimentRecord(Part):
     curves: list[CurveRecord]
 
 
-class ConflictRecord(Part):
-    """An experiment that the others contradict, see `tuner.bench.combine.Conflict`."""
-
-    experiment: str
-    names: list[str]
-    measured: float
-    expected: float
-    deviation: float
-
-
 class BenchRecord(ResultFile):
     """The content of ``bench.json``.
 
@@ -86,7 +76,7 @@ class BenchRecord(ResultFile):
     chi_square: float
     degrees_of_freedom: int
     p_value: float
-    conflicts: list[ConflictRecord]
+    conflicts: list[Conflict]
     experiments: list[ExperimentRecord]
 
 
@@ -100,16 +90,7 @@ def bench_record(combination: Combination, measurements: Sequence[Measurement]) 
         chi_square=combination.chi_square,
         degrees_of_freedom=combination.degrees_of_freedom,
         p_value=combination.p_value,
-        conflicts=[
-            ConflictRecord(
-                experiment=conflict.experiment,
-                names=list(conflict.names),
-                measured=conflict.measured,
-                expected=conflict.expected,
-                deviation=conflict.deviation,
-            )
-            for conflict in combination.conflicts
-        ],
+        conflicts=list(combination.conflicts),
         experiments=[_experiment(measurement) for measurement in measurements],
     )
 

@@ -112,11 +112,7 @@ def _outputs(examination: Examination) -> list[OutputSensitivity]:
     names = sensitivity.names
     return [
         OutputSensitivity(
-            flight=output.flight,
-            channel=output.channel,
-            axis=output.axis,
-            unit=output.unit,
-            rmse=output.rmse,
+            **vars(output),
             change=dict(zip(names, sensitivity.change[:, row].tolist(), strict=True)),
             rmse_up=dict(zip(names, sensitivity.rmse_up[:, row].tolist(), strict=True)),
             rmse_down=dict(zip(names, sensitivity.rmse_down[:, row].tolist(), strict=True)),
