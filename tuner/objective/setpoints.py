@@ -73,18 +73,9 @@ class AxisMatch:
 
 @dataclass(frozen=True)
 class SetpointMatch:
-    """The axes of a flight, and how old the state was that its controller saw.
-
-    Attributes
-    ----------
-    axes
-        Roll, pitch, yaw.
-    latency
-        s.
-    """
+    """The axes of a flight: roll, pitch, yaw."""
 
     axes: tuple[AxisMatch, AxisMatch, AxisMatch]
-    latency: float
 
     @property
     def is_ours(self) -> bool:
@@ -113,14 +104,12 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
         return None
     chosen = np.linspace(0, inside.sum() - 1, POINTS).astype(np.intp)
     time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
-    computed = _computed(flight, controller, time)
-    scores = [
-        _axis(wanted[:, 0], c[:, 0]).correlation + _axis(wanted[:, 1], c[:, 1]).correlation
-        for c in computed
-    ]
-    best = int(np.argmax(scores))
-    roll, pitch, yaw = (_axis(wanted[:, i], computed[best][:, i]) for i in range(3))
-    return SetpointMatch((roll, pitch, yaw), float(LATENCIES[best]))
+    by_latency = (
+        tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3))
+        for computed in _computed(flight, controller, time)
+    )
+    roll, pitch, yaw = max(by_latency, key=lambda axes: axes[0].correlation + axes[1].correlation)
+    return SetpointMatch((roll, pitch, yaw))
 
 
 def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Finding, ...]:
