@@ -39,15 +39,12 @@ class Explained:
         What was recorded of the rotors.
     correlation
         About body x, y and z, at the delay at which roll and pitch together are met best.
-    delay
-        s by which turns follow what was recorded.
     rate, gyro_rate
         Hz at which the rotors and the gyro were logged.
     """
 
     source: Source
     correlation: tuple[float, float, float]
-    delay: float
     rate: float
     gyro_rate: float
 
@@ -65,17 +62,11 @@ def explained(flight: Flight, vehicle: VehicleFile, source: Source) -> Explained
     if clock is None:
         return None
     turning, torque = turning_and_torque(flight.series, vehicle, source, clock)
-    step = float(clock[1] - clock[0])
-    most = max(1, round(LATEST / step))
-    delays = [(delay, _correlation(turning, torque, delay)) for delay in range(-1, most + 1)]
-    delay, best = max(delays, key=lambda pair: pair[1][0] + pair[1][1])
-    return Explained(
-        source,
-        (best[0], best[1], best[2]),
-        delay * step,
-        flight.series[source].rate,
-        flight.series["body_rate"].rate,
-    )
+    most = max(1, round(LATEST / float(clock[1] - clock[0])))
+    delays = (_correlation(turning, torque, delay) for delay in range(-1, most + 1))
+    best = max(delays, key=lambda correlation: correlation[0] + correlation[1])
+    rates = flight.series[source].rate, flight.series["body_rate"].rate
+    return Explained(source, (best[0], best[1], best[2]), *rates)
 
 
 def common_clock(

@@ -71,8 +71,6 @@ class LocalSensitivity:
         (K, R) RMS change of an output for +1 %, in its unit.
     rmse_up, rmse_down
         (K, R) RMSE for +10 % and −10 %, the others unchanged; NaN where the simulation crashed.
-    crashed
-        (K,) how many of the simulations with ±10 % crashed, over all flights.
     flights
         F names.
     windowed
@@ -89,7 +87,6 @@ class LocalSensitivity:
     change: Array
     rmse_up: Array
     rmse_down: Array
-    crashed: NDArray[np.int_]
     flights: tuple[str, ...]
     windowed: bool
     time: Array
@@ -110,7 +107,6 @@ class LocalSensitivity:
             change=concatenated("change"),
             rmse_up=concatenated("rmse_up"),
             rmse_down=concatenated("rmse_down"),
-            crashed=np.sum([part.crashed for part in parts], axis=0),
             flights=tuple(name for part in parts for name in part.flights),
             windowed=any(part.windowed for part in parts),
             time=concatenated("time", 0),
@@ -180,7 +176,6 @@ def local_sensitivity(
         change=np.stack(change, axis=-1),
         rmse_up=rmse[1 : 1 + count],
         rmse_down=rmse[1 + count :],
-        crashed=crashes[1 : 1 + count].sum(axis=1) + crashes[1 + count :].sum(axis=1),
         flights=tuple(flights),
         windowed=objective.segments.count > len(flights),
         time=time,
