@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
 from tuner.selection.linear import RIDGE, Columns, Linear
+from tuner.selection.steady import chance_of_gusts
 from tuner.selection.table import SelectionCode
 
 SIGNIFICANCE = 0.01
@@ -79,7 +80,8 @@ def score(
     stretches, have to contradict it, and surely. What is not in the model has to predict.
 
     A group with columns for each flight is nothing that other flights could predict: sections of
-    the flight's own do, and flights count alike however strongly each shows it.
+    the flight's own do, and flights count alike however strongly each shows it. It has to differ
+    between flights by more than gusts would let it (`chance_of_gusts`).
 
     Where sections, or no flights for sure, speak for a group, a gust during one manoeuvre might do
     what it would; so the stretches that scatter most are all that chance is judged by. What a
@@ -132,6 +134,8 @@ def score(
     of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure)
     if of_few and not reads_recording:
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
+    if not by_flight:
+        chance = max(chance, chance_of_gusts(linear, model, group, without))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
     elif fit.share < MATERIAL:

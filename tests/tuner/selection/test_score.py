@@ -13,12 +13,12 @@ MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
 FLIGHTS, STRETCHES, SAMPLES = 4, 12, 200
 
 
-def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS, gusts=False):
+def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS, gusts=False, alike=False):
     """Return the loss of straight regressions: each stretch has its own regressors.
 
     The truth moves the second column by the effect of each flight. Correlated residuals are
-    constant over a stretch; gusts are, too, last for several, and are worst in a few. Flights from
-    ``shown_by`` on do not excite the second column.
+    constant over a stretch; gusts are, too, last for several, and are worst in a few, unless they
+    are alike everywhere. Flights from ``shown_by`` on do not excite the second column.
     """
     random = np.random.default_rng(seed)
     gust = 0.0
@@ -31,7 +31,7 @@ def linear_fit(*effects, seed=0, correlated=False, shown_by=FLIGHTS, gusts=False
         noise = random.normal() if correlated else random.normal(size=SAMPLES)
         if gusts:
             gust = 0.6 * gust + random.normal()
-            noise = noise + gust * random.standard_gamma(0.5)
+            noise = noise + gust * (1.0 if alike else random.standard_gamma(0.5))
         residual = noise - columns[:, 1] * effects[number % len(effects)]
         hessian.append(columns.T @ columns)
         score_.append(columns.T @ residual)
