@@ -31,6 +31,9 @@ from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable
 
+CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
+"""What corrects, in this order: a dictionary's own order is lost where jax takes it apart."""
+
 
 class Feed(eqx.Module):
     """What an observer needs of its segments, F of which lie along the last axis.
@@ -48,6 +51,15 @@ class Feed(eqx.Module):
     segments: Segments
     offsets: Float[Array, "O F"]
     samples: dict[str, Sampled]
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Channel -> how many columns it has, in the order of `CHANNELS`."""
+        return {
+            name: int(self.samples[name].weight.shape[1])
+            for name in CHANNELS
+            if name in self.samples
+        }
 
 
 class Expected(eqx.Module):
@@ -102,7 +114,7 @@ class Observer(eqx.Module):
         rate = float(schedule.log_rate)
         processes = processes_of(model.vehicle, expected.strengths, rate)
         late = feed.offsets[: len(OFFSETS)] * OFFSET_UNIT
-        return Observer(plant, processes, late, tuple(feed.samples), rate), state
+        return Observer(plant, processes, late, tuple(feed.widths), rate), state
 
     def numbers(self, state: State, tick: Array, in_flight: int) -> Array:
         """Return what is corrected of a state, (n, F): so many commands in flight at its end."""
@@ -180,7 +192,8 @@ class Observer(eqx.Module):
     ) -> Array:
         """Return what is seen minus what was sampled (m, F), in standard deviations."""
         rows = []
-        for name, sample in samples.items():
+        for name in self.channels:
+            sample = samples[name]
             place = sample.place - self.late[CLOCK_OF[name]] * self.rate
             there = before[name] + place * (now[name] - before[name])
             if name == "attitude":

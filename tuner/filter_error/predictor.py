@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
 from tuner.filter_error.kalman import Gains, gains_of, innovations
-from tuner.filter_error.observer import Expected, Feed
+from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
 from tuner.filter_error.strengths import likeliest
 from tuner.flights.flight import Flight
@@ -27,8 +27,6 @@ from tuner.uncertainty.information import FisherInformation, information_from_ja
 
 Array = NDArray[np.float64]
 
-CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
-"""What corrects, in this order."""
 AT_ONCE = 8
 """Parameters by which is differentiated at a time."""
 LEARNT_FROM = 6.0
@@ -143,7 +141,8 @@ class Predictor:
         return replace(self.feed, offsets=jnp.asarray(point.offsets))
 
     def _expected(self, objective: Objective, point: Point) -> Expected:
-        noise = np.repeat([self.noise[name] for name in self._widths], list(self._widths.values()))
+        widths = self.feed.widths
+        noise = np.repeat([self.noise[name] for name in widths], list(widths.values()))
         return Expected(
             objective.tunable,
             *map(jnp.asarray, (point.coefficients, self.strengths, noise)),
@@ -203,10 +202,6 @@ class Predictor:
             score=predicted.score + np.where(upstream, looped.score, 0.0),
         )
 
-    @property
-    def _widths(self) -> dict[str, int]:
-        return {name: int(each.weight.shape[1]) for name, each in self.feed.samples.items()}
-
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
         """Return whitened innovations at a point, and derivatives by some of its P parameters.
 
@@ -225,8 +220,8 @@ class Predictor:
             errors, derivatives = innovations(
                 self.simulator, feed, self.gains, expected, directions
             )
-            residuals = gathered(errors, self._widths, self.rows)
-            for name, part in gathered(derivatives[: len(some)], self._widths, self.rows).items():
+            residuals = gathered(errors, feed.widths, self.rows)
+            for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():
                 columns.setdefault(name, np.zeros((size, *part.shape[1:])))[some] = part
         return Jacobian(residuals, columns, jnp.full(self.feed.segments.count, jnp.inf))
 

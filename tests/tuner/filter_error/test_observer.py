@@ -12,7 +12,14 @@ from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from tests.sim_jax.support import controller, moving_start, vehicle, wobble
 from tuner.filter_error.kalman import GATE, deviance
-from tuner.filter_error.observer import Observer, commands_in_flight, first_errors
+from tuner.filter_error.observer import (
+    CHANNELS,
+    Feed,
+    Observer,
+    commands_in_flight,
+    first_errors,
+)
+from tuner.filter_error.recorded import Sampled, gathered
 
 SCHEDULE = Schedule(log_rate=400, position_control_rate=400, longest_actuator_latency=0.02)
 TICK = jnp.asarray(25)  # beyond the delay line's ten places
@@ -51,6 +58,28 @@ def test_a_command_on_its_way_moves_its_rotor_when_its_time_has_come(begin, age,
     by = [float(new[0] - old[0]) for old, new in zip(*ends, strict=True)]
     assert (by[0] > 1.0) == acts
     assert by[1:] == [0.0, 0.0, 0.0]
+
+
+def test_each_channels_errors_stand_where_its_columns_are_looked_for(begin):
+    """A dictionary that jax has taken apart is sorted by its keys, and channels are not."""
+    observer, state = begin
+    observer = Observer(observer.plant, None, jnp.zeros((5, 1)), CHANNELS, 400.0)
+    seen = observer.seen(state, TICK)
+    too_small = {name: 10.0 * number for number, name in enumerate(CHANNELS)}
+    too_small["attitude"] = 0.0
+    samples = {
+        name: Sampled(
+            seen[name] - too_small[name],
+            jnp.ones((3 if name == "attitude" else len(seen[name]), 1)),
+            jnp.ones(1),
+        )
+        for name in CHANNELS
+    }
+    widths = Feed(None, None, jax.tree.map(lambda leaf: leaf[None], samples)).widths
+    errors = jax.jit(lambda taken: observer.errors(seen, seen, taken))(samples)
+    table, rows = np.asarray(errors)[None], {name: np.zeros((1, 1), int) for name in CHANNELS}
+    for name, part in gathered(table, widths, rows).items():
+        np.testing.assert_allclose(part, too_small[name], atol=1e-9)
 
 
 def test_innovations_of_the_right_size_are_the_likeliest():
