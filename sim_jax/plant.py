@@ -143,8 +143,13 @@ class Plant(eqx.Module):
             saturation=mixer.saturation(controller.mixer, state.command),
             step=1.0 / rate_hz,
         )
-        flying = ~jnp.isfinite(state.crash_time)
-        command = mixer.mix(controller.mixer, torque, state.setpoints.thrust, counts=flying)
+        command = mixer.mix(
+            controller.mixer,
+            torque,
+            state.setpoints.thrust,
+            desaturates=controller.rate.saturation_feedback > 0.5,
+            counts=~jnp.isfinite(state.crash_time),
+        )
         return self.commanded(replaced(state, gyro=gyro, integral=integral), command)
 
     def commanded(self, state: State, command: PerRotor) -> State:

@@ -59,8 +59,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.SALVAGED: "The recording is broken, and the flight is what was salvaged of it; the line "
     "states what was lost. Record the flight again if that matters.",
     Code.SATURATION_FEEDBACK: "Rotors were clipped at their lower limit, and the recordings agree "
-    "with a rate integrator that stops, or does not stop, then, other than the controller file has "
-    "it; it was simulated so. Set mixer.saturation_feedback in the controller file.",
+    "with a mixer that desaturates and a rate integrator that stops then, as PX4's do, or with "
+    "neither, other than the controller file has it; it was simulated so. Set "
+    "mixer.saturation_feedback in the controller file.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
     "vehicle may differ.",

@@ -47,7 +47,8 @@ class RateGains(eqx.Module):
     k: Vec3
     integrator_limit: Vec3
     saturation_feedback: Scalar
-    """1: the mixer's saturation stops the integral, as in PX4; 0: it does not; between: a share."""
+    """1: the mixer desaturates, and stops the integral then, as in PX4; 0: each rotor is clipped by
+    itself, and nothing hears of it."""
 
 
 class Filters(eqx.Module):

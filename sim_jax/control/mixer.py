@@ -118,23 +118,35 @@ def _outside(middle: Scalar, reach: Scalar) -> Flag:
 
 
 def _desaturated_where_needed(
-    airmode: int, torque: Vec3, thrust: Scalar, counts: Flag | bool
+    airmode: int, torque: Vec3, thrust: Scalar, desaturates: Flag | bool, counts: Flag | bool
 ) -> PerRotor:
     """Mix; desaturation, which is most of the work, is left out while no vehicle saturates."""
     roll, pitch, yaw = torque.x * HALF_SQRT2, torque.y * HALF_SQRT2, torque.z
     ahead, across = jnp.abs(pitch - roll), jnp.abs(pitch + roll)
     without_yaw = _outside(thrust, larger(ahead, across))
     saturates = without_yaw | _outside(thrust + yaw, ahead) | _outside(thrust - yaw, across)
+    plain = _sum(roll, pitch, yaw, thrust)
+
+    def desaturated() -> PerRotor:
+        a, b, c, d = (
+            jnp.where(desaturates, *outputs)
+            for outputs in zip(_outputs(airmode, torque, thrust), plain, strict=True)
+        )
+        return a, b, c, d
+
     mixed: PerRotor = jax.lax.cond(
-        anyone(saturates & counts),
-        lambda: _outputs(airmode, torque, thrust),
-        lambda: _sum(roll, pitch, yaw, thrust),
+        anyone(saturates & desaturates & counts), desaturated, lambda: plain
     )
     return mixed
 
 
 def mix(
-    settings: MixerSettings, torque: Vec3, thrust: Scalar, *, counts: Flag | bool = True
+    settings: MixerSettings,
+    torque: Vec3,
+    thrust: Scalar,
+    *,
+    desaturates: Flag | bool = True,
+    counts: Flag | bool = True,
 ) -> PerRotor:
     """Return four motor commands in 0..1.
 
@@ -146,12 +158,15 @@ def mix(
         Normalised torque set-point, FRD; each axis counts up to ±1.
     thrust
         Normalised collective thrust; counts from 0 to 1.
+    desaturates
+        Whether torque and thrust give way where a rotor would leave its range, as in PX4; else each
+        rotor's command is clipped by itself.
     counts
         Whether anybody looks at a vehicle's commands; if not, they may lack desaturation.
     """
     within = Vec3(*(saturate(axis, -1.0, 1.0) for axis in (torque.x, torque.y, torque.z)))
     thrust = saturate(thrust, 0.0, 1.0)
-    outputs = _desaturated_where_needed(settings.airmode, within, thrust, counts)
+    outputs = _desaturated_where_needed(settings.airmode, within, thrust, desaturates, counts)
     if settings.thrust_factor > 0:
         a, b, c, d = (_linearised(out, settings.thrust_factor) for out in outputs)
         outputs = (a, b, c, d)

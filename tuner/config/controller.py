@@ -134,7 +134,9 @@ class Mixer(Section):
     pwm_quantisation
         Truncate the output to whole microseconds of PWM, as PX4 does; stops gradients.
     saturation_feedback
-        The rate integrator stops in a direction in which rotors are clipped low, as in PX4.
+        The mixer desaturates, and the rate integrator stops in a direction in which rotors are
+        clipped low, as in PX4; else each rotor's command is clipped by itself, as simpler
+        controllers do.
     """
 
     airmode: Literal[0, 1, 2] = 0
