@@ -245,9 +245,8 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     Code.SALVAGED: (composed.salvaged, "Record the flight again if what was lost matters."),
     Code.SATURATION_FEEDBACK: (
         (
-            "Rotors were clipped at their lower limit, and the recordings agree with a rate "
-            "integrator that {stops} then, other than the controller file has it; it was simulated "
-            "so."
+            "Rotors were clipped at their lower limit, and the recordings agree with a mixer that "
+            "{mixer} then, other than the controller file has it; it was simulated so."
         ),
         "Set mixer.saturation_feedback: {flag} in the controller file.",
     ),
@@ -306,6 +305,11 @@ def _values(finding: Finding) -> dict[str, object]:
     seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
     values["explained_percent"] = percent(max(numbers.get("explained", 0.0), 0.0))
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
-    values |= {"stops": "stops" if feedback else "does not stop", "flag": str(feedback).lower()}
+    mixer = (
+        "desaturates and a rate integrator that stops"
+        if feedback
+        else "clips each rotor by itself and a rate integrator that does not stop"
+    )
+    values |= {"mixer": mixer, "flag": str(feedback).lower()}
     lower = "ended lower, and its result was kept" if numbers.get("changed") else "ended no lower"
     return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}
