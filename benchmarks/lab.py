@@ -24,8 +24,8 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.config import Options, settle, values_of
 from tuner.engine import Report, engine_for
 from tuner.flights.flight import Array, Flight
+from tuner.job.disturbances import examined
 from tuner.job.first_terms import with_first_terms
-from tuner.job.holding import with_undetermined_held
 from tuner.job.prepare import job_of
 from tuner.job.terms import search_with_terms
 from tuner.objective.battery import log_voltage_of
@@ -153,13 +153,7 @@ def trial_of(seed: int) -> Trial:
         selected = search_with_terms(
             job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
         )
-        fitted, examination = with_undetermined_held(
-            selected.job,
-            selected.fitted,
-            lambda *_: None,
-            lambda _: None,
-            in_doubt=selected.in_doubt,
-        )
+        fitted, examination = examined(selected, lambda *_: None, lambda _: None)
         seconds = time.process_time() - clock
     free = {
         name: estimate

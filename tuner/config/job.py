@@ -221,7 +221,7 @@ class JobFile(Section):
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()
     terms: Literal["auto", "none"] | tuple[TermName, ...] = "auto"
-    disturbances: Literal["none", "follow"] = "none"
+    disturbances: Literal["none", "follow"] = "follow"
     target: Literal["gazebo", "physical"] = "gazebo"
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()

@@ -14,17 +14,40 @@ from tuner.filter_error.predictor import Predictor, hidden
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
 from tuner.filter_error.refit import with_least_innovations
 from tuner.findings import Code, Finding
+from tuner.job.holding import with_undetermined_held
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
+from tuner.job.selected import Selected
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
+from tuner.spans import span
+from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
 
 COLOURED = 1.2
 """Residuals over measurement noise from which something else than noise must be in them."""
+CONTRADICTS = 3.0
+"""Standard errors of least squares by which no coefficient may move."""
+
+
+def examined(
+    selected: Selected,
+    on_progress: Callable[[Job, Progress], None],
+    on_message: Callable[[str], None],
+) -> tuple[Fitted, Examination]:
+    """Return the fit with what pushed the flights, or with what they leave open held.
+
+    And how well each coefficient is known.
+    """
+    fit = selected.job, selected.fitted, on_progress, on_message
+    with span("disturbances"):
+        followed = with_disturbances(*fit, in_doubt=selected.in_doubt)
+    on_message("Examining how well each coefficient is known.")
+    with span("examination"):
+        return followed or with_undetermined_held(*fit, in_doubt=selected.in_doubt)
 
 
 def with_disturbances(
@@ -40,7 +63,8 @@ def with_disturbances(
     ``in_doubt`` is as for `tuner.examination.examination.examine`.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
-    set-points were not recorded, and where nothing would be known better.
+    set-points were not recorded, where nothing would be known better, and where the two fits
+    contradict each other.
     """
     largest = max(max(scale.values()) for scale in fitted.scales.values())
     if largest < COLOURED or not fitted.polished or job.settings.job.disturbances == "none":
@@ -73,7 +97,23 @@ def with_disturbances(
     )
     examination = examine(again, predictor=predictor, in_doubt=in_doubt)
     before = examine(fitted, in_doubt=in_doubt)
+    if not _agree(examination.uncertainty, before.uncertainty):
+        on_message("It contradicts the fit of the simulated flights, which is kept.")
+        return None
     return (again, examination) if _is_sharper(examination, before) else None
+
+
+def _agree(new: Uncertainty, old: Uncertainty) -> bool:
+    """Return whether no coefficient moved by more than the error of the fit that it moved from.
+
+    A filter knows more where its noise model holds, and something else where it does not. Of the
+    two estimates least squares' is the one that stays right then (Hausman 1978).
+    """
+    return all(
+        abs(new.estimates[name].value - estimate.value) <= CONTRADICTS * estimate.std_error
+        for name, estimate in old.estimates.items()
+        if name in new.estimates
+    )
 
 
 def _is_sharper(new: Examination, old: Examination) -> bool:

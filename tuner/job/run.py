@@ -26,7 +26,7 @@ from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check_information, check_recordings
 from tuner.job.cross_validation import cross_validate, jackknife_errors
-from tuner.job.disturbances import with_disturbances
+from tuner.job.disturbances import examined
 from tuner.job.effective import effective_fit
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.findings import (
@@ -39,7 +39,6 @@ from tuner.job.findings import (
 from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
 from tuner.job.held_out import Validation, validate
-from tuner.job.holding import with_undetermined_held
 from tuner.job.listener import SILENT, Listener
 from tuner.job.next_log import what_to_log
 from tuner.job.prepare import Job, job_of
@@ -227,26 +226,7 @@ def _fitted(
             raise
         if selected.job is job:
             ahead.await_examination()
-        return (selected, *_examined(selected, on_progress, listener))
-
-
-def _examined(
-    selected: Selected, on_progress: OnProgress, listener: Listener
-) -> tuple[Fitted, Examination]:
-    """Return the fit with what pushed the flights, or with what they leave open held.
-
-    And how well each coefficient is known.
-    """
-    job, fitted = selected.job, selected.fitted
-    with span("disturbances"):
-        followed = with_disturbances(
-            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
-        )
-    listener.on_message("Examining how well each coefficient is known.")
-    with span("examination"):
-        return followed or with_undetermined_held(
-            job, fitted, on_progress, listener.on_message, in_doubt=selected.in_doubt
-        )
+        return (selected, *examined(selected, on_progress, listener.on_message))
 
 
 def _validated(
