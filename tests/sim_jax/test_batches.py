@@ -150,6 +150,15 @@ def test_leaving_desaturation_out_changes_nothing(airmode: int) -> None:
     np.testing.assert_allclose(mapped, together, atol=1e-15)
 
 
+def test_without_desaturation_each_rotor_is_clipped_by_itself_beside_one_with_it() -> None:
+    """A yaw of 0.55 at a thrust of 0.45, of which PX4's desaturation leaves 0.45."""
+    torque, thrust = Vec3(*jnp.asarray([[0.0] * 2, [0.0] * 2, [0.55] * 2])), jnp.full(2, 0.45)
+    desaturates = jnp.asarray([True, False])
+    commands = jnp.stack(mixer.mix(MixerSettings(), torque, thrust, desaturates=desaturates))
+    np.testing.assert_allclose(jnp.sort(commands[:, 0]), [0.0, 0.0, 0.9, 0.9], atol=1e-12)
+    np.testing.assert_allclose(jnp.sort(commands[:, 1]), [0.0, 0.0, 1.0, 1.0], atol=1e-12)
+
+
 def test_an_age_of_all_and_one_of_each_read_the_same() -> None:
     history = jnp.zeros((7, 2, 3))
     for step in range(20):
