@@ -278,12 +278,12 @@ def linear_of(
     around
         How many conditions.
     """
-    segments, blocks, size = information.blocks.shape[1:4]
+    size = information.score.shape[-1]
     count, flights = size - around, int(information.flight.max()) + 1
-    section = np.minimum(np.arange(blocks) * SECTIONS // blocks, SECTIONS - 1)
-    hessian = information.blocks.sum(axis=0).reshape(-1, size, size)
+    hessian, score, flight, number = _stretches(information)
+    section = np.minimum(number * SECTIONS // (number.max() + 1), SECTIONS - 1)
     flown = np.einsum("spp->s", hessian) > 0
-    flight = np.repeat(information.flight, blocks)[flown]
+    flight = flight[flown]
     of_prior = np.diag(information.prior)
     own = np.concatenate([of_prior[:count], np.repeat(of_prior[count:], flights)])
     prior = np.diag(own)
@@ -297,15 +297,34 @@ def linear_of(
     return Linear(
         scaled=scaled,
         hessian=hessian[flown],
-        score=information.score.sum(axis=0).reshape(-1, size)[flown],
+        score=score[flown],
         prior=prior,
         pull=own * (scaled - mean),
         prior_sd=1.0 / np.sqrt(own),
         flight=flight,
-        section=np.tile(section, segments)[flown],
+        section=section[flown],
         loss=loss,
         seen=seen if around else None,
     )
+
+
+def _stretches(
+    information: FisherInformation,
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Return Hessian (S, L, L), score (S, L), flight (S,) and number in it of every `BLOCK` s.
+
+    Windows that begin in the same stretch are one: their residuals are no more independent than
+    those of a flight that is flown whole.
+    """
+    size, blocks = information.score.shape[-1], information.blocks.shape[2]
+    begins = information.begins[:, None] / BLOCK + np.arange(blocks)
+    numbers = np.floor(begins + 1e-9).astype(np.intp).ravel()
+    keys = np.stack([np.repeat(information.flight, blocks), numbers], axis=-1)
+    found, member = np.unique(keys, axis=0, return_inverse=True)
+    hessian, score = np.zeros((len(found), size, size)), np.zeros((len(found), size))
+    np.add.at(hessian, member, information.blocks.sum(axis=0).reshape(-1, size, size))
+    np.add.at(score, member, information.score.sum(axis=0).reshape(-1, size))
+    return hessian, score, found[:, 0], found[:, 1]
 
 
 def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:
