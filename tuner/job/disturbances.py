@@ -27,8 +27,6 @@ from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
 
-COLOURED = 1.2
-"""Residuals over measurement noise from which something else than noise must be in them."""
 CONTRADICTS = 3.0
 """Standard errors of least squares by which no coefficient may move."""
 
@@ -66,8 +64,8 @@ def with_disturbances(
     set-points were not recorded, where nothing would be known better, and where the two fits
     contradict each other.
     """
-    largest = max(max(scale.values()) for scale in fitted.scales.values())
-    if largest < COLOURED or not fitted.polished or job.settings.job.disturbances == "none":
+    asked = job.settings.job.disturbances != "none"
+    if fitted.leaves_noise_alone or not fitted.polished or not asked:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
     predictor = Predictor.of(full.objective, full.point, job.fitted)

@@ -185,7 +185,7 @@ class Selection:
             candidates=len(self.candidates),
             neutral=self._neutral,
             stand_ins=[group for group in state.added if is_stand_in(group)],
-            measured=[group for group in state.added if reads_recording(group)],
+            no_gusts=[group for group in state.added if _no_gust(state, group)],
         )
         if not taken or not kept:
             return state if kept else replace(state, added={})
@@ -337,7 +337,7 @@ class Selection:
             self._columns(self.candidates[group]),
             candidates=len(self.candidates),
             neutral=self._neutral if group in state.added else None,
-            reads_recording=reads_recording(group),
+            no_gust=_no_gust(state, group),
         )
 
     def _rows(
@@ -377,6 +377,14 @@ class Selection:
         model = self._columns([*self.job.space.names, *_names(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
+
+
+def _no_gust(state: Standing, group: str) -> bool:
+    """Return whether no gust can pass for a group: none knows what was recorded of a battery.
+
+    And in still air there is none: a fit that leaves measurement noise alone.
+    """
+    return reads_recording(group) or state.fitted.leaves_noise_alone
 
 
 def _offsets(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:

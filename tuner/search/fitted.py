@@ -14,6 +14,9 @@ from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.iteration import Iteration
 
+COLOURED = 1.2
+"""Residuals over measurement noise from which something else than noise must be in them."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -90,6 +93,11 @@ class Fitted:
     polished: bool = True
     findings: tuple[Finding, ...] = field(default=())
     held: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def leaves_noise_alone(self) -> bool:
+        """Whether residuals hold no more than measurement noise, on any flight and channel."""
+        return max(max(scale.values()) for scale in self.scales.values()) < COLOURED
 
 
 def by_flight(

@@ -70,7 +70,7 @@ def score(
     candidates: int,
     neutral: NDArray[np.float64] | None = None,
     gone: Columns | None = None,
-    reads_recording: bool = False,
+    no_gust: bool = False,
 ) -> Score:
     """Return what a group is worth beside a model.
 
@@ -102,8 +102,9 @@ def score(
         its neutral values there.
     gone
         Columns of coefficients that go to their neutral values with the group and without it.
-    reads_recording
-        Whether the group's law reads a recorded signal.
+    no_gust
+        Whether no gust can pass for the group: its law reads a recorded signal, or the fit with it
+        leaves measurement noise alone.
     """
     columns = (model, np.concatenate([model, group]))
     to_neutral = np.zeros(len(linear.scaled)) if neutral is None else neutral - linear.scaled
@@ -132,7 +133,7 @@ def score(
     chance = _chance(linear, model, group, minima)
     stays = inside and held_out.share > -patience * held_out.scatter  # nothing contradicts it
     of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure)
-    if of_few and not reads_recording:
+    if of_few and not no_gust:
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not by_flight:
         chance = max(chance, chance_of_gusts(linear, model, group, without))
@@ -155,7 +156,7 @@ def surviving(
     candidates: int,
     neutral: NDArray[np.float64],
     stand_ins: Collection[str] = (),
-    measured: Collection[str] = (),
+    no_gusts: Collection[str] = (),
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
@@ -175,8 +176,8 @@ def surviving(
         Group -> columns.
     stand_ins
         Names of groups that describe as a whole what others do one by one.
-    measured
-        Names of groups whose laws read a recorded signal.
+    no_gusts
+        Names of groups for which no gust can pass.
     """
     left, taken = dict(groups), dict[str, Score]()
     while True:
@@ -191,7 +192,7 @@ def surviving(
                 candidates=candidates,
                 neutral=neutral,
                 gone=gone,
-                reads_recording=name in measured,
+                no_gust=name in no_gusts,
             )
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:

@@ -9,9 +9,9 @@ from typing import Any, cast
 import pytest
 
 from tuner.config import JobFile
-from tuner.job.disturbances import COLOURED, with_disturbances
+from tuner.job.disturbances import with_disturbances
 from tuner.job.prepare import Job
-from tuner.search.fitted import Fitted
+from tuner.search.fitted import COLOURED, Fitted
 
 NOBODY = cast(Any, None)
 

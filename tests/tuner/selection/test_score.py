@@ -187,7 +187,7 @@ def test_a_gust_that_does_what_a_term_would_is_not_feared_where_a_recorded_signa
     kept, taken = surviving(after, MODEL, groups, **of)
     assert not kept
     assert taken["first"].reason is SelectionCode.NOT_SIGNIFICANT
-    kept, taken = surviving(after, MODEL, groups, **of, measured=["first"])
+    kept, taken = surviving(after, MODEL, groups, **of, no_gusts=["first"])
     assert not taken
     assert kept["first"].reason is SelectionCode.PREDICTS_SECTIONS
     assert kept["first"].chance < 1e-12
@@ -198,7 +198,7 @@ def test_gusts_let_a_term_stay_whose_signal_was_recorded_hardly_more_often():
     both, stayed = np.concatenate([MODEL, FIRST]), []
     for seed in range(200):
         after = moved_to_minimum(linear_fit(0.0, seed=seed, gusts=True), both)
-        found = score(after, MODEL, FIRST, candidates=14, neutral=np.zeros(4), reads_recording=True)
+        found = score(after, MODEL, FIRST, candidates=14, neutral=np.zeros(4), no_gust=True)
         stayed.append(found.earns_place)
     assert np.mean(stayed) <= 0.01
 
