@@ -191,7 +191,9 @@ class JobFile(Section):
     disturbances
         ``follow`` fits once more where the residuals hold more than measurement noise and rate and
         thrust set-points were recorded: a Kalman filter follows what pushed the flights, which
-        takes some minutes; ``none`` leaves that to the intervals.
+        takes some minutes; of more than some four minutes of flight it is left to the intervals, as
+        ``none`` leaves it. ``auto`` follows where the fit has chosen its terms, so that what is left
+        is none of them.
     target
         Which of a run's two answers the exports for simulators hold: ``gazebo``, the coefficients
         with which Gazebo, which lacks some of the terms, flies most like the vehicle; ``physical``,
@@ -221,7 +223,7 @@ class JobFile(Section):
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()
     terms: Literal["auto", "none"] | tuple[TermName, ...] = "auto"
-    disturbances: Literal["none", "follow"] = "follow"
+    disturbances: Literal["auto", "none", "follow"] = "auto"
     target: Literal["gazebo", "physical"] = "gazebo"
     coefficients: dict[CoefficientName, CoefficientSettings] = Field(default_factory=dict)
     ties: tuple[Annotated[tuple[CoefficientName, ...], Len(min_length=2)], ...] = ()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
-from tuner.filter_error.kalman import Gains, gains_of, innovations
+from tuner.filter_error.kalman import GATE, Gains, gains_of, innovations
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
 from tuner.filter_error.strengths import likeliest
@@ -31,6 +31,10 @@ AT_ONCE = 8
 """Parameters by which is differentiated at a time."""
 LEARNT_FROM = 6.0
 """s of each flight from which strengths are estimated."""
+LOST = 0.05
+"""Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
+NUMBERS = 57
+"""Of a state and its disturbances that samples correct, with four commands on their way."""
 NOISIER = 1.05
 """Root mean square of a channel's whitened innovations from which it is noisier than assumed."""
 
@@ -121,6 +125,17 @@ class Predictor:
             return learnt
         return replace(learnt, noise=noise).at(objective, point)
 
+    def keeps_track(self, objective: Objective, point: Point) -> bool:
+        """Return whether few innovations of any channel are outliers, and all are finite.
+
+        Beyond the gate an innovation corrects no further: a filter that is lost stays lost.
+        """
+        for error in self.jacobian(objective, point, ()).residuals.values():
+            white = np.abs(np.asarray(error)[np.asarray(error) != 0.0])
+            if len(white) and np.mean(~(white <= GATE)) > LOST:
+                return False
+        return True
+
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor with the gains of a point."""
         gains, _ = self._gains(objective, point, self.strengths, self.ticks)
@@ -130,6 +145,12 @@ class Predictor:
     def ticks(self) -> int:
         """How many there are."""
         return int(next(iter(self.feed.samples.values())).values.shape[0])
+
+    @property
+    def memory(self) -> int:
+        """Bytes that gains take."""
+        flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
+        return self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize
 
     def _gains(
         self, objective: Objective, point: Point, strengths: Array, ticks: int

@@ -19,6 +19,7 @@ from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
 from tuner.job.selected import Selected
+from tuner.job.terms import candidates_of
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -61,15 +62,19 @@ def with_disturbances(
     ``in_doubt`` is as for `tuner.examination.examination.examine`.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
-    set-points were not recorded, where nothing would be known better, and where the two fits
-    contradict each other.
+    set-points were not recorded, where flights are too many or too long, where a filter loses them,
+    where nothing would be known better, and where the two fits contradict each other.
     """
-    asked = job.settings.job.disturbances != "none"
-    if fitted.leaves_noise_alone or not fitted.polished or not asked:
+    asked = job.settings.job.disturbances
+    follows = asked == "follow" or (asked == "auto" and candidates_of(job))
+    if fitted.leaves_noise_alone or not fitted.polished or not follows:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
     predictor = Predictor.of(full.objective, full.point, job.fitted)
     if predictor is None:
+        return None
+    if predictor.memory > full.objective.memory // 2:
+        on_message("What pushed the flights is not followed: there are too many of them for that.")
         return None
     clock = time.perf_counter()
     names, count = full.objective.space.names, len(full.fitted)
@@ -80,6 +85,9 @@ def with_disturbances(
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
     problem = full.objective, full.point, fitted.criterion
     predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
+    if not predictor.keeps_track(full.objective, point):
+        on_message("What pushed them cannot be followed: the model lacks something else.")
+        return None
     again = polished(
         job,
         replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)),

@@ -380,10 +380,7 @@ class Selection:
 
 
 def _no_gust(state: Standing, group: str) -> bool:
-    """Return whether no gust can pass for a group: none knows what was recorded of a battery.
-
-    And in still air there is none: a fit that leaves measurement noise alone.
-    """
+    """Return whether no gust can pass for a group: none knows a voltage, and there may be none."""
     return reads_recording(group) or state.fitted.leaves_noise_alone
 
 

@@ -122,8 +122,8 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
 ):
     judged = []
 
-    def surviving(*_, measured, **__):
-        judged.extend(measured)
+    def surviving(*_, no_gusts, **__):
+        judged.extend(no_gusts)
         return {}, {}
 
     monkeypatch.setattr(selection, "surviving", surviving)
@@ -131,7 +131,7 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
     monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
     groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
     job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
-    standing = Standing(None, groups, None)
+    standing = Standing(SimpleNamespace(leaves_noise_alone=False), groups, None)
     selection.Selection(job, None, groups, print, print)._pruned(standing)
     assert judged == ["battery"]
 
