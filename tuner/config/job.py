@@ -192,8 +192,8 @@ class JobFile(Section):
         ``follow`` fits once more where the residuals hold more than measurement noise and rate and
         thrust set-points were recorded: a Kalman filter follows what pushed the flights, which
         takes some minutes; of more than some four minutes of flight it is left to the intervals, as
-        ``none`` leaves it. ``auto`` follows where the fit has chosen its terms, so that what is left
-        is none of them.
+        ``none`` leaves it. ``auto`` follows where the fit has chosen its terms, so that what is
+        left is none of them.
     target
         Which of a run's two answers the exports for simulators hold: ``gazebo``, the coefficients
         with which Gazebo, which lacks some of the terms, flies most like the vehicle; ``physical``,
