@@ -380,7 +380,7 @@ class Selection:
 
 
 def _no_gust(state: Standing, group: str) -> bool:
-    """Return whether no gust can pass for a group: none knows a voltage, and there may be none."""
+    """Return whether no gust can pass for a group: it reads a recording, or noise alone is left."""
     return reads_recording(group) or state.fitted.leaves_noise_alone
 
 
