@@ -44,7 +44,7 @@ def contest_of(folder: Path) -> Contest:
     """
     paths = [str(path) for path in sorted(folder.glob("log*"))]
     settings = settle(Options(paths, vehicle="crazyflie"))
-    flights = sorted(without_pose(settings), key=_flown)
+    flights = sorted(without_pose(settings)[0], key=_flown)
     if len(flights) < 2:
         raise InputError(folder, "it holds fewer than two flights without a pose", "")
     began = time.perf_counter()

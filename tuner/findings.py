@@ -60,6 +60,7 @@ class Code(StrEnum):
     NO_TACHOMETER = "no_tachometer"
     YAW_OPEN = "yaw_open"
     RATE_WORSE = "rate_worse"  # before, after, hold (rad/s), seconds
+    RATE_FORETOLD = "rate_foretold"  # before, after, hold (rad/s), seconds
     RATE_NOT_FORETOLD = "rate_not_foretold"  # before, after, hold (rad/s), seconds
     VEHICLE_NOT_GIVEN = "vehicle_not_given"
     BENCH_CONFLICT = "bench_conflict"  # deviation (standard errors); names: the coefficients

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 from tuner.config import Settings, TrajectorySettings, check_mixer
 from tuner.config.job import InletName
+from tuner.disk import exists
 from tuner.errors import InputError, RecordingError, did_you_mean
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
@@ -60,7 +61,7 @@ def read_recordings(
 ) -> tuple[Recording, ...]:
     """Read every mission of the settled files, and assign it what the job file says of it.
 
-    A flight that cannot be simulated is left out (`read_usable` names it), if others are left.
+    What cannot be used is left out (`read_usable` names it), if others are left.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def read_recordings(
     Raises
     ------
     InputError
-        A file cannot be read, no flight holds what its inlet needs, a side-car names an
+        No file can be read, no flight holds what its inlet needs, a side-car names an
         impossible trajectory, or a held-out flight does not exist.
     """
     recordings, _ = read_usable(settings, holdout=holdout)
@@ -80,7 +81,7 @@ def read_recordings(
 
 
 def read_usable(
-    settings: Settings, *, holdout: Sequence[str] | None = None
+    settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
 ) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
     """Read every mission of the settled files that can be simulated, and name the others.
 
@@ -88,12 +89,15 @@ def read_usable(
     ----------
     settings, holdout
         As of `read_recordings`.
+    fits
+        Whether one that is not held out has to be left.
 
     Returns
     -------
     tuple
-        The recordings, and a finding for each flight that is left out because it does not hold
-        what its inlet needs, or that enters further down than its signals would let it.
+        The recordings, and a finding for each that is left out because it cannot be read, because
+        nothing flies in it, or because it does not hold what its inlet needs, and for each that
+        enters further down than its signals would let it.
 
     Raises
     ------
@@ -101,39 +105,44 @@ def read_usable(
         As `read_recordings`.
     """
     job = settings.job
-    flights = [
-        flight
-        for path in settings.flights
-        for flight in load_flights(path, topics=job.topics, namespace=job.namespace)
-    ]
-    names = [flight.name for flight in flights]
+    flights: list[Flight] = []
+    left_out: list[tuple[str, RecordingError]] = []
+    for path in settings.flights:
+        try:
+            flights += load_flights(path, topics=job.topics, namespace=job.namespace)
+        except RecordingError as error:
+            if not exists(path):
+                raise
+            left_out.append((path.stem, error))
+    names = [*(flight.name for flight in flights), *(name for name, _ in left_out)]
     for name in job.holdout:
         if name not in names:
             raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
     recordings: list[Recording] = []
-    left_out: list[tuple[Flight, RecordingError]] = []
     for flight in flights:
         try:
             (recording,) = recordings_of(
                 settings, [_with_reference(flight, settings)], holdout=holdout
             )
         except RecordingError as error:
-            left_out.append((flight, error))
+            left_out.append((flight.name, error))
         else:
             recordings.append(recording)
     held_out = job.holdout if holdout is None else holdout
     none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
-    if left_out and (not recordings or none_to_fit):
+    if left_out and (not recordings or (fits and none_to_fit)):
         raise left_out[0][1]
     recordings = [_as_fitted(recording, recordings, settings) for recording in recordings]
     chosen = (recording.because for recording in recordings if recording.because is not None)
     return tuple(recordings), (
-        *(
-            Finding(Code.LEFT_OUT, "warning", flight.name, names=(error.what, error.remedy))
-            for flight, error in left_out
-        ),
+        *(left_out_of(name, error) for name, error in left_out),
         *chosen,
     )
+
+
+def left_out_of(name: str, error: RecordingError) -> Finding:
+    """Return the finding that a flight takes no part, and why."""
+    return Finding(Code.LEFT_OUT, "warning", name, names=(error.what, error.remedy))
 
 
 def recordings_of(

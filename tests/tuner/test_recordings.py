@@ -7,7 +7,14 @@ import pytest
 
 from tuner.config import JobFile, Options, settle
 from tuner.errors import InputError, RecordingError
-from tuner.recordings import Recording, read_recordings, recordings_of, with_offsets
+from tuner.recordings import (
+    Recording,
+    read_recordings,
+    read_usable,
+    recordings_of,
+    with_offsets,
+)
+from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[2] / "reference_flights"
 SPIN, CIRCLE = "yaw_spin_3rps", "circle_4mps"
@@ -59,6 +66,26 @@ def test_a_flight_that_is_held_out_must_feed_its_inlet_too(settings, flights):
         recordings_of(settings, bare[1:])
     with pytest.raises(InputError, match="there is no flight 'circle_4mps-2'; did you mean"):
         read_recordings(replace(settings, job=settings.job.replace(holdout=("circle_4mps-2",))))
+
+
+def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path):
+    too_short, empty = tmp_path / "too_short.csv", tmp_path / "empty.bag"
+    rows = [f"{0.01 * i:.2f},0,0,0,0,0,0,1" for i in range(100)]
+    too_short.write_text("\n".join(["t,px,py,pz,qx,qy,qz,qw", *rows]))
+    empty.touch()
+    circle = str(FLIGHTS / f"{CIRCLE}.bag")
+    settings = replace(
+        settle(Options([str(too_short), circle, str(empty)], holdout=["too_short"])), job=JobFile()
+    )
+    recordings, left_out = read_usable(settings)
+    assert [recording.flight.name for recording in recordings] == [CIRCLE]
+    assert [finding.subject for finding in left_out] == ["too_short", "empty"]
+    assert sentence(left_out[1]).startswith("The flight is left out: it is empty")
+    assert sentence(left_out[0]).startswith("The flight is left out: nothing flies in it")
+    with pytest.raises(RecordingError, match="nothing flies in it"):
+        read_usable(replace(settings, flights=(too_short, empty)))
+    with pytest.raises(RecordingError, match="no such file"):
+        read_usable(replace(settings, flights=(*settings.flights, tmp_path / "typed_wrong.bag")))
 
 
 def test_a_flight_alone_enters_as_reference_on_time(flights):

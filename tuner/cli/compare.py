@@ -40,6 +40,7 @@ def compare(
     laps
         Show each lap on the terminal, too.
     """
+    from tuner.cli.progress import listening
     from tuner.cli.tables import print_comparison
     from tuner.runtime import configure
 
@@ -50,6 +51,9 @@ def compare(
     options = Options(
         flights, controller=controller, config=config, topics=topics, namespace=namespace
     )
-    table, settings = compare_vehicles(options, vehicle, out or ())
+    with listening(quiet=quiet) as listener:
+        table, settings = compare_vehicles(
+            options, vehicle, out or (), on_message=listener.on_message
+        )
     if not quiet:
         print_comparison(table, settings, laps=laps, written=out or ())

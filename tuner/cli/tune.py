@@ -68,11 +68,16 @@ def tune(
 
         options = fitted.options(bench=bench)
         with span("reading"):
-            bare = without_pose(settle(options))
+            bare, left_out = without_pose(settle(options))
         if bare:
             with listening(quiet=quiet) as listener:
                 measured = fit_without_pose(
-                    settle(options), bare, out=out, listener=listener, command=TYPED.get()
+                    settle(options),
+                    bare,
+                    left_out=left_out,
+                    out=out,
+                    listener=listener,
+                    command=TYPED.get(),
                 )
             profile_into(measured.folder)
             if not quiet:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from tuner.comparison.comparison import Comparison
@@ -12,8 +12,9 @@ from tuner.comparison.errors import FlightErrors, rmse_of
 from tuner.comparison.table import Row, Table, check_table_file, write_table
 from tuner.config import Options, Settings, VehicleFile, find_config, read_vehicle, settle
 from tuner.errors import InputError
-from tuner.recordings import read_recordings
+from tuner.recordings import read_usable
 from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.wording.findings import one_line
 
 OVERALL = "all"
 #: A lap in which fewer poses were recorded than this is left out.
@@ -24,6 +25,8 @@ def compare(
     options: Options,
     vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
     out: Sequence[Path] = (),
+    *,
+    on_message: Callable[[str], None] = lambda _: None,
 ) -> tuple[Table, Settings]:
     """Simulate recorded flights with several vehicles, and tabulate the RMSE of each.
 
@@ -35,6 +38,8 @@ def compare(
         Vehicle files or names of shipped ones; or label -> one of those, or a vehicle.
     out
         Files to write, by suffix .csv, .json or .html.
+    on_message
+        Called with a line on each flight that is left out, or simulated otherwise than asked.
 
     Returns
     -------
@@ -54,9 +59,10 @@ def compare(
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
     sets = {label: _vehicle(named) for label, named in vehicles.items()}
-    comparison = Comparison(
-        read_recordings(settings), settings.controller, window=settings.job.search.window
-    )
+    recordings, noticed = read_usable(settings, fits=False)
+    for finding in noticed:
+        on_message(one_line(finding))
+    comparison = Comparison(recordings, settings.controller, window=settings.job.search.window)
     table = table_of({label: comparison.fly(vehicle) for label, vehicle in sets.items()})
     for path in out:
         write_table(table, path)

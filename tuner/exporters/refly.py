@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
-from tuner.recordings import read_recordings, with_conditions, with_inputs_late, with_offsets
+from tuner.recordings import read_usable, with_conditions, with_inputs_late, with_offsets
 from tuner.result import AxesRmse, Run, RunResult
 
 
@@ -33,7 +33,10 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
         return {}
     settings = _settings(run)
     wanted = {flight.name: flight for flight in run.result.flights}
-    recordings = [r for r in read_recordings(settings) if r.flight.name in wanted]
+    readable, _ = read_usable(settings, fits=False)
+    recordings = tuple(r for r in readable if r.flight.name in wanted)
+    if gone := sorted(set(wanted) - {r.flight.name for r in recordings}):
+        raise InputError(wanted[gone[0]].path, "is not the recording of the run", "fit it again")
     for flight in (recording.flight for recording in recordings):
         if flight.sha256 != wanted[flight.name].sha256:
             raise InputError(flight.path, "is not the recording of the run", "fit it again")

@@ -29,7 +29,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "commanded_thrust": (-1e4, 1e4),
     "commanded_torque": (-1e4, 1e4),
     "rotor_speed": (0.0, 20_000.0),
-    "battery_voltage": (0.0, 100.0),
+    "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
 }
 
 #: No recording lasts longer, in s, to either side of its middle.

@@ -16,6 +16,7 @@ from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.content import Settings, Signals, given_map, read_signals
 from tuner.flights.flight import Series
+from tuner.flights.locate import require_pose
 from tuner.flights.mission import IDLE, SHORTEST, stretches
 from tuner.flights.notes import Note
 from tuner.flights.sidecar import read_sidecar
@@ -64,12 +65,12 @@ def flying(signals: Signals) -> tuple[tuple[float, float], ...]:
 def read_inertial(
     path: Path, *, topics: str | Path | None = None, namespace: str = ""
 ) -> InertialFlight | None:
-    """Read a recording that holds no pose; None of one that does, or that lacks `NEEDS`.
+    """Read a recording that holds no pose; None of one that does, or whose samples are corrupt.
 
     Raises
     ------
     RecordingError
-        The file cannot be read, or nothing flies in it.
+        The file cannot be read, nothing flies in it, or it holds neither a pose nor `NEEDS`.
     ConfigError
         The topic map or the side-car is wrong.
     """
@@ -78,6 +79,7 @@ def read_inertial(
         given = given_map(path, settings, sidecar)
         signals = read_signals(path, settings, sidecar, given, with_pose=False)
     if not is_inertial(signals):
+        require_pose(signals.recording, signals.topic_map, signals.places)
         return None
     runs = flying(signals)
     if not runs:

@@ -155,7 +155,7 @@ def require_pose(recording: Recording, topics: TopicMap, places: Mapping[str, Pl
             recording.path,
             f"holds no {what}, only {', '.join(held[:12]) or 'nothing'}",
             "log the vehicle's estimate of it, or motion capture; body rate, acceleration and "
-            "motor commands together are fitted without one (tune --flights)",
+            "motor commands are fitted without one, by themselves (tune --flights)",
         )
     wanted = list(dict.fromkeys(source.topic for source in sources))
     for topic in wanted:

@@ -13,7 +13,8 @@ from tuner.bench.combine import Combination, combine
 from tuner.bench.measurement import Measurement
 from tuner.bench.scales import value_of
 from tuner.config import Settings, VehicleFile, values_of, with_values
-from tuner.errors import ConfigError, RecordingError
+from tuner.disk import exists
+from tuner.errors import ConfigError, InputError, RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.inertial import InertialFlight, read_inertial
 from tuner.inertial.ahead import AHEAD, rate_errors
@@ -22,38 +23,46 @@ from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.folder import folder_for
 from tuner.job.listener import SILENT, Listener
+from tuner.recordings import left_out_of
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
 """What a flight without a pose gives over the mass."""
 
 
-def without_pose(settings: Settings) -> tuple[InertialFlight, ...]:
-    """Return the flights of a job, if none of its recordings holds a pose; else none of them.
+def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
+    """Return the flights of a job, if none of its recordings holds a pose, and what is left out.
+
+    Where one does there are none: the others take no part (`tuner.recordings` names them).
 
     Raises
     ------
     RecordingError
-        Some recordings hold a pose and others do not.
+        No recording can be used.
     """
     job = settings.job
-    read = {
-        path: read_inertial(path, topics=job.topics, namespace=job.namespace)
-        for path in map(Path, settings.flights)
-    }
-    bare = {path: flight for path, flight in read.items() if flight is not None}
-    if bare and len(bare) < len(read):
-        raise RecordingError(
-            next(iter(bare)),
-            "holds no pose, others do",
-            "fit those without one by themselves, and give the result folder with --bench",
-        )
-    return tuple(bare.values())
+    flights: list[InertialFlight] = []
+    left_out: list[tuple[Path, RecordingError]] = []
+    for path in settings.flights:
+        try:
+            flight = read_inertial(path, topics=job.topics, namespace=job.namespace)
+        except RecordingError as error:
+            if not exists(path):
+                raise
+            left_out.append((path, error))
+            continue
+        if flight is None:
+            return (), ()
+        flights.append(flight)
+    if left_out and not flights:
+        raise left_out[0][1]
+    return tuple(flights), tuple(left_out_of(path.stem, error) for path, error in left_out)
 
 
 def fit_without_pose(
     settings: Settings,
     flights: Sequence[InertialFlight],
     *,
+    left_out: Sequence[Finding] = (),
     out: Path | None = None,
     listener: Listener = SILENT,
     command: str = "",
@@ -65,7 +74,10 @@ def fit_without_pose(
     settings
         Of the job; its vehicle is of the weighed mass.
     flights
-        At least one.
+        At least one; those that the job holds out are predicted, and not fitted, and those that
+        cannot be fitted are left out, if others are left.
+    left_out
+        Findings of those that already were.
     out
         Result folder; None makes one under ``runs/`` named by the time.
     listener
@@ -76,21 +88,21 @@ def fit_without_pose(
     Raises
     ------
     InputError
-        A flight cannot be used; nothing was written.
+        No flight can be used; nothing was written.
     OutputError
         The result folder cannot be written to.
     """
     began = time.perf_counter()
     start, folder = settings.vehicle, folder_for(out)
-    measured = []
-    for flight in flights:
-        listener.on_message(f"{flight.name}: fitting body rate and specific force without a pose.")
-        measured.append(measure_inertial(flight, start))
+    held_out = [flight for flight in flights if flight.name in settings.job.holdout]
+    to_fit = [flight for flight in flights if flight.name not in settings.job.holdout]
+    measured, used, unusable = _measured(to_fit, start, listener)
+    left_out = (*left_out, *unusable)
     known = known_of(start)
     alone = combine(measured, known)
     measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
     combination = combine(measurements, known)
-    path = Path(flights[0].path)
+    path = Path(used[0].path)
     try:
         vehicle = vehicle_of(path, start, combination)
     except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
@@ -104,21 +116,49 @@ def fit_without_pose(
         measurements,
         combination,
         findings=(
+            *left_out,
             *_left_open(settings, combination.names),
-            *_foretold(flights, start, vehicle),
+            *_foretold(used, start, vehicle),
+            *_foretold(held_out, start, vehicle, held_out=True),
             *conflicts_of(combination),
         ),
         settings={"command": command, "origin": dict(settings.origin)},
-        source={"flights": ", ".join(flight.name for flight in flights)},
+        source={"flights": ", ".join(flight.name for flight in used)},
         header=f"From flights without a pose; the rest as in {start.name}.",
         began=began,
     )
 
 
+def _measured(
+    flights: Sequence[InertialFlight], start: VehicleFile, listener: Listener
+) -> tuple[list[Measurement], list[InertialFlight], list[Finding]]:
+    """Return what flights say, those that say it, and findings of those that cannot be fitted."""
+    measured, used, errors = [], [], []
+    for flight in flights:
+        listener.on_message(f"{flight.name}: fitting body rate and specific force without a pose.")
+        try:
+            measured.append(measure_inertial(flight, start))
+        except RecordingError as error:
+            errors.append((flight.name, error))
+        else:
+            used.append(flight)
+    if not used:
+        what, to_do = "holds out all flights that can be used", "leave one to fit"
+        raise errors[0][1] if errors else InputError("--holdout", what, to_do)
+    return measured, used, [left_out_of(name, error) for name, error in errors]
+
+
 def _foretold(
-    flights: Sequence[InertialFlight], start: VehicleFile, vehicle: VehicleFile
+    flights: Sequence[InertialFlight],
+    start: VehicleFile,
+    vehicle: VehicleFile,
+    *,
+    held_out: bool = False,
 ) -> tuple[Finding, ...]:
-    """Return of which flights body rate is foretold worse than before, or than by holding it."""
+    """Return of which flights body rate is foretold worse than before, or than by holding it.
+
+    Of flights that were held out it is said how well it is foretold in any case.
+    """
     findings = []
     for flight in flights:
         errors = rate_errors(stretches_of(flight.series, flight.flying), start, vehicle)
@@ -134,6 +174,8 @@ def _foretold(
             findings.append(Finding(Code.RATE_WORSE, "warning", flight.name, numbers))
         elif errors.fitted > errors.hold:
             findings.append(Finding(Code.RATE_NOT_FORETOLD, "info", flight.name, numbers))
+        elif held_out:
+            findings.append(Finding(Code.RATE_FORETOLD, "info", flight.name, numbers))
     return tuple(findings)
 
 

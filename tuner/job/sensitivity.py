@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tuner.config import Options, Settings, check_names, settle
@@ -19,7 +19,7 @@ from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.prepare import Job, job_of
 from tuner.job.unfitted import unfitted
 from tuner.objective.alternatives import alternatives_of
-from tuner.recordings import read_recordings
+from tuner.recordings import read_usable
 from tuner.report import render
 from tuner.report.record import About, Recording, write_traces
 from tuner.search.fitted import Fitted
@@ -106,9 +106,11 @@ def examine_vehicle(
         )
     if request.samples is not None and request.samples < 2:
         raise InputError("--samples", f"{request.samples} is too few", "give at least 2")
-    job = job_of(settings, read_recordings(settings, holdout=()))
+    recordings, noticed = read_usable(settings, holdout=())
+    job = job_of(settings, recordings)
     make_folder(out)
     fitted = unfitted(job)
+    fitted = replace(fitted, findings=(*noticed, *fitted.findings))
     on_message("simulating, and differentiating by every coefficient")
     examination = examine(fitted, otherwise=alternatives_of(fitted.objective), at_minimum=False)
     knowledge = write_knowledge(out, job, examination, fitted)

@@ -112,14 +112,18 @@ def require_windows(flight: Flight, seconds: float, fed: Collection[str]) -> Non
         Names what is missing, and in how much of the flight.
     """
     stretches = _stretches(flight, seconds, None)
-    for what, names in ((" and ".join(fed), fed), ("pose", ())):
+    for names in ((), *((name,) for name in fed), fed):
         usable = len(_usable(flight, stretches, names))
         if usable < MOSTLY * len(stretches):
+            what = " and ".join(names).replace("_", " ") or "pose"
             lacking = 100.0 * (1.0 - usable / len(stretches))
+            seldom = not names and flight.series["position"].rate * seconds < FEWEST
             raise RecordingError(
                 flight.path,
-                f"lacks a continuous {what.replace('_', ' ')} in {lacking:.0f} % of its mission",
-                "inspect the recording: samples outside their range are dropped",
+                f"lacks a continuous {what} in {lacking:.0f} % of its mission",
+                f"log the pose at {np.ceil(FEWEST / seconds):.0f} Hz or more"
+                if seldom
+                else "inspect the recording: samples outside their range are dropped",
             )
 
 

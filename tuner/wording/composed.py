@@ -14,6 +14,9 @@ from tuner.flights.notes import Note, NoteCode
 from tuner.wording.notes import damage_sentence, note_in_words
 from tuner.wording.phrases import as_sentence, listed
 
+WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
+"""Words with which an error begins that says something of the file which it names."""
+
 
 def recording(finding: Finding) -> str:
     """Return what was found or changed while the recording was read."""
@@ -22,6 +25,13 @@ def recording(finding: Finding) -> str:
     count = int(numbers.pop("count"))
     text = note_in_words(Note(NoteCode(code), "warning", topic, count, numbers, tuple(names)))
     return f"{topic}: {text}." if topic else as_sentence(text)
+
+
+def left_out(finding: Finding) -> str:
+    """Return why a flight takes no part: of a clause without a subject the flight is that."""
+    what = finding.names[0]
+    it = "it " if what.split()[0] in WITHOUT_SUBJECT else ""
+    return f"The flight is left out: {it}{what}."
 
 
 def salvaged(finding: Finding) -> str:

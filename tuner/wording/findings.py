@@ -210,6 +210,14 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "Fit it by itself: another build, battery or propeller turns the vehicle otherwise.",
     ),
+    Code.RATE_FORETOLD: (
+        (
+            "From its commands alone the fitted coefficients predict the body rate of this flight, "
+            "which was held out, {seconds:g} s ahead to {after:.3g} rad/s; the initial ones do to "
+            "{before:.3g} rad/s, and that it stays as it is would be right to {hold:.3g} rad/s."
+        ),
+        "",
+    ),
     Code.RATE_NOT_FORETOLD: (
         (
             "From its commands alone the fitted coefficients predict the body rate of this flight "
@@ -239,7 +247,7 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.RECORDING: (composed.recording, ""),
     Code.LEFT_OUT: (
-        "The flight is left out: it {given}.",
+        composed.left_out,
         lambda finding: as_sentence(finding.names[1]),
     ),
     Code.SALVAGED: (composed.salvaged, "Record the flight again if what was lost matters."),

@@ -124,11 +124,17 @@ def test_recordings_are_compared_with_named_vehicles(compared):
 def test_the_job_file_says_what_flew(bag, compared, tmp_path):
     job = tmp_path / "tune.yaml"
     job.write_text("holdout: [small_circle]\nflights: {small_circle: {time_offset: 0.1}}\n")
+    (tmp_path / "empty.bag").touch()
+    said = []
     table, settings = compare(
-        Options([str(bag)], config=str(job)),
+        Options([str(bag), str(tmp_path / "empty.bag")], config=str(job)),
         [str(configs_folder() / "vehicles" / "hovergames_updated.yaml")],
+        on_message=said.append,
     )
     assert settings.job_path == job
+    assert [line.partition(": it is")[0] for line in said] == [
+        "warning: empty: The flight is left out"
+    ]
     (row, *_) = table.rows
     assert row.rmse.x > 100 * compared[0].of("hovergames_updated", "small_circle").x
 

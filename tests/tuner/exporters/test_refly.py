@@ -94,12 +94,12 @@ def test_a_true_run_flies_again_as_it_says(run):
 
 
 def test_recordings_are_read_as_the_run_read_them(run, monkeypatch):
-    def read(settings):
+    def read(settings, *, fits):
         seen.append(settings.vehicle)
-        return reading(settings)
+        return reading(settings, fits=fits)
 
-    seen, reading = [], refly_module.read_recordings
-    monkeypatch.setattr(refly_module, "read_recordings", read)
+    seen, reading = [], refly_module.read_usable
+    monkeypatch.setattr(refly_module, "read_usable", read)
     refly(run, with_values(run.vehicle, {"motor_constant": 2e-5}))
     (began_with,) = seen  # by it commands follow from a commanded wrench, and inlets are chosen
     assert values_of(began_with)["rotor_drag_coefficient"] == 4e-4
@@ -117,8 +117,12 @@ def test_numbers_that_fly_otherwise_are_refused(run):
 
 
 def test_a_recording_that_is_gone_or_changed_is_said(run, tmp_path):
+    overwritten = tmp_path / "small_circle.bag"
+    overwritten.touch()
     for change, expected in (
         ({"path": str(tmp_path / "gone.bag")}, "is not there any more"),
+        ({"path": str(overwritten)}, "is empty"),
+        ({"path": run.result.flights[0].path, "name": "other"}, "is not the recording of the run"),
         ({"sha256": "0" * 64}, "is not the recording of the run"),
     ):
         flights = (run.result.flights[0].model_copy(update=change),)

@@ -150,3 +150,13 @@ def test_a_jump_that_stays_is_only_noted() -> None:
     assert notes[0].code is NoteCode.AWAY_FOR_GOOD
     assert notes[0].kind == "warning"
     assert notes[0].count == 1
+
+
+def test_a_battery_of_no_volts_was_not_read():
+    time = np.arange(50) * 0.1
+    volts = np.full((50, 1), 3.9)
+    volts[20:30] = 0.0
+    kept, values, (note, *_) = clean("battery_voltage", "power", time, volts)
+    assert (note.code, note.count) == (NoteCode.OUT_OF_RANGE, 10)
+    assert len(kept) == 40
+    assert values.min() == 3.9

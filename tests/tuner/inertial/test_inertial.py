@@ -1,6 +1,7 @@
 """Flights without a pose: what gyro, accelerometer and commands say agrees with what flew."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,16 +16,19 @@ from tuner.config import (
     values_of,
     with_values,
 )
-from tuner.errors import RecordingError
+from tuner.errors import InputError, RecordingError
 from tuner.findings import Code
 from tuner.flights.inertial import read_inertial
 from tuner.inertial.ahead import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import least_noticed
 from tuner.job.inertial import fit_without_pose, without_pose
+from tuner.recordings import read_usable
 from tuner.result import BEST_FIT_FILE
 from tuner.simulation.simulate import simulate
+from tuner.wording.findings import one_line
 
+FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 LATENCY = 0.004
 WRONG = {"motor_constant": 1.3, "inertia_xx": 0.7, "inertia_yy": 1.2, "time_constant_up": 2.0}
 SHOWN = ("motor_constant", "inertia_xx", "inertia_yy", "time_constant_up", "time_constant_down")
@@ -70,7 +74,7 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
     start = with_values(flown, {n: truth[n] * factor for n, factor in WRONG.items()})
     path = log_file(simulation, tmp_path / "log00", order=(1, 3, 4, 2))
     settings = settings_for(path, with_values(start, {"actuator_latency": 0.0}))
-    (flight,) = without_pose(settings)
+    ((flight,), _) = without_pose(settings)
     assert flight.flying[0][1] > 13.0
     fitted = fit_without_pose(settings, [flight], out=tmp_path / "run")
     result = fitted.result.coefficients
@@ -95,7 +99,7 @@ def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tm
     truth = values_of(flown)
     wrong = {name: 9.0 * truth[name] for name in ("inertia_xx", "inertia_yy", "inertia_zz")}
     settings = settings_for(log_file(simulation, tmp_path / "log00"), with_values(flown, wrong))
-    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert best["inertia_xx"] == pytest.approx(truth["inertia_xx"], rel=0.1)
     assert best["inertia_zz"] == pytest.approx(truth["inertia_zz"], rel=0.1)  # the proportion's
@@ -108,7 +112,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
     shape = TrajectorySettings(name="lemniscate", radius=1.0, omega=1.0, speed_scale=4.0)
     simulation = next(iter(simulate(trimmed, ControllerFile(), shape, duration=14.0, rate=400.0)))
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
-    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     best = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     for name, truth in {"torque_trim_x": moment, "torque_trim_y": -2.0 * moment}.items():
         assert best[name] == pytest.approx(truth, rel=0.1), name
@@ -117,7 +121,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
         assert least_noticed(name, flown) < 0.1 * moment
         assert least_noticed(name, flown.replace(mass=1e-3)) < 1e-3 * moment
     # the file that leaves the trims out foretells the body rate worse
-    (flight,) = without_pose(settings)
+    ((flight,), _) = without_pose(settings)
     stretches = stretches_of(flight.series, flight.flying)
     foretold = rate_errors(stretches, flown, read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert foretold.fitted < 0.5 * foretold.initial
@@ -129,7 +133,7 @@ def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeyp
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
     wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
     monkeypatch.setattr("tuner.job.inertial.vehicle_of", lambda *_: wrong)
-    fitted = fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
     assert worse.level == "warning"
     assert worse.numbers["after"] > worse.numbers["before"]
@@ -139,9 +143,9 @@ def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeyp
 def test_a_heavier_vehicle_scales_thrust_and_inertia_alike(simulation, flown, tmp_path):
     path = log_file(simulation, tmp_path / "log00")
     settings = settings_for(path, flown)
-    light = fit_without_pose(settings, without_pose(settings), out=tmp_path / "light")
+    light = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "light")
     settings = settings_for(path, flown.replace(mass=2.0 * flown.mass))
-    heavy = fit_without_pose(settings, without_pose(settings), out=tmp_path / "heavy")
+    heavy = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "heavy")
     for name in ("motor_constant", "inertia_xx", "inertia_yy"):
         pair = [run.result.coefficients[name].best for run in (light, heavy)]
         assert pair[1] / pair[0] == pytest.approx(2.0, rel=1e-6), name
@@ -153,7 +157,7 @@ def test_commands_of_other_motors_are_refused_in_one_line(simulation, flown, tmp
     settings = settings_for(path, flown)
     # the map lists m1, m3, m4, m2: the rotors from front right on are now m3, m1, m2, m4
     with pytest.raises(RecordingError, match="2, 1, 4 and 3 of the columns that the topic map"):
-        fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+        fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -162,7 +166,7 @@ def test_rotors_that_spin_the_other_way_are_noticed(simulation, flown, tmp_path)
     mirrored = replace(simulation, signals={**simulation.signals, "body_rate": rate})
     settings = settings_for(log_file(mirrored, tmp_path / "log00"), flown)
     with pytest.raises(RecordingError, match=r"(?s)yaw.*spins"):
-        fit_without_pose(settings, without_pose(settings), out=tmp_path / "run")
+        fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
 
 
 def test_a_log_on_the_ground_is_refused(tmp_path):
@@ -172,3 +176,41 @@ def test_a_log_on_the_ground_is_refused(tmp_path):
     columns |= {f"motor.m{i}": ("I", nothing) for i in range(1, 5)}
     with pytest.raises(RecordingError, match="the motors only idle"):
         read_inertial(log_of(time, columns, tmp_path / "log00"))
+
+
+def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
+    simulation, flown, tmp_path
+):
+    fitted = log_file(simulation, tmp_path / "log00")
+    held_out = log_file(simulation, tmp_path / "log01")
+    mixed_up = log_file(simulation, tmp_path / "log02", order=(3, 1, 2, 4))
+    still = np.zeros(2000)
+    columns = {f"{kind}.{axis}": ("f", still) for kind in ("gyro", "acc") for axis in "xyz"}
+    columns |= {f"motor.m{i}": ("I", still) for i in range(1, 5)}
+    on_ground = log_of(np.arange(2000) / 400, columns, tmp_path / "log03")
+    paths = [str(path) for path in (on_ground, fitted, held_out, mixed_up)]
+    start = with_values(flown, {"inertia_xx": 0.7 * values_of(flown)["inertia_xx"]})
+    settings = settle(Options(paths, vehicle=start, holdout=["log01"]))
+    flights, left_out = without_pose(settings)
+    assert [flight.name for flight in flights] == ["log00", "log01", "log02"]
+    run = fit_without_pose(settings, flights, left_out=left_out, out=tmp_path / "run")
+    assert [m.experiment for m in run.measurements] == ["log00"]
+    left = [f for f in run.result.findings if f.code is Code.LEFT_OUT]
+    assert [finding.subject for finding in left] == ["log03", "log02"]
+    assert "of the columns that the topic map lists" in one_line(left[1])
+    (foretold,) = [f for f in run.result.findings if f.subject == "log01"]
+    assert foretold.numbers["after"] < foretold.numbers["before"]
+    with pytest.raises(RecordingError, match="the motors only idle"):
+        without_pose(settle(Options([str(on_ground)], vehicle=flown)))
+    with pytest.raises(InputError, match="holds out all flights that can be used"):
+        fit_without_pose(settings, flights[1:2], out=tmp_path / "run")
+
+
+def test_beside_flights_with_a_pose_those_without_one_are_left_out(simulation, flown, tmp_path):
+    bare, posed = log_file(simulation, tmp_path / "log00"), FLIGHTS / "circle_4mps.bag"
+    settings = settle(Options([str(bare), str(posed)], vehicle=flown, holdout=[]))
+    assert without_pose(settings) == ((), ())
+    usable, (left_out,) = read_usable(settings)
+    assert [recording.flight.name for recording in usable] == ["circle_4mps"]
+    assert left_out.subject == "log00"
+    assert "by themselves" in one_line(left_out)

@@ -72,6 +72,15 @@ def test_what_is_left_of_corrupt_commands_is_no_slow_log(flight, bag):
     assert recording.inlet == "actuator"
 
 
+def test_a_pose_that_is_logged_too_seldom_is_not_called_a_lack_of_commands(flight, bag):
+    seldom = dict(flight.series)
+    for name in ("position", "attitude"):
+        kept = slice(None, None, round(flight.series[name].rate / 7.0))
+        seldom[name] = Series(seldom[name].time[kept], seldom[name].values[kept])
+    with pytest.raises(RecordingError, match=r"a continuous pose in 100 %.*log the pose at 16 Hz"):
+        recordings_of(settings_for(bag), [replace(flight, series=seldom)])
+
+
 def test_a_flight_whose_every_command_is_corrupt_is_said_to_be(flight, bag):
     signals = {name: rows for name, rows in flight.signals.items() if name != "command"}
     note = Note(NoteCode.OUT_OF_RANGE, "info", "motor", 4221, names=("command",))

@@ -92,6 +92,12 @@ MADE = {
         "a",
         {"before": 7.6, "after": 8.2, "hold": 1.8, "seconds": 0.5},
     ),
+    Code.RATE_FORETOLD: Finding(
+        Code.RATE_FORETOLD,
+        "info",
+        "a",
+        {"before": 7.6, "after": 5.2, "hold": 1.8, "seconds": 0.5},
+    ),
     Code.RATE_NOT_FORETOLD: Finding(
         Code.RATE_NOT_FORETOLD,
         "info",
