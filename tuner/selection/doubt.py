@@ -17,8 +17,8 @@ standard deviation): below the smaller of the two it is as good as absent."""
 SIZES = 40
 """Sizes that are looked at, from the smallest to the usual one, equally far apart in logarithm."""
 FLAT = 1e-10
-"""Share of a group's information that every direction is taken to have at least: what is less is
-rounding, and leaves it to the prior."""
+"""Share of a group's information, and of its prior's, that every direction is taken to have at
+least: what is less is rounding, and leaves it to the prior."""
 
 
 def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array:
@@ -96,7 +96,7 @@ class Evidence:
         along = np.vstack([follow, np.eye(len(group))]) * usual
         known = left * np.outer(usual, usual) - np.eye(len(group))  # by the flights alone
         values, vectors = np.linalg.eigh(0.5 * (known + known.T))
-        inverse = (vectors / np.maximum(values, FLAT * values[-1])) @ vectors.T
+        inverse = (vectors / np.maximum(values, FLAT * max(values[-1], 1.0))) @ vectors.T
         spread = along.T @ meat @ along + known / stretches.count
         covariance = inverse @ spread @ inverse
         variance, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))

@@ -150,3 +150,11 @@ def test_groups_add_up_as_squares(fits):
     one, both = in_doubt(linear, MODEL, [TERM])[0], in_doubt(linear, MODEL, [TERM, TERM])[0]
     assert both == pytest.approx(np.sqrt(2.0) * one)
     assert in_doubt(linear, MODEL, [])[0] == 0.0
+
+
+@pytest.mark.parametrize("said", [0.0, 1e-30])
+def test_a_term_of_which_the_flights_say_nothing_changes_nothing(said):
+    linear, _ = flown(np.random.default_rng(4))
+    mute = np.diag([1.0, np.sqrt(said)])
+    linear = replace(linear, hessian=mute @ linear.hessian @ mute, score=linear.score @ mute)
+    assert in_doubt(linear, MODEL, [TERM]) == pytest.approx([0.0, 0.0], abs=1e-9)
