@@ -195,7 +195,7 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
     if flight_settings is not None:
         inlet = flight_settings.inlet or inlet
         offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
-    if is_stale(flight):
+    if is_stale(flight.series, flight.notes):
         raise RecordingError(
             flight.path,
             "its attitude stops changing while the vehicle moves on, too soon for a flight",

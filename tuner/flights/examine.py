@@ -38,6 +38,7 @@ from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Recording, Samples, Topic
 from tuner.flights.resample import resample
 from tuner.flights.sidecar import Sidecar, read_sidecar
+from tuner.flights.stale import is_stale
 from tuner.flights.sync import pose_offset
 from tuner.flights.topics import TopicMap
 
@@ -105,13 +106,15 @@ def _without_flight(recording: Recording, problem: RecordingError) -> Inspection
 
 def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
-    measured = _columns(content.series)
+    measured, stale = _columns(content.series), is_stale(content.series, content.notes)
+    if stale:
+        del measured["attitude"]
     return replace(
         _with_signals(content),
         problem=None if missions else "nothing flies in it: no mission was found",
         missions=missions,
         inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
-        coefficients=informed(content.series, measured, missions),
+        coefficients=() if stale else informed(content.series, measured, missions),
         clock=_clock(content),
         notes=content.notes,
     )

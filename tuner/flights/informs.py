@@ -31,6 +31,8 @@ _NEEDS: Mapping[str, Sequence[str]] = {
     "rotor_speed": (*_POSE, "rotor_speed"),
     "attitude": _POSE,
 }
+_WRENCH = ("commanded_thrust", "commanded_torque")
+"""What a vehicle file's arms and curve turn into motor commands where none were recorded."""
 _DRIVES = ("rotor_speed", "command", "thrust_setpoint")
 """Of which the attitude inlet needs one: what turns the rotors."""
 
@@ -45,6 +47,8 @@ def inlets(measured: Mapping[str, tuple[int, ...]], *, trajectory: bool) -> tupl
     trajectory
         Whether the trajectory is named, which stands for a recorded reference.
     """
+    if all(name in measured for name in _WRENCH):
+        measured = {"command": (0, 1, 2, 3), **measured}
     available = []
     for name, needs in _NEEDS.items():
         missing = [need for need in needs if need not in measured]

@@ -7,11 +7,11 @@ bit although the vehicle moves on. One at rest repeats itself too, and is left a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tuner.flights.flight import Flight, Series
+from tuner.flights.flight import Series
 from tuner.flights.notes import Note, NoteCode
 
 LASTS = 1.0
@@ -48,8 +48,8 @@ def _moves(position: Series, since: float) -> bool:
     return len(places) > 0 and bool(np.ptp(places, axis=0).max() >= MOVED)
 
 
-def is_stale(flight: Flight) -> bool:
-    """Return whether a flight's attitude repeats itself at its end while the vehicle moves."""
-    last = flight.series["attitude"].values[-2:]
-    noted = any(n.code is NoteCode.STALE and "attitude" in n.names for n in flight.notes)
+def is_stale(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:
+    """Return whether a recorded attitude repeats itself at its end while the vehicle moves."""
+    last = series["attitude"].values[-2:]
+    noted = any(n.code is NoteCode.STALE and "attitude" in n.names for n in notes)
     return noted and bool((last[-1] == last[0]).all())

@@ -55,6 +55,8 @@ class Linear:
         Half the robust sum of squares of all flights.
     seen
         (S, L) which columns each stretch sees; None where all see all.
+    around
+        How many of the last columns say what surrounds one flight each.
     """
 
     scaled: Array
@@ -67,6 +69,12 @@ class Linear:
     section: NDArray[np.intp]
     loss: float
     seen: NDArray[np.intp] | None = None
+    around: int = 0
+
+    @property
+    def flights(self) -> int:
+        """How many flights there are."""
+        return len(np.unique(self.flight))
 
     @property
     def columns(self) -> NDArray[np.intp]:
@@ -76,7 +84,9 @@ class Linear:
         return np.broadcast_to(np.arange(len(self.scaled)), self.score.shape)
 
     def sees_alike(self, group: Columns) -> bool:
-        """Return whether every stretch sees all columns of a group."""
+        """Return whether a group is of the vehicle: every flight's stretches see its columns."""
+        if self.flights == 1:
+            return bool((group < len(self.scaled) - self.around).all())
         return self.seen is None or bool(np.isin(group, np.intersect1d(*self.seen[[0, -1]])).all())
 
     def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
@@ -305,6 +315,7 @@ def linear_of(
         section=section[flown],
         loss=loss,
         seen=seen if around else None,
+        around=around * flights,
     )
 
 

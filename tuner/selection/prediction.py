@@ -1,4 +1,7 @@
-"""How well fits to the other flights predict each flight: one linear step, then a simulation."""
+"""How well fits to the other flights predict each flight: one linear step, then a simulation.
+
+A flight that is alone is predicted section by section, by fits to its other sections.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,8 @@ def predicted_losses(
     """Return the loss (N,) of each flight with the coefficients that the others ask for.
 
     One linear step leads from the joint fit to the fit without the flight; there the flight is
-    simulated. Its own offsets follow.
+    simulated. Its own offsets follow. A flight that is alone is simulated with the joint fit; what
+    its sections lose by fits without them is the linear approximation's.
 
     Parameters
     ----------
@@ -41,8 +45,11 @@ def predicted_losses(
     objective, criterion = fitted.objective, replace(fitted.criterion, scale=dict(scale))
     space, flight = objective.space, np.asarray(objective.segments.flight)
     movable, vectors = offsets_fitted(fitted), []
+    alone = objective.flights == 1
     for number in range(objective.flights):
-        change = linear.step(model, inside=linear.flight != number)[own]
+        change = np.zeros(len(own))
+        if not alone:
+            change = linear.step(model, inside=linear.flight != number)[own]
         vectors.append(vector_after(space, fitted.point.coefficients, change))
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
     points = Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets))
@@ -53,7 +60,15 @@ def predicted_losses(
         inside = flight == number
         loss = float(np.asarray(sums.loss)[inside].sum())
         losses.append(loss - _gain_of_offsets(sums, inside, len(space), movable[:, number]))
-    return np.array(losses)
+    return np.array(losses) * (lost_by_sections(linear, model) if alone else 1.0)
+
+
+def lost_by_sections(linear: Linear, model: Columns) -> float:
+    """Return the loss of sections by fits without them, over that of the fit to all."""
+    lost = 0.0
+    for out in linear.folds(linear.section):
+        lost += float(linear.change_of_loss(linear.step(model, inside=~out))[out].sum())
+    return 1.0 + lost / linear.loss
 
 
 def vector_after(space: Space, vector: Array, change: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -83,6 +83,8 @@ def score(
     the flight's own do, and flights count alike however strongly each shows it. It has to differ
     between flights by more than gusts would let it (`chance_of_gusts`).
 
+    Of a flight that is alone sections are left out, too: it has to predict itself in time.
+
     Where sections, or no flights for sure, speak for a group, a gust during one manoeuvre might do
     what it would; so the stretches that scatter most are all that chance is judged by. What a
     recorded signal says a gust does not know.
@@ -117,12 +119,13 @@ def score(
     alone, with_group = _steps(linear, columns, (without, begin), everything)
     fit = _Gain.of(linear, alone, with_group, everything)
     by_flight, inside = linear.sees_alike(group), neutral is not None
-    folds = linear.flight if by_flight else linear.section
+    across = by_flight and linear.flights > 1
+    folds = linear.flight if across else linear.section
     held_out = _held_out(linear, columns, (without, begin), folds)
     reason, patience = SelectionCode.PREDICTS_FLIGHTS, SURE if inside else 1.0
     if by_flight and inside:
         held_out = held_out.with_flights_apart(linear.flight)
-    if not by_flight:
+    if not across:
         held_out = held_out.with_flights_alike(linear.flight)
         reason = SelectionCode.PREDICTS_SECTIONS
     elif not held_out.is_sure and held_out.share > -patience * held_out.scatter:

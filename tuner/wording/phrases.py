@@ -12,7 +12,7 @@ def listed(words: Sequence[str]) -> str:
 
 def percent(share: float) -> str:
     """Return a share as a percentage, of two digits below one hundred percent."""
-    return f"{100 * share:.2g} %" if share < 1 else f"{100 * share:.0f} %"
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def quantity(value: float, unit: str | None) -> str:

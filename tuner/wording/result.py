@@ -142,7 +142,7 @@ def _reason(term: LostTerm, entry: Callable[[Coefficient], Written | NotCarried 
 _REASONS = {
     SelectionCode.PREDICTS_FLIGHTS: "flights left out of the fit are predicted better with it",
     SelectionCode.PREDICTS_SECTIONS: "sections of flights left out of the fit are predicted better "
-    "with it; no single flight is by the others",
+    "with it, where no flight is by others",
     SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
     "of the fit contradicts it",
     SelectionCode.ASKED_FOR: "the job file names it",

@@ -15,6 +15,7 @@ from rich.console import Console
 from tests.tuner.flights import making
 from tuner.coefficients import COEFFICIENTS
 from tuner.flights import Inspection, inspect_recordings
+from tuner.flights.informs import inlets
 from tuner.flights.inspection import as_json
 from tuner.flights.inspection_table import render
 
@@ -132,3 +133,12 @@ def test_second_time_needs_neither_numpy_nor_jax() -> None:
     assert "jax" not in words[0]
     assert "pandas" not in words[0]
     assert words[1] == "7 []\n"
+
+
+def test_commanded_thrust_and_torque_stand_for_the_motor_commands() -> None:
+    wrench = {"commanded_thrust": (0,), "commanded_torque": (0, 1, 2)}
+    pose = {"position": (0, 1, 2), "attitude": (0, 1, 2, 3)}
+    fed = {inlet.name for inlet in inlets(pose | wrench, trajectory=False) if not inlet.missing}
+    assert fed == {"actuator", "attitude"}
+    (actuator,) = (i for i in inlets(pose, trajectory=False) if i.name == "actuator")
+    assert actuator.missing == ("command",)

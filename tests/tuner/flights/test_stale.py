@@ -5,6 +5,7 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.errors import RecordingError
+from tuner.flights import inspect_recordings
 from tuner.flights.flight import Series
 from tuner.flights.load import load_flight
 from tuner.flights.mission import find_missions
@@ -65,11 +66,16 @@ def written(path, stops: float):
 
 def test_a_flight_of_which_too_little_is_left_is_read_but_not_fitted(tmp_path) -> None:
     short = written(tmp_path / "short.csv", 1.0)
+    longer = written(tmp_path / "longer.csv", 6.0)
     settings = settle(Options([short.path], vehicle="crazyflie"))
     with pytest.raises(RecordingError, match="its attitude stops changing"):
         recordings_of(settings, [short])
     assert short.duration == pytest.approx(TIME[-1], abs=0.02)
-    assert is_stale(short)
-    longer = written(tmp_path / "longer.csv", 6.0)
+    assert is_stale(short.series, short.notes)
+    ((looked_at, then), _) = inspect_recordings([short.path, tmp_path / "longer.csv"], cache=False)
+    assert all("attitude" in inlet.missing for inlet in looked_at.inlets)
+    assert looked_at.coefficients == ()
     assert longer.duration == pytest.approx(6.0, abs=0.02)
-    assert not is_stale(longer)
+    assert not is_stale(longer.series, longer.notes)
+    assert not any("attitude" in inlet.missing for inlet in then.inlets)
+    assert then.coefficients

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.selection.linear import Linear
+from tuner.selection.prediction import lost_by_sections
 from tuner.selection.score import Score, _Gain, score, surviving
 from tuner.selection.table import SelectionCode
 
@@ -150,6 +151,57 @@ def test_a_term_that_one_flight_alone_shows_is_predicted_by_sections():
     linear = linear_fit(0.5, shown_by=1)
     found = score(linear, MODEL, FIRST, candidates=1)
     assert found.reason is SelectionCode.PREDICTS_SECTIONS
+
+
+def alone(linear, number=0):
+    """Return the loss of one flight of some, without the others."""
+    own = linear.flight == number
+    seen = None if linear.seen is None else linear.seen[own]
+    parts = {name: getattr(linear, name)[own] for name in ("hessian", "score", "section")}
+    return replace(linear, **parts, flight=linear.flight[own], seen=seen, loss=linear.loss / 4)
+
+
+def test_a_flight_that_is_alone_predicts_itself_section_by_section():
+    found = score(alone(linear_fit(0.5)), MODEL, FIRST, candidates=14)
+    assert found.reason is SelectionCode.PREDICTS_SECTIONS
+    assert found.gain_holdout == pytest.approx(found.gain_fit, rel=0.2)
+    both = np.concatenate([MODEL, FIRST])
+    inside = score(
+        moved_to_minimum(alone(linear_fit(0.5)), both),
+        MODEL,
+        FIRST,
+        candidates=14,
+        neutral=np.zeros(4),
+    )
+    assert inside.reason is SelectionCode.PREDICTS_SECTIONS
+
+
+@pytest.mark.parametrize("given", [{}, {"correlated": True}, {"gusts": True}])
+def test_a_flight_that_is_alone_is_bought_a_term_no_more_often_than_chance_is_let(given):
+    both, bought = np.concatenate([MODEL, FIRST]), []
+    for seed in range(200):
+        linear = alone(linear_fit(0.0, seed=seed, **given))
+        after = moved_to_minimum(linear, both)
+        found = score(linear, MODEL, FIRST, candidates=1)
+        stayed = score(after, MODEL, FIRST, candidates=1, neutral=np.zeros(4))
+        bought.append((found.earns_place, stayed.earns_place))
+    assert np.mean(bought) <= 0.01
+
+
+def test_what_surrounds_a_flight_that_is_alone_has_to_stand_out_from_its_gusts(monkeypatch):
+    """Its column is no term of the vehicle's, though all stretches see it."""
+    own = replace(alone(by_flight(linear_fit(0.5), 1)), around=FLIGHTS)
+    group = np.array([3])
+    assert score(own, MODEL, group, candidates=1).reason is SelectionCode.PREDICTS_SECTIONS
+    monkeypatch.setattr("tuner.selection.score.chance_of_gusts", lambda *_: 0.5)
+    assert score(own, MODEL, group, candidates=1).reason is SelectionCode.NOT_SIGNIFICANT
+
+
+def test_sections_of_a_flight_that_is_alone_are_met_worse_by_fits_without_them():
+    linear = alone(linear_fit(0.0))
+    fitted = moved_to_minimum(linear, np.concatenate([MODEL, FIRST]))
+    lost = [lost_by_sections(fitted, free) for free in (MODEL, np.concatenate([MODEL, FIRST]))]
+    assert 1.0 < lost[0] < lost[1] < 1.1
 
 
 def test_a_term_that_a_coefficient_of_the_model_copies_is_not_distinguished():
