@@ -30,6 +30,7 @@ class Code(StrEnum):
     MOTOR_ORDER = "motor_order"  # names: the recorded columns, from 1, in the vehicle's order
     SPINS_REVERSED = "spins_reversed"
     SETPOINTS_SCALED = "setpoints_scaled"  # gain, correlation; names: the axis, the law guessed
+    SETPOINTS_LATE = "setpoints_late"  # seconds
     SETPOINTS_BIASED = "setpoints_biased"  # bias (rad/s); names: the axis
     SETPOINTS_FOREIGN = "setpoints_foreign"  # axis -> correlation
     HEADING_FLOWN = "heading_flown"  # correlation

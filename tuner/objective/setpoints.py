@@ -42,6 +42,8 @@ ALIKE = 0.5
 """Correlation below which recorded set-points are not those of the controller file."""
 FACTOR = 1.4
 """Ratio of recorded to computed set-points beyond which a gain or law is doubted."""
+LATE = 0.04
+"""s of delay that are worth a word: twice what cameras, network and estimator usually take."""
 OFF = 0.05
 """rad/s of steady difference that is worth a word."""
 MOVES = 0.05
@@ -73,9 +75,18 @@ class AxisMatch:
 
 @dataclass(frozen=True)
 class SetpointMatch:
-    """The axes of a flight: roll, pitch, yaw."""
+    """How the recorded rate set-points of a flight stand to the computed ones.
 
-    axes: tuple[AxisMatch, AxisMatch, AxisMatch]
+    Attributes
+    ----------
+    axes
+        Roll, pitch, yaw.
+    late
+        s, age of the recorded state that they answer, as roll and pitch show it.
+    """
+
+    axes: tuple[AxisMatch, ...]
+    late: float
 
     @property
     def is_ours(self) -> bool:
@@ -104,16 +115,17 @@ def match_setpoints(flight: Flight, controller: ControllerFile) -> SetpointMatch
         return None
     chosen = np.linspace(0, inside.sum() - 1, POINTS).astype(np.intp)
     time, wanted = recorded.time[inside][chosen], recorded.values[inside][chosen]
-    by_latency = (
-        tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3))
-        for computed in _computed(flight, controller, time)
+    matches = (
+        SetpointMatch(
+            tuple(_axis(wanted[:, i], computed[:, i]) for i in range(3)), late=float(latency)
+        )
+        for latency, computed in zip(LATENCIES, _computed(flight, controller, time), strict=True)
     )
-    roll, pitch, yaw = max(by_latency, key=lambda axes: axes[0].correlation + axes[1].correlation)
-    return SetpointMatch((roll, pitch, yaw))
+    return max(matches, key=lambda match: match.axes[0].correlation + match.axes[1].correlation)
 
 
 def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Finding, ...]:
-    """Return which axes of a flight were commanded with another gain, bias or heading."""
+    """Return which axes of a flight were commanded with another gain, delay, bias or heading."""
     match = match_setpoints(flight, controller)
     if match is None:
         return ()
@@ -134,6 +146,9 @@ def setpoint_findings(flight: Flight, controller: ControllerFile) -> tuple[Findi
         elif abs(axis.bias) > OFF:
             numbers = {"bias": round(axis.bias, 3)}
             findings.append(Finding(Code.SETPOINTS_BIASED, "info", flight.name, numbers, (name,)))
+    if match.late > LATE and max(axis.spread for axis in match.axes[:2]) > MOVES:
+        numbers = {"seconds": match.late}
+        findings.append(Finding(Code.SETPOINTS_LATE, "info", flight.name, numbers))
     if not match.heading_is_ours:
         numbers = {"correlation": round(match.axes[2].correlation, 2)}
         findings.append(Finding(Code.HEADING_FLOWN, "warning", flight.name, numbers))

@@ -165,6 +165,13 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "The recorded {first} rate set-points are {bias:+.3f} rad/s off the controller file's.",
         "",
     ),
+    Code.SETPOINTS_LATE: (
+        (
+            "The recorded rate set-points are those of the controller file to a state that is "
+            "{milliseconds:.0f} ms old: a slow estimator, a filter or late stamps lie between."
+        ),
+        "Check the stamps of pose and set-points; the fit takes it for estimate_latency.",
+    ),
     Code.HEADING_FLOWN: (
         (
             "The recorded yaw rate set-points do not follow from the controller file (correlation "

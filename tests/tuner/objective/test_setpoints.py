@@ -61,6 +61,20 @@ def test_a_gain_and_a_bias_are_told_apart(flight):
     assert finding.numbers["bias"] == pytest.approx(0.2, abs=0.01)
 
 
+def test_set_points_that_answer_an_old_state_are_said_to(flight):
+    prompt = match_setpoints(flight, OURS).late
+    assert prompt < 0.03
+    series = dict(flight.series)
+    for name in ("position", "velocity", "attitude"):
+        if name in series:
+            series[name] = Series(series[name].time - 0.048, series[name].values)
+    held_back = replace(flight, series=series)
+    assert match_setpoints(held_back, OURS).late == pytest.approx(prompt + 0.048, abs=0.005)
+    (finding,) = setpoint_findings(held_back, OURS)
+    assert finding.code is Code.SETPOINTS_LATE
+    assert "ms old" in one_line(finding)
+
+
 def test_set_points_of_another_controller_enter_below_the_reference(flight):
     foreign = with_setpoints(flight, lambda values: values[::-1] * [1.0, -1.0, 1.0])
     choice = choose_inlet(foreign, "auto", None, OURS)

@@ -75,6 +75,7 @@ MADE = {
         ("roll", "rotation_matrix"),
     ),
     Code.SETPOINTS_BIASED: Finding(Code.SETPOINTS_BIASED, "info", "a", {"bias": 0.08}, ("pitch",)),
+    Code.SETPOINTS_LATE: Finding(Code.SETPOINTS_LATE, "info", "a", {"seconds": 0.06}),
     Code.SETPOINTS_FOREIGN: Finding(
         Code.SETPOINTS_FOREIGN, "warning", "a", {"roll": 0.1, "pitch": 0.2}
     ),
