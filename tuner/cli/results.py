@@ -25,7 +25,8 @@ NOT_SIMULATED = "–"
 
 
 def print_run(folder: Path, result: RunResult) -> None:
-    """Print the coefficients, the RMSE before and after, and where everything lies."""
+    """Print the coefficients, the RMSE before and after, what to log, and where everything lies."""
+    from tuner.wording.proposals import next_log_in_words
     from tuner.wording.result import ending_sentence, refits_in_words, starts_in_words
 
     screen = console()
@@ -42,6 +43,8 @@ def print_run(folder: Path, result: RunResult) -> None:
         screen.print(line, markup=False)
     if any(flight.predicted_best for flight in result.flights):
         screen.print(_predictions(result))
+    for line in next_log_in_words(result.next_log):
+        screen.print(line, markup=False)
     search = result.search
     screen.print(
         f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "

@@ -1,7 +1,8 @@
-"""Tables of a run: what is not simulated is no crash."""
+"""Tables of a run: what is not simulated is no crash; what to log next time is said."""
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.cli.results import print_run
+from tuner.design.log_proposal import LogProposal
 from tuner.result import AxesRmse, PredictedErrors
 from tuner.wording.result import starts_in_words
 
@@ -25,8 +26,14 @@ def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811
     fell = run.result.flights[0].model_copy(
         update={"name": "fell", "horizon": 1.0, "rmse_best": crashed, "rmse_fitted_starts": crashed}
     )
-    print_run(run.folder, run.result.model_copy(update={"flights": (followed, fell)}))
-    lines = capsys.readouterr().out.splitlines()
+    tachometer = LogProposal(
+        signal="rotor_speed", change="added", rate=100.0, noise=6.0, shrinks={"motor_constant": 0.5}
+    )
+    update = {"flights": (followed, fell), "next_log": (tachometer,)}
+    print_run(run.folder, run.result.model_copy(update=update))
+    out = capsys.readouterr().out
+    assert "Log the rotor speed, at 100 Hz and good to 6 rad/s: it would halve" in out
+    lines = out.splitlines()
     rows = [line.split() for line in lines if line.split()[:1] == ["followed"] and "–" in line]
     assert [row.count("–") for row in rows] == [3, 2]  # attitude; attitude and body rate
     assert not any("crash" in cell for row in rows for cell in row)
