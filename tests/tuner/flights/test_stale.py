@@ -46,6 +46,16 @@ def test_a_vehicle_at_rest_and_a_moment_without_change_are_left_alone(stops, mov
     assert find_missions(kept)[0].end == pytest.approx(TIME[-1])
 
 
+def test_a_last_pose_that_is_sent_for_good_is_no_pose_while_the_gyro_turns() -> None:
+    signals = flight(6.0, moves=False)
+    turning = np.column_stack([0.4 * np.cos(TIME), 0.4 * np.sin(TIME), 0 * TIME])
+    kept, (note,) = without_stale(signals | {"body_rate": Series(TIME, turning)})
+    assert note.names == ("attitude",)
+    assert find_missions(kept)[0].end == pytest.approx(6.0, abs=0.015)
+    noise = np.random.default_rng(2).normal(0.0, 0.02, (len(TIME), 3))
+    assert without_stale(signals | {"body_rate": Series(TIME, noise)})[1] == []
+
+
 @pytest.mark.parametrize("lost", [np.s_[:300], np.s_[:]])
 def test_where_no_position_is_seen_nothing_is_taken_for_motion(lost) -> None:
     signals = flight(6.0, moves=True)
