@@ -25,7 +25,7 @@ class Code(StrEnum):
     WRONG_VEHICLE = "wrong_vehicle"  # lift, weight (N), mass (kg)
     CANNOT_HOVER = "cannot_hover"  # idle, full, weight (N), mass (kg)
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
-    INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal
+    INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
     ATTITUDE_FOLLOWED = "attitude_followed"  # names: the inlet that it could have entered through
     MOTOR_ORDER = "motor_order"  # names: the recorded columns, from 1, in the vehicle's order
     SPINS_REVERSED = "spins_reversed"

@@ -13,6 +13,7 @@ from tuner.flights.flight import Flight
 from tuner.flights.notes import NoteCode
 from tuner.objective.explained import Explained, Source, explained
 from tuner.objective.inlets import INLETS
+from tuner.objective.motor_order import motor_order
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 
 EXPLAINS = 0.15
@@ -79,21 +80,25 @@ def choose_inlet(
             continue
         told = explained(flight, vehicle, source)
         if told is None or told.tilting >= EXPLAINS:
-            return Choice(name, None if doubt is None else _finding(flight, name, doubt))
+            return Choice(name, None if doubt is None else _finding(flight, name, doubt, vehicle))
         doubt = doubt or told
     assert doubt is not None
     if not INLETS["attitude"].can_be_fed(flight):
         return Choice(first)
-    return Choice("attitude", _finding(flight, "attitude", doubt))
+    return Choice("attitude", _finding(flight, "attitude", doubt, vehicle))
 
 
-def _finding(flight: Flight, inlet: InletName, doubt: Explained) -> Finding:
+def _finding(flight: Flight, inlet: InletName, doubt: Explained, vehicle: VehicleFile) -> Finding:
+    """Return why a flight enters further down, and whether its motors are in another order."""
     numbers = {
         "correlation": round(doubt.tilting, 2) + 0.0,
         "recorded": round(doubt.rate),
         "gyro": round(doubt.gyro_rate),
     }
-    return Finding(Code.INLET_CHOSEN, "info", flight.name, numbers, (inlet, doubt.source))
+    span = (0.0, flight.duration)
+    order = motor_order(flight.series, vehicle, doubt.source, span)
+    why = () if order is None or order.is_right else ("order",)
+    return Finding(Code.INLET_CHOSEN, "info", flight.name, numbers, (inlet, doubt.source, *why))
 
 
 def inlet_for(flight: Flight, requested: str) -> InletName:

@@ -44,17 +44,24 @@ def salvaged(finding: Finding) -> str:
 
 def inlet_chosen(finding: Finding) -> str:
     """Return why a flight enters further down the loop than it was recorded for."""
-    inlet, signal = finding.names
+    inlet, signal, *order = finding.names
     what = signal.replace("_", " ")
     followed = {
         "attitude": "its recorded attitude is followed and only its translation simulated",
         "rotor_speed": "it is simulated from its rotor speeds",
     }[inlet]
+    read = " in the order in which it is read" if order else ""
     return (
         f"The {what}, logged at {finding.numbers['recorded']:.0f} Hz, does not explain how the "
-        f"vehicle turned (correlation {finding.numbers['correlation']:.2f} with its angular "
+        f"vehicle turned{read} (correlation {finding.numbers['correlation']:.2f} with its angular "
         f"acceleration), so that {followed}."
     )
+
+
+def inlet_remedy(finding: Finding) -> str:
+    """Return what to log; nothing where the motors' order is the cause, which has its own line."""
+    _, signal, *order = finding.names
+    return "" if order else f"Log the {signal.replace('_', ' ')} as often as its loop runs."
 
 
 def setpoints_scaled(finding: Finding) -> str:

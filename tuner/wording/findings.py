@@ -269,7 +269,7 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         composed.flight_unmatched,
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     ),
-    Code.INLET_CHOSEN: (composed.inlet_chosen, "Log the {last} as often as its loop runs."),
+    Code.INLET_CHOSEN: (composed.inlet_chosen, composed.inlet_remedy),
     Code.ATTITUDE_FOLLOWED: (
         (
             "The recorded attitude of all fitted flights is followed, so that nothing is fitted of "

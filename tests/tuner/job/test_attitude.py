@@ -15,6 +15,7 @@ from tuner.job.prepare import job_of
 from tuner.job.search import search
 from tuner.objective.choice import choose_inlet
 from tuner.objective.inlets import TURNING
+from tuner.objective.motor_order import MotorOrder
 from tuner.recordings import read_usable, recordings_of
 from tuner.wording.findings import one_line
 
@@ -80,6 +81,7 @@ def test_auto_follows_the_attitude_where_commands_explain_no_turn(sparse, update
     line = one_line(choice.because)
     assert "command, logged at 45 Hz, does not explain how the vehicle turned" in line
     assert "its recorded attitude is followed" in line
+    assert line.endswith("Log the command as often as its loop runs.")
     assert choose_inlet(sparse, "actuator", updated, ControllerFile()).inlet == "actuator"
 
 
@@ -96,6 +98,23 @@ def dense(full_flight):
 def test_auto_keeps_commands_that_explain_the_turns(dense, updated):
     assert choose_inlet(dense, "auto", updated, ControllerFile()).because is None
     assert choose_inlet(dense, "auto", updated, ControllerFile()).inlet == "actuator"
+
+
+def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, updated, monkeypatch):
+    seen = MotorOrder((1, 0, 3, 2), reversed_spins=None)
+    monkeypatch.setattr("tuner.objective.choice.motor_order", lambda *_: seen)
+    command = dense.series["command"]
+    turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
+    choice = choose_inlet(
+        replace(dense, series={**dense.series, "command": turned}),
+        "auto",
+        updated,
+        ControllerFile(),
+    )
+    assert choice.inlet == "attitude"
+    line = one_line(choice.because)
+    assert "turned in the order in which it is read (correlation" in line
+    assert "Log the" not in line
 
 
 def test_thrust_drag_and_battery_come_back_from_a_sparse_log(sparse, updated, full_bag, tmp_path):
