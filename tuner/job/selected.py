@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
+import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from tuner.job.prepare import Job
+from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.selection.candidates import Groups
 from tuner.selection.linear import Linear
@@ -67,3 +70,12 @@ class Standing:
         """Coefficient -> number of the search vector."""
         names, numbers = self.fitted.objective.space.names, self.fitted.point.coefficients
         return dict(zip(names, np.asarray(numbers).tolist(), strict=True))
+
+
+def offsets_of(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
+    """Return a fit's offsets, without some, as the rows of another problem of the same flights."""
+    rows = np.asarray(fitted.point.offsets)
+    known = dict(zip(fitted.objective.of_flight, rows, strict=True))
+    known = {name: row for name, row in known.items() if name not in gone}
+    nothing = np.zeros(rows.shape[1])
+    return jnp.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))

@@ -26,7 +26,7 @@ from tuner.job.findings import findings_at
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
 from tuner.job.search import OnProgress, free_offsets
-from tuner.job.selected import Selected, Standing
+from tuner.job.selected import Selected, Standing, offsets_of
 from tuner.model import with_coefficients
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import Objective, with_conditions
@@ -37,7 +37,9 @@ from tuner.selection.candidates import (
     Groups,
     coefficients_in,
     conditions_in,
+    groups_in,
     is_stand_in,
+    names_in,
     reads_recording,
     start_of,
     with_terms,
@@ -45,6 +47,7 @@ from tuner.selection.candidates import (
 from tuner.selection.doubt import in_doubt
 from tuner.selection.linear import linear_at
 from tuner.selection.prediction import predicted_losses, vector_after
+from tuner.selection.rows import row_of
 from tuner.selection.score import Score, score, surviving
 from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.wording.phrases import listed
@@ -102,7 +105,7 @@ class Selection:
             state.fitted,
             objective=with_feedback(fitted.objective, feedback_of(state.fitted.objective)),
             outcomes=fitted.outcomes,
-            point=Point(jnp.asarray(vector), _offsets(state.fitted, fitted.objective)),
+            point=Point(jnp.asarray(vector), offsets_of(state.fitted, fitted.objective)),
         )
         said = findings_at(self.job, self.fitted)
         others = [finding for finding in fitted.findings if finding not in said]
@@ -113,7 +116,7 @@ class Selection:
 
     def _in_doubt(self, state: Standing, rows: Sequence[SelectionRow]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
-        names = [*self.job.space.names, *_names(state.added)]
+        names = [*self.job.space.names, *names_in(state.added)]
         outside = [
             self._columns(row.names)
             for row in rows
@@ -200,11 +203,11 @@ class Selection:
         them astray.
         """
         space, linear = state.fitted.objective.space, state.linear
-        gone = self._columns(_names({name: self.candidates[name] for name in taken}))
+        gone = self._columns(names_in({name: self.candidates[name] for name in taken}))
         kept = {name: names for name, names in state.added.items() if name not in taken}
         away = np.zeros(len(linear.scaled))
         away[gone] = (self._neutral - linear.scaled)[gone]
-        free = self._columns([*self.job.space.names, *_names(kept)])
+        free = self._columns([*self.job.space.names, *names_in(kept)])
         everything = np.ones(len(linear.flight), bool)
         change = linear.step(free, inside=everything, from_=away)
         of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
@@ -237,7 +240,7 @@ class Selection:
         from_here = replace(
             state.fitted,
             objective=objective,
-            point=Point(jnp.asarray(vector), _offsets(state.fitted, objective, gone=idle)),
+            point=Point(jnp.asarray(vector), offsets_of(state.fitted, objective, gone=idle)),
         )
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
@@ -276,7 +279,7 @@ class Selection:
         )
         start = np.asarray(point.coefficients)
         vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
-        at = Point(jnp.asarray(vector), _offsets(fitted, objective))
+        at = Point(jnp.asarray(vector), offsets_of(fitted, objective))
         linear = linear_at(
             objective,
             at,
@@ -333,7 +336,7 @@ class Selection:
         others = {name: names for name, names in state.added.items() if name != group}
         return score(
             state.linear,
-            self._columns([*self.job.space.names, *_names(others)]),
+            self._columns([*self.job.space.names, *names_in(others)]),
             self._columns(self.candidates[group]),
             candidates=len(self.candidates),
             neutral=self._neutral if group in state.added else None,
@@ -347,18 +350,27 @@ class Selection:
         groups = dict.fromkeys([*state.added, *self.candidates])
         scores = {group: self._score(state, group) for group in groups}
         rows = [
-            SelectionRow(
-                group=group,
-                names=self.candidates[group],
-                gain_fit=found.gain_fit,
-                gain_holdout=found.gain_holdout,
-                scatter=found.scatter,
-                kept=group in state.added,
-                reason=found.reason if group in state.added else dropped.get(group, found.reason),
-            )
+            row_of(group, self.candidates[group], found, kept=True)
+            if group in state.added
+            else row_of(group, self.candidates[group], found, dropped.get(group), kept=False)
             for group, found in scores.items()
         ]
+        rows += [
+            row_of(group, names, self._worth(state, names), SelectionCode.OPEN_LOOP, kept=True)
+            for group, names in groups_in(self.job.space, self.job.first_terms).items()
+        ]
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
+
+    def _worth(self, state: Standing, names: Sequence[str]) -> Score:
+        """Return what a group of the base model is worth beside all else in the model."""
+        others = [name for name in self.job.space.names if name not in names]
+        return score(
+            state.linear,
+            self._columns([*others, *names_in(state.added)]),
+            self._columns(names),
+            candidates=len(self.candidates),
+            neutral=self._neutral,
+        )
 
     def _predicts_better(self, trial: Standing, state: Standing, *, by_flight: bool) -> bool:
         """Return whether a refit predicts flights left out better than the fit before it.
@@ -374,7 +386,7 @@ class Selection:
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
     def _predicted(self, state: Standing, scale: Mapping[str, Array]) -> NDArray[np.float64]:
-        model = self._columns([*self.job.space.names, *_names(state.added)])
+        model = self._columns([*self.job.space.names, *names_in(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
 
@@ -382,17 +394,3 @@ class Selection:
 def _no_gust(state: Standing, group: str) -> bool:
     """Return whether no gust can pass for a group: it reads a recording, or noise alone is left."""
     return reads_recording(group) or state.fitted.leaves_noise_alone
-
-
-def _offsets(fitted: Fitted, objective: Objective, *, gone: Collection[str] = ()) -> Array:
-    """Return a fit's offsets, without some, as the rows of another problem of the same flights."""
-    rows = np.asarray(fitted.point.offsets)
-    known = dict(zip(fitted.objective.of_flight, rows, strict=True))
-    known = {name: row for name, row in known.items() if name not in gone}
-    nothing = np.zeros(rows.shape[1])
-    return jnp.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))
-
-
-def _names(groups: Groups) -> tuple[str, ...]:
-    """Return the coefficients of some groups."""
-    return tuple(name for names in groups.values() for name in names)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -46,6 +46,20 @@ def groups_around(objective: Objective, *, closed_loop: bool) -> Groups:
         for group, names in groups.items()
         if not set(names).intersection(objective.conditions)
     }
+
+
+def groups_in(space: Space, others: Collection[str]) -> Groups:
+    """Return the groups of terms that are wholly free, but for others."""
+    return {
+        group: names
+        for group, names in term_groups().items()
+        if group not in others and set(names) <= set(space.free)
+    }
+
+
+def names_in(groups: Groups) -> tuple[str, ...]:
+    """Return all that some groups hold: coefficients, and what surrounds each flight."""
+    return tuple(name for names in groups.values() for name in names)
 
 
 def coefficients_in(groups: Groups) -> tuple[str, ...]:

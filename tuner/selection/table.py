@@ -21,6 +21,8 @@ class SelectionCode(StrEnum):
     """Kept: chance does not explain what it is worth, and nothing left out contradicts it."""
     ASKED_FOR = "asked_for"
     """Kept: the job file names it."""
+    OPEN_LOOP = "open_loop"
+    """Kept: inputs are fed in below the loop that would hide it."""
     HOVERS_TILTED = "hovers_tilted"
     """Kept: every recording shows a hover that is not level, so the markers sit at an angle."""
     NOT_SIGNIFICANT = "not_significant"

@@ -146,6 +146,8 @@ _REASONS = {
     SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
     "of the fit contradicts it",
     SelectionCode.ASKED_FOR: "the job file names it",
+    SelectionCode.OPEN_LOOP: "it is from the beginning: inputs are fed in below the loop that "
+    "would hide it",
     SelectionCode.HOVERS_TILTED: "every recording shows a hover that is not level",
     SelectionCode.NOT_SIGNIFICANT: "residuals that are correlated in time gain as much from chance",
     SelectionCode.IMMATERIAL: "it lowers the loss by less than simulators of one vehicle differ",

@@ -14,10 +14,13 @@ from tuner.job import selection, terms
 from tuner.job.selected import Standing
 from tuner.job.terms import with_terms_selected
 from tuner.objective.criterion import units_of
+from tuner.selection.score import Score
 from tuner.selection.table import SelectionCode
 from tuner.uncertainty.estimates import uncertainty_of
+from tuner.wording.result import selection_in_words
 
 DRAG = 0.03
+LINEAR = "linear_drag"
 
 
 def selected(drag, *, seed=0, job=None, around=None):
@@ -137,6 +140,29 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
 
 
 @pytest.mark.slow
+def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_they_are_worth(
+    monkeypatch,
+):
+    worth = Score(0.4, 0.3, 0.1, 0.5, SelectionCode.NOT_SIGNIFICANT)
+    monkeypatch.setattr(selection, "score", lambda *_, **__: worth)
+    monkeypatch.setattr(selection.Selection, "_neutral", None)
+    monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
+    drag, tilt = (tuple(f"{name}_{axis}" for axis in "xyz") for name in (LINEAR, "marker_tilt"))
+    names = (*BASE_IN_ORDER, *drag, *tilt, "angular_drag_x")
+    job = SimpleNamespace(
+        space=SimpleNamespace(names=names, free=names), first_terms={"marker_tilt": tilt}
+    )
+    standing = Standing(SimpleNamespace(leaves_noise_alone=False), {}, None)
+    groups = {"fuselage_drag": ("fuselage_drag",)}
+    rows = selection.Selection(job, None, groups, print, print)._rows(standing, {})
+    assert [(row.group, row.kept, row.reason) for row in rows] == [
+        (LINEAR, True, SelectionCode.OPEN_LOOP),
+        ("fuselage_drag", False, SelectionCode.NOT_SIGNIFICANT),
+    ]
+    assert (rows[0].names, rows[0].gain_fit, rows[0].gain_holdout) == (drag, 0.4, 0.3)
+    assert selection_in_words(rows) == f"Added to Gazebo's motor model: {LINEAR}."
+
+
 def test_a_job_that_wants_no_terms_gets_none():
     for job in (JobFile(terms="none"), JobFile(free=BASE)):
         without = with_terms_selected(

@@ -1,0 +1,26 @@
+"""A row of a selection's table, from what a group is worth."""
+
+from __future__ import annotations
+
+from tuner.selection.score import Score
+from tuner.selection.table import SelectionCode, SelectionRow
+
+
+def row_of(
+    group: str,
+    names: tuple[str, ...],
+    found: Score,
+    reason: SelectionCode | None = None,
+    *,
+    kept: bool,
+) -> SelectionRow:
+    """Return the row of a group; its reason is the score's unless another is known."""
+    return SelectionRow(
+        group=group,
+        names=names,
+        gain_fit=found.gain_fit,
+        gain_holdout=found.gain_holdout,
+        scatter=found.scatter,
+        kept=kept,
+        reason=reason or found.reason,
+    )
