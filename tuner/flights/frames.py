@@ -163,7 +163,8 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     here = mismatch(gyro)
     best = min(_RATES, key=lambda r: mismatch(r.read(gyro)))
     there = mismatch(best.read(gyro))
-    if there < 0.7 and there < here / 2:
+    of_another_unit = there < here / 20 and alike(turning, best.read(gyro)) > GOOD
+    if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
     return None, doubt if here > 0.9 else None

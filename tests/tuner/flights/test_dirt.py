@@ -14,6 +14,8 @@ from tests.tuner.flights import making
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights import Flight, load_flight, load_flights
 from tuner.flights.damage import Cause
+from tuner.flights.flight import Series
+from tuner.flights.frames import correct_frames
 from tuner.flights.notes import Note, NoteCode
 from tuner.trajectory_settings import TrajectorySettings
 from tuner.wording.notes import damage_sentence
@@ -314,3 +316,25 @@ def test_side_car_names_the_trajectory_and_the_mission(short: Path, tmp_path: Pa
     with pytest.raises(ConfigError, match=r"no trajectory 'cirlce'.*one of circle, ") as caught:
         build(TrajectorySettings, misnamed, "side.yaml")
     assert "\n" not in str(caught.value)
+
+
+def test_degrees_per_second_are_noticed_however_noisy_the_gyro() -> None:
+    time = np.arange(0.0, 20.0, 0.01)
+    half = 0.15 * np.sin(2.0 * time)
+    attitude = np.column_stack([np.cos(half), np.sin(half), 0.0 * half, 0.0 * half])
+    turning = np.column_stack([0.6 * np.cos(2.0 * time), 0.0 * time, 0.0 * time])
+    noise = np.random.default_rng(1).normal(0.0, [1.0, 0.1, 0.1], turning.shape)
+    series = {
+        "position": Series(time, np.zeros((len(time), 3))),
+        "attitude": Series(time, attitude),
+        "body_rate": Series(time, np.degrees(turning + noise)),
+    }
+    read, (note,) = correct_frames(series, {})
+    assert (note.code, note.names) == (
+        NoteCode.FRAME_TURNED,
+        ("body_rate", "in degrees per second"),
+    )
+    np.testing.assert_allclose(read["body_rate"].values, turning + noise)
+    unlike = Series(time, np.degrees(noise[::-1]) * 5.0)
+    _, (*_, note) = correct_frames({**series, "body_rate": unlike}, {})
+    assert note.code is NoteCode.BODY_RATE_DOUBTED
