@@ -170,7 +170,7 @@ def ranked_set(kind: Kind, seed: int) -> Ranked:
     while flown is None:
         truth = drawn(objective.space, random)
         flown = recorded(objective, truth, random, gusts=kind.gusts)
-    found = fitted(flown)
+    found = fitted(flown.objective)
     error = uncertainty_of(found).covariance.error
     space = objective.space
     true, best = (np.asarray(space.scaled(jnp.asarray(v))) for v in (truth, _vector(found)))
@@ -194,7 +194,7 @@ def reference_job() -> Job:
 
 
 @lru_cache(maxsize=2)
-def problem(*, terms: bool, more: tuple[str, ...] = ()) -> Objective:
+def problem(*, terms: bool, more: tuple[str, ...] = (), narrowed: float = NARROWED) -> Objective:
     """Return the reference flights' problem with the prior of the truths.
 
     With terms, these are `TERMS` and ``more``. A spin is held level: nothing else holds a vehicle
@@ -207,7 +207,7 @@ def problem(*, terms: bool, more: tuple[str, ...] = ()) -> Objective:
         objective = replace(objective, model=with_terms_computed(objective.model, names))
         start = objective.start(objective.space.initial)
         objective, _ = with_terms(objective, start, names, job.settings.job)
-    parameters = [replace(p, prior_sd=NARROWED * p.prior_sd) for p in objective.space.parameters]
+    parameters = [replace(p, prior_sd=narrowed * p.prior_sd) for p in objective.space.parameters]
     inlet = objective.segments.inlet
     held = replace(inlet, level_held=inlet.spins)
     return replace(

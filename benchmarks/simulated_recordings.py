@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,12 +14,47 @@ from scipy.spatial.transform import Rotation
 from benchmarks.air import air
 from sim_jax.disturbance import Disturbance
 from sim_jax.rollout import rollout
+from sim_jax.state import Setpoints
+from tuner.filter_error.recorded import SETPOINTS
+from tuner.flights.flight import Flight, Series
 from tuner.model import Model
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Trace, beginning_of, simulated_at_stamps, trace_of
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Flown:
+    """Flights of a problem.
+
+    Attributes
+    ----------
+    objective
+        The problem with what was recorded of them.
+    setpoints
+        What asked for their body rates (3, samples, F) and thrust.
+    """
+
+    objective: Objective
+    setpoints: Setpoints
+
+    def with_setpoints(self, flights: Sequence[Flight]) -> list[Flight]:
+        """Return flights, in the order of the segments, whose recorded set-points are these."""
+        schedule = self.objective.schedule
+        every = schedule.log_rate // schedule.position_control_rate
+        stamps = np.arange(0, self.objective.samples, every) / schedule.log_rate
+        table = np.asarray(
+            jnp.concatenate([self.setpoints.rate.stacked(), self.setpoints.thrust[None]])
+        )
+        again = []
+        for number, flight in enumerate(flights):
+            rows = table[:, ::every, number].T
+            parts = zip(SETPOINTS, (rows[:, :3], rows[:, 3:]), strict=True)
+            series = {name: Series(stamps, values) for name, values in parts}
+            again.append(replace(flight, series={**flight.series, **series}))
+        return again
 
 
 def recorded(
@@ -28,7 +64,7 @@ def recorded(
     *,
     gusts: bool,
     log_voltage: Array | None = None,
-) -> Objective | None:
+) -> Flown | None:
     """Return a problem with recordings of its flights at a truth, stamped and noisy as its own.
 
     Parameters
@@ -46,7 +82,7 @@ def recorded(
 
     Returns
     -------
-    Objective or None
+    Flown or None
         None where a flight crashed.
     """
     model = objective.tunable.at(jnp.asarray(vector))
@@ -55,7 +91,7 @@ def recorded(
     if log_voltage is not None:
         segments = replace(objective.segments, log_voltage=jnp.asarray(log_voltage))
         flown = replace(objective, segments=segments)
-    trace = _flown(model, flown, pushing)
+    trace, setpoints = _flown(model, flown, pushing)
     if bool(jnp.isfinite(trace.crash_time).any()):
         return None
     still = jnp.zeros((len(OFFSETS), objective.segments.count))
@@ -66,7 +102,8 @@ def recorded(
         noise = random.normal(size=known.shape) / np.where(known > 0.0, known, np.inf)
         noisy = _turned(np.asarray(clean), noise) if channel == "attitude" else clean + noise
         measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
-    return replace(objective, segments=replace(objective.segments, measured=measured))
+    segments = replace(objective.segments, measured=measured)
+    return Flown(replace(objective, segments=segments), setpoints)
 
 
 def _air(objective: Objective, model: Model, random: np.random.Generator) -> Disturbance:
@@ -85,7 +122,9 @@ def _air(objective: Objective, model: Model, random: np.random.Generator) -> Dis
 
 
 @eqx.filter_jit
-def _flown(model: Model, objective: Objective, pushing: Disturbance | None) -> Trace:
+def _flown(
+    model: Model, objective: Objective, pushing: Disturbance | None
+) -> tuple[Trace, Setpoints]:
     segments = objective.segments
     start, inlet, around = beginning_of(model, segments, objective.schedule)
     flown = rollout(
@@ -98,7 +137,7 @@ def _flown(model: Model, objective: Objective, pushing: Disturbance | None) -> T
         environment=replace(around, disturbance=pushing),
         limits=objective.limits,
     )
-    return trace_of(flown, model, segments)
+    return trace_of(flown, model, segments), flown.log.setpoints
 
 
 def _turned(attitude: Array, by: Array) -> Array:

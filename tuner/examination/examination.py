@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.filter_error.predictor import Predictor
+from tuner.filter_error.predictor import Predictor, with_hidden
 from tuner.objective.alternatives import residuals_at
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
@@ -94,7 +94,7 @@ def examine(
     full_problem = full_problem_of(fitted.objective, fitted.point)
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
     reference = references(objective.space, np.asarray(point.coefficients))
-    informations, sensitivities = [], []
+    informations, sensitivities, predicted = [], [], []
     residuals: list[Residual] = []
     for flights in portions(objective, point, criterion):
         batch = portion(objective, point, criterion, flights)
@@ -106,16 +106,22 @@ def examine(
             )
             for name, other in otherwise.items()
         }
-        informations.append(
-            information_from_jacobian(*batch, jacobian, otherwise=moved)
-            if predictor is None
-            else predictor.among(flights).information(*batch, jacobian)
-        )
+        if predictor is not None:
+            predicted.append(predictor.among(flights).information(*batch))
+        compared = jacobian if predictor is None else jacobian.of(predictor.rows)
+        informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
         sensitivities.append(
             local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
         )
         residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
     information = FisherInformation.joined(informations)
+    if predicted:
+        information = with_hidden(
+            FisherInformation.joined(predicted),
+            information,
+            objective.space.names,
+            len(full_problem.fitted),
+        )
     if in_doubt:
         moves = [in_doubt.get(name, 0.0) for name in objective.space.names]
         information = replace(information, in_doubt=np.array(moves))

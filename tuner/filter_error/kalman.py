@@ -1,8 +1,8 @@
 """A simulation that recorded samples correct, as a Kalman filter does.
 
 At each tick the samples since the one before correct motion, rotor speeds, the controller's memory
-and the disturbances. `gains` linearises the loop about the corrected simulation and propagates its
-covariance (extended Kalman filter); `innovations` flies with gains that are given, so that its
+and the disturbances. `filtered` linearises the loop about the corrected simulation and propagates
+its covariance (extended Kalman filter); `innovations` flies with gains that are given, so that its
 derivative is that of a simulation: a predictor of fixed structure (Ljung 1999, 7.2).
 
 Innovations are whitened: with S = L Lᵀ their covariance, L⁻¹ times them is white and of unit
@@ -69,6 +69,24 @@ class Gains(eqx.Module):
     whitens: Float[Array, "T m m F"]
 
 
+class Filtered(eqx.Module):
+    """What a filter makes of recordings.
+
+    Attributes
+    ----------
+    gains
+        On every tick.
+    white
+        (T, m, F) whitened innovations.
+    loss
+        (F,) negative log-likelihood of each segment, but for a constant.
+    """
+
+    gains: Gains
+    white: Float[Array, "T m F"]
+    loss: Float[Array, " F"]
+
+
 def _linearised(function: Callable[[Array], tuple[Array, T]], at: Array) -> tuple[T, Array]:
     """Return what a function returns beside its value, and the value's derivatives.
 
@@ -115,27 +133,23 @@ def _shortly_delayed(simulator: Simulator, expected: Expected) -> tuple[Simulato
     return replace(simulator, schedule=short), count
 
 
-def gains_of(
-    simulator: Simulator, feed: Feed, expected: Expected, ticks: int
-) -> tuple[Gains, NDArray[np.float64]]:
-    """Return the Kalman gains, and each segment's (F,) negative log-likelihood.
+def filtered(simulator: Simulator, feed: Feed, expected: Expected, ticks: int) -> Filtered:
+    """Return the Kalman gains, the innovations, and how likely they are.
 
     Parameters
     ----------
     simulator, feed, expected
         What flies, the recordings, and what is taken for true.
     ticks
-        Up to which the likelihood counts and gains are computed; they are zero beyond.
+        Up to which is filtered; gains and innovations are zero beyond.
     """
     short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
-    return _gains(short, in_flight)(feed, expected, np.asarray(ticks))
+    return _filter(short, in_flight)(feed, expected, np.asarray(ticks))
 
 
 @lru_cache(maxsize=4)
-def _gains(
-    simulator: Simulator, in_flight: int
-) -> Callable[..., tuple[Gains, NDArray[np.float64]]]:
-    def segmentwise(feed: Feed, expected: Expected, ticks: Array) -> tuple[Gains, Array]:
+def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
+    def segmentwise(feed: Feed, expected: Expected, ticks: Array) -> Filtered:
         observer, first = Observer.of(simulator, feed, expected)
         noise, first_sd = expected.noise, first_errors(first, in_flight)
         processes = observer.processes
@@ -167,10 +181,10 @@ def _gains(
             scatter = jnp.log(jnp.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
             kept = jax.tree.map(
                 lambda rows, row: lax.dynamic_update_index_in_dim(
-                    rows, jnp.moveaxis(row, 0, -1).astype(rows.dtype), number, 0
+                    rows, row.astype(rows.dtype), number, 0
                 ),
                 kept,
-                Gains(gain, whitens),
+                (jnp.moveaxis(gain, 0, -1), jnp.moveaxis(whitens, 0, -1), white),
             )
             change = -jnp.einsum("fik,kf->if", gain, jnp.clip(white, -GATE, GATE))
             state, pushed = (
@@ -198,9 +212,9 @@ def _gains(
                 kept,
             )
 
-        empty = Gains(
-            jnp.zeros((total, size, wide, segments), jnp.float32),
-            jnp.zeros((total, wide, wide, segments), jnp.float32),
+        empty = tuple(
+            jnp.zeros((total, *shape, segments), jnp.float32)
+            for shape in ((size, wide), (wide, wide), (wide,))
         )
         begin = (
             first,
@@ -210,10 +224,10 @@ def _gains(
             jnp.zeros(segments),
             empty,
         )
-        *_, loss, kept = lax.fori_loop(0, ticks, tick, begin)
-        return kept, loss
+        *_, loss, (gain, whitens, white) = lax.fori_loop(0, ticks, tick, begin)
+        return Filtered(Gains(gain, whitens), white, loss)
 
-    return over_devices(segmentwise, name=("observer's gains", simulator, in_flight))
+    return over_devices(segmentwise, name=("filter", simulator, in_flight))
 
 
 def innovations(
@@ -224,7 +238,7 @@ def innovations(
     Parameters
     ----------
     simulator, feed, expected
-        As of `gains_of`.
+        As of `filtered`.
     gains
         Of the observer.
     directions

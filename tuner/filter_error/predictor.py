@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
-from tuner.filter_error.kalman import GATE, Gains, gains_of, innovations
+from tuner.filter_error.kalman import GATE, Filtered, Gains, filtered, innovations
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
-from tuner.filter_error.strengths import likeliest
+from tuner.filter_error.strengths import Likelihood, likeliest
 from tuner.flights.flight import Flight
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.inlets import INLETS
@@ -27,10 +27,8 @@ from tuner.uncertainty.information import FisherInformation, information_from_ja
 
 Array = NDArray[np.float64]
 
-AT_ONCE = 8
+AT_ONCE = 24
 """Parameters by which is differentiated at a time."""
-LEARNT_FROM = 6.0
-"""s of each flight from which strengths are estimated."""
 LOST = 0.05
 """Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
 NUMBERS = 57
@@ -108,20 +106,31 @@ class Predictor:
             noise=dict.fromkeys(channels, 1.0),
         )
 
-    def learnt(self, objective: Objective, point: Point) -> Predictor:
-        """Return the predictor with the strengths, noise and gains that fit a point."""
-        some = min(round(LEARNT_FROM * float(objective.schedule.log_rate)), self.ticks)
+    def learnt(self, objective: Objective, point: Point, seconds: float) -> Predictor:
+        """Return the predictor with the strengths, noise and gains that fit a point.
 
-        def loss(strengths: Array) -> float:
-            return float(np.sum(self._gains(objective, point, strengths, some)[1]))
+        Strengths are learnt from so many s of each flight, from those that are known on.
+        """
+        some = min(round(seconds * float(objective.schedule.log_rate)), self.ticks)
 
-        learnt = replace(self, strengths=likeliest(loss)).at(objective, point)
-        noise = {}
+        def likelihood(strengths: Array) -> Likelihood:
+            found = self._filtered(objective, point, strengths, some)
+            white, whitens = (
+                np.moveaxis(np.asarray(rows[:some], float), -1, 1)
+                for rows in (found.white, found.gains.whitens)
+            )
+            wide = white.shape[-1]
+            return Likelihood(
+                float(np.sum(found.loss)), white.reshape(-1, wide), whitens.reshape(-1, wide, wide)
+            )
+
+        learnt = replace(self, strengths=likeliest(likelihood, self.strengths)).at(objective, point)
+        noise = dict(self.noise)
         for name, error in learnt.jacobian(objective, point, ()).residuals.items():
             known = np.abs(np.asarray(error)[np.asarray(error) != 0.0])
             spread = 1.4826 * float(np.median(known)) if len(known) else 1.0
-            noise[name] = spread if spread > NOISIER else 1.0
-        if all(factor == 1.0 for factor in noise.values()):
+            noise[name] *= spread if spread > NOISIER else 1.0
+        if noise == self.noise:
             return learnt
         return replace(learnt, noise=noise).at(objective, point)
 
@@ -138,8 +147,8 @@ class Predictor:
 
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor with the gains of a point."""
-        gains, _ = self._gains(objective, point, self.strengths, self.ticks)
-        return replace(self, feed=self._fed(point), gains=gains)
+        found = self._filtered(objective, point, self.strengths, self.ticks)
+        return replace(self, feed=self._fed(point), gains=found.gains)
 
     @property
     def ticks(self) -> int:
@@ -152,11 +161,11 @@ class Predictor:
         flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
         return self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize
 
-    def _gains(
+    def _filtered(
         self, objective: Objective, point: Point, strengths: Array, ticks: int
-    ) -> tuple[Gains, Array]:
+    ) -> Filtered:
         noisy = replace(self, strengths=strengths)
-        return gains_of(self.simulator, self._fed(point), noisy._expected(objective, point), ticks)
+        return filtered(self.simulator, self._fed(point), noisy._expected(objective, point), ticks)
 
     def _fed(self, point: Point) -> Feed:
         return replace(self.feed, offsets=jnp.asarray(point.offsets))
@@ -178,49 +187,20 @@ class Predictor:
         return replace(self, feed=feed, gains=gains, rows=rows)
 
     def information(
-        self,
-        objective: Objective,
-        point: Point,
-        criterion: Criterion,
-        simulated: Jacobian,
+        self, objective: Objective, point: Point, criterion: Criterion
     ) -> FisherInformation:
-        """Return what the innovations say of all coefficients.
+        """Return what the innovations of these flights say at a point, see `with_hidden`.
 
-        Of those that position control hides, what the closed loop's simulation says while the
-        others are known.
-
-        Parameters
-        ----------
-        objective, point, criterion
-            The problem of these flights, and where it is examined.
-        simulated
-            Its Jacobian there.
+        Its criterion gives no scales: innovations are whitened.
         """
-        upstream = hidden(objective.space.names)
-        moved = np.flatnonzero(~upstream)
+        moved = np.flatnonzero(~hidden(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.feed.offsets)
-        predicted = information_from_jacobian(
+        return information_from_jacobian(
             objective,
             own,
             unscaled(criterion),
             self.jacobian(objective, own, [*moved, *offsets]),
-        )
-        looped = information_from_jacobian(
-            objective,
-            point,
-            criterion,
-            replace(
-                simulated,
-                residuals={name: simulated.residuals[name] for name in self.rows},
-                columns={name: simulated.columns[name] for name in self.rows},
-            ),
-        )
-        both = np.outer(upstream, upstream)
-        return replace(
-            predicted,
-            blocks=predicted.blocks + np.where(both, looped.blocks, 0.0),
-            score=predicted.score + np.where(upstream, looped.score, 0.0),
         )
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
@@ -250,6 +230,36 @@ class Predictor:
 def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
     """Return (K,) which coefficients recorded set-points hide: what lies upstream of them."""
     return np.isin(names, INLETS["body_rate"].bypasses)
+
+
+def with_hidden(
+    predicted: FisherInformation, looped: FisherInformation, names: Sequence[str], fitted: int
+) -> FisherInformation:
+    """Return what innovations say, and of what set-points hide what least squares said of it.
+
+    That is what it said while all others were estimated too: given what the filter says of these,
+    gusts would scatter it more (no noise model knows them there).
+
+    Parameters
+    ----------
+    predicted, looped
+        Of innovations, and of the closed loop's simulation, in the same channels.
+    names, fitted
+        Of the K coefficients, of which the first were fitted.
+    """
+    upstream = hidden(names)
+    others = np.flatnonzero(~upstream[:fitted])
+    upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
+    clear = np.eye(len(names))
+    clear[np.ix_(np.flatnonzero(upstream), others)] = -np.linalg.solve(
+        looped.total[np.ix_(others, others)], upper
+    ).T
+    blocks = clear @ looped.blocks @ clear.T
+    return replace(
+        predicted,
+        blocks=predicted.blocks + np.where(np.outer(upstream, upstream), blocks, 0.0),
+        score=predicted.score + np.where(upstream, looped.score @ clear.T, 0.0),
+    )
 
 
 def unscaled(criterion: Criterion) -> Criterion:

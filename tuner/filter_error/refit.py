@@ -1,6 +1,7 @@
 """The coefficients that predict best: Gauss-Newton on whitened innovations.
 
-Gains, and the ticks at which samples are taken, stay while a point is descended to, then follow it.
+Strengths of the disturbances, gains, and the ticks at which samples are taken stay while a point is
+descended to, then follow it.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from tuner.search.normal_equations import normal_equations
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FOLLOWED = 2
-"""Times that gains follow the point."""
+LEARNT_FROM = (6.0, 18.0)
+"""s of each flight from which strengths are learnt, each time before a descent: at first roughly,
+what least squares leaves of the disturbances in its coefficients is still in them."""
 STEPS = 3
 """Of Gauss and Newton with gains that stay, at most."""
 HALVINGS = 3
@@ -43,7 +45,7 @@ def with_least_innovations(
     Parameters
     ----------
     predictor, flights
-        The predictor of N flights: what it has to learn, it learns first.
+        The predictor of N flights.
     problem
         With the point where the descent begins, and its criterion.
     free
@@ -51,8 +53,8 @@ def with_least_innovations(
     """
     objective, point, criterion = problem
     point = Point(point.coefficients, predictor.feed.offsets)
-    predictor = predictor.learnt(objective, point)
-    for _ in range(FOLLOWED):
+    for seconds in LEARNT_FROM:
+        predictor = predictor.learnt(objective, point, seconds)
         point = _descended(predictor, objective, point, unscaled(criterion), free)
         laid = Predictor.of(objective, point, flights)
         assert laid is not None

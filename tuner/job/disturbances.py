@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import replace
-from types import MappingProxyType
 
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import NDArray
 
+from tuner.coefficients import conditions
 from tuner.examination.examination import Examination, examine
 from tuner.filter_error.predictor import Predictor, hidden
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
 from tuner.filter_error.refit import with_least_innovations
 from tuner.findings import Code, Finding
+from tuner.job.extension import extended
 from tuner.job.holding import with_undetermined_held
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
@@ -24,6 +27,8 @@ from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
+from tuner.selection.doubt import in_doubt
+from tuner.selection.linear import linear_of
 from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
@@ -41,30 +46,27 @@ def examined(
 
     And how well each coefficient is known.
     """
-    fit = selected.job, selected.fitted, on_progress, on_message
     with span("disturbances"):
-        followed = with_disturbances(*fit, in_doubt=selected.in_doubt)
+        followed = with_disturbances(selected, on_progress, on_message)
     on_message("Examining how well each coefficient is known.")
     with span("examination"):
-        return followed or with_undetermined_held(*fit, in_doubt=selected.in_doubt)
+        return followed or with_undetermined_held(
+            selected.job, selected.fitted, on_progress, on_message, in_doubt=selected.in_doubt
+        )
 
 
 def with_disturbances(
-    job: Job,
-    fitted: Fitted,
+    selected: Selected,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
-    *,
-    in_doubt: Mapping[str, float] = MappingProxyType({}),
 ) -> tuple[Fitted, Examination] | None:
     """Return the fit in which what pushed the flights is estimated too, and its examination.
-
-    ``in_doubt`` is as for `tuner.examination.examination.examine`.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
     set-points were not recorded, where flights are too many or too long, where a filter loses them,
     where nothing would be known better, and where the two fits contradict each other.
     """
+    job, fitted = selected.job, selected.fitted
     asked = job.settings.job.disturbances
     follows = asked == "follow" or (asked == "auto" and candidates_of(job))
     if fitted.leaves_noise_alone or not fitted.polished or not follows:
@@ -91,8 +93,8 @@ def with_disturbances(
     again = polished(
         job,
         replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)),
-        free=Free((moves & hidden(names))[:count], offsets),
-        title="what set-points hide",
+        free=Free(np.zeros(count, bool), offsets),
+        title="clocks",
         on_progress=lambda progress: on_progress(job, progress),
         stages=1,
     )
@@ -101,12 +103,39 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    examination = examine(again, predictor=predictor, in_doubt=in_doubt)
-    before = examine(fitted, in_doubt=in_doubt)
+    doubt = _in_doubt(selected, again, predictor)
+    examination = examine(again, predictor=predictor, in_doubt=doubt)
+    before = examine(fitted, in_doubt=selected.in_doubt)
     if not _agree(examination.uncertainty, before.uncertainty):
         on_message("It contradicts the fit of the simulated flights, which is kept.")
         return None
     return (again, examination) if _is_sharper(examination, before) else None
+
+
+def _in_doubt(selected: Selected, again: Fitted, predictor: Predictor) -> dict[str, float]:
+    """Return how far coefficients would move with terms that were left out, by the innovations.
+
+    Of what set-points hide, by least squares. A steady wind is a disturbance like others.
+    """
+    groups = [names for names in selected.left_out if not set(names) & set(conditions())]
+    if not groups:
+        return dict(selected.in_doubt)
+    _, wide = extended(selected.job, again, [name for names in groups for name in names])
+    space, at = wide.objective.space, wide.point.coefficients
+    beside = replace(predictor, simulator=wide.objective.simulator)
+    information = beside.information(wide.objective, wide.point, again.criterion)
+    scaled = np.asarray(space.scaled(jnp.asarray(at)))
+    linear = linear_of(information, scaled, space.prior_mean, 0.0)
+
+    def columns(names: Collection[str]) -> NDArray[np.intp]:
+        return np.flatnonzero(np.isin(space.names, list(names)))
+
+    held = set(again.held.values())
+    seen = ~hidden(again.objective.space.names)
+    known = [n for n, there in zip(again.objective.space.names, seen, strict=True) if there]
+    model = columns([name for name in known if name not in held])
+    moves = in_doubt(linear, model, [columns(names) for names in groups])
+    return {**selected.in_doubt, **{space.names[i]: float(moves[i]) for i in model}}
 
 
 def _agree(new: Uncertainty, old: Uncertainty) -> bool:

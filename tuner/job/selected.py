@@ -34,6 +34,15 @@ class Selected:
     rows: tuple[SelectionRow, ...] = ()
     in_doubt: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def left_out(self) -> tuple[tuple[str, ...], ...]:
+        """Names of each group that was tried and not kept, if the flights say anything of it."""
+        return tuple(
+            row.names
+            for row in self.rows
+            if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
+        )
+
     def rows_given(self, held: Mapping[str, str]) -> tuple[SelectionRow, ...]:
         """Return the table once coefficients are held: a term that was chosen and is, is out.
 

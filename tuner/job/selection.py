@@ -112,16 +112,13 @@ class Selection:
         fitted = replace(fitted, findings=(*others, *findings_at(job, fitted)))
         rows = self._rows(state, dropped)
         fitted = fitted if state.added else self.fitted
-        return Selected(job, fitted, rows, self._in_doubt(state, rows))
+        selected = Selected(job, fitted, rows)
+        return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
 
-    def _in_doubt(self, state: Standing, rows: Sequence[SelectionRow]) -> dict[str, float]:
+    def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
         names = [*self.job.space.names, *names_in(state.added)]
-        outside = [
-            self._columns(row.names)
-            for row in rows
-            if not row.kept and row.reason is not SelectionCode.NO_INFORMATION
-        ]
+        outside = [self._columns(group) for group in groups]
         moves = in_doubt(state.linear, self._columns(names), outside)
         coefficients = [name for name in names if name not in conditions_in(self.candidates)]
         return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
@@ -119,6 +120,15 @@ class Jacobian(eqx.Module):
     residuals: dict[str, Float[Array, "n k F"]]
     columns: dict[str, Float[Array, "Q n k F"]]
     crash_time: Float[Array, " F"]
+
+    def of(self, channels: Iterable[str]) -> Jacobian:
+        """Return the part that concerns some channels."""
+        names = tuple(channels)
+        return replace(
+            self,
+            residuals={name: self.residuals[name] for name in names},
+            columns={name: self.columns[name] for name in names},
+        )
 
 
 class SegmentData(eqx.Module):

@@ -2,38 +2,72 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import minimize
 
 from sim_jax.numeric import GRAVITY
 from tests.sim_jax.support import vehicle
 from tuner.filter_error.disturbances import (
     FAST,
+    LEAST,
     MOST,
     SLOW,
     USUAL,
     disturbance_of,
     processes_of,
+    within,
 )
-from tuner.filter_error.strengths import likeliest
+from tuner.filter_error.strengths import Likelihood, likeliest
 
 ORDER = (*SLOW, *FAST)
 
 
-def test_the_least_loss_is_found_where_strengths_trade_off() -> None:
-    best = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0])
-    bends = np.diag([40.0, 5.0, 8.0, 60.0, 10.0, 30.0])
-    bends[0, 4] = bends[4, 0] = 8.0
+SAMPLES, WIDE = 3000, 5
 
-    def loss(strengths: np.ndarray) -> float:
-        return float(0.5 * (strengths - best) @ bends @ (strengths - best))
 
-    np.testing.assert_allclose(likeliest(loss), best, atol=0.3)
+def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
+    """Return the likelihood of samples whose covariance six strengths make up, and trade off in."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.standard_normal((6, WIDE, WIDE))
+    shapes = shapes @ np.swapaxes(shapes, 1, 2)
+
+    def root(strengths: np.ndarray) -> np.ndarray:
+        added = np.einsum("k,kij->ij", np.exp(2.0 * (strengths - USUAL)), shapes)
+        return np.linalg.cholesky(added + 1e-6 * np.eye(WIDE))
+
+    samples = rng.standard_normal((SAMPLES, WIDE)) @ root(truth).T
+
+    def filtered(strengths: np.ndarray) -> Likelihood:
+        whitens = np.linalg.inv(root(strengths))
+        white = samples @ whitens.T
+        loss = 0.5 * np.sum(white**2) - SAMPLES * np.log(np.diag(whitens)).sum()
+        return Likelihood(float(loss), white, np.broadcast_to(whitens, (SAMPLES, WIDE, WIDE)))
+
+    return filtered
+
+
+def test_the_likeliest_strengths_are_found_where_they_trade_off() -> None:
+    truth = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0])
+    filtered = drawn(truth, seed=2)
+    best = minimize(lambda s: filtered(within(s)).loss, truth, method="Nelder-Mead").fun
+    assert filtered(likeliest(filtered, USUAL)).loss < best + 4.0  # where a step is worth no more
+
+
+def test_nothing_moves_from_what_is_likeliest_already() -> None:
+    filtered = drawn(USUAL, seed=3)
+    once = likeliest(filtered, USUAL)
+    np.testing.assert_array_equal(likeliest(filtered, once), once)
 
 
 def test_strengths_stay_inside_their_limits() -> None:
-    np.testing.assert_allclose(likeliest(lambda strengths: -strengths.sum())[4:], MOST[4:])
+    truth = np.where(np.arange(6) < 4, USUAL - 20.0, MOST + 3.0)
+    found = likeliest(drawn(truth, seed=4), USUAL)
+    assert (found >= LEAST).all()
+    np.testing.assert_allclose(found[4:], MOST[4:])
 
 
 def test_a_process_keeps_its_variance_and_forgets_within_its_time_constant() -> None:
