@@ -169,15 +169,15 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
                 return errors, errors
 
             error, seen = _linearised(compare, zero)
-            spread = jnp.einsum("fij,fmj->fim", covariance, seen)
-            innovation = jnp.einsum("fmi,fin->fmn", seen, spread) + jnp.diag(noise**2)
+            spread = covariance @ jnp.swapaxes(seen, 1, 2)
+            innovation = seen @ spread + jnp.diag(noise**2)
             factor = jnp.linalg.cholesky(innovation)
             whitens = solve_triangular(
                 factor, jnp.broadcast_to(jnp.eye(wide), factor.shape), lower=True
             )
-            gain = jnp.einsum("fim,fkm->fik", spread, whitens)
+            gain = spread @ jnp.swapaxes(whitens, 1, 2)
             white = jnp.einsum("fkm,mf->kf", whitens, error)
-            covariance = covariance - jnp.einsum("fik,fjk->fij", gain, gain)
+            covariance = covariance - gain @ jnp.swapaxes(gain, 1, 2)
             scatter = jnp.log(jnp.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
             kept = jax.tree.map(
                 lambda rows, row: lax.dynamic_update_index_in_dim(
@@ -201,7 +201,7 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
                 return jnp.concatenate([numbers, kept]), after
 
             state, follows = _linearised(advance, zero)
-            covariance = jnp.einsum("fij,fjk,flk->fil", follows, covariance, follows) + unrest
+            covariance = follows @ covariance @ jnp.swapaxes(follows, 1, 2) + unrest
             covariance = 0.5 * (covariance + jnp.swapaxes(covariance, 1, 2))
             return (
                 state,

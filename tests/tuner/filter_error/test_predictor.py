@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.crash import Limits
 from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
 from tuner.filter_error.disturbances import COUNT, disturbance_of, processes_of
+from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, unscaled
 from tuner.filter_error.refit import with_least_innovations
 from tuner.flights.flight import Flight, InitialState, Series
@@ -119,3 +121,13 @@ def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fit
     space = exact.space
     missed = (np.asarray(point.coefficients) - space.initial) * space.slope(space.initial)
     assert (np.abs(missed) < 3.5 * error).all()
+
+
+def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
+    """A simulation would end there: the state frozen, and all samples that follow lost."""
+    problem, predictor, point = fitted
+    strict = replace(predictor.simulator, limits=Limits(floor=5.0))  # above what is flown
+    expected = predictor._expected(problem, point)
+    observer, state = Observer.of(strict, predictor.feed, expected)
+    after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
+    assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
