@@ -26,7 +26,7 @@ FURTHEST = float(np.log(4.0))
 """That a strength moves at a time: beyond, the likelihood is no parabola."""
 ENOUGH = 1.0
 """Gain of the logarithmic likelihood that is not worth another step: a standard error or so."""
-STEPS = 10
+STEPS = 6
 DAMPED = 4
 """Times that a step is damped more, where it does not lead down."""
 

@@ -33,8 +33,10 @@ from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
 
-CONTRADICTS = 3.0
-"""Standard errors of least squares by which no coefficient may move."""
+CONTRADICTS = 4.0
+"""Standard errors of least squares by which no coefficient may move. Those errors are known from
+some ten stretches that do not depend on each other: with ten degrees of freedom chance alone takes
+one of a dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
 
 
 def examined(
