@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
-from tuner.filter_error.kalman import GATE, Filtered, Gains, filtered, innovations
+from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
 from tuner.filter_error.strengths import Likelihood, likeliest
@@ -53,8 +53,8 @@ class Predictor:
         (6,) of the disturbances.
     noise
         Channel -> factor on the samples' standard deviations.
-    gains
-        None before they are computed.
+    found
+        What the filter makes of the recordings: None before it has run.
     """
 
     simulator: Simulator
@@ -62,7 +62,7 @@ class Predictor:
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
     noise: Mapping[str, float]
-    gains: Gains | None = None
+    found: Filtered | None = None
 
     @staticmethod
     def of(objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor | None:
@@ -116,7 +116,7 @@ class Predictor:
         def likelihood(strengths: Array) -> Likelihood:
             found = self._filtered(objective, point, strengths, some)
             white, whitens = (
-                np.moveaxis(np.asarray(rows[:some], float), -1, 1)
+                np.moveaxis(np.asarray(rows[:some]), -1, 1)
                 for rows in (found.white, found.gains.whitens)
             )
             wide = white.shape[-1]
@@ -126,29 +126,34 @@ class Predictor:
 
         learnt = replace(self, strengths=likeliest(likelihood, self.strengths)).at(objective, point)
         noise = dict(self.noise)
-        for name, error in learnt.jacobian(objective, point, ()).residuals.items():
-            known = np.abs(np.asarray(error)[np.asarray(error) != 0.0])
-            spread = 1.4826 * float(np.median(known)) if len(known) else 1.0
+        for name, white in learnt._sizes():
+            spread = 1.4826 * float(np.median(white)) if len(white) else 1.0
             noise[name] *= spread if spread > NOISIER else 1.0
         if noise == self.noise:
             return learnt
         return replace(learnt, noise=noise).at(objective, point)
 
-    def keeps_track(self, objective: Objective, point: Point) -> bool:
-        """Return whether few innovations of any channel are outliers, and all are finite.
+    @property
+    def keeps_track(self) -> bool:
+        """Whether few innovations of any channel are outliers, and all are finite.
 
         Beyond the gate an innovation corrects no further: a filter that is lost stays lost.
         """
-        for error in self.jacobian(objective, point, ()).residuals.values():
-            white = np.abs(np.asarray(error)[np.asarray(error) != 0.0])
-            if len(white) and np.mean(~(white <= GATE)) > LOST:
-                return False
-        return True
+        return all(
+            np.mean(~(white <= GATE)) <= LOST for _, white in self._sizes() if len(white) > 0
+        )
+
+    def _sizes(self) -> Iterator[tuple[str, Array]]:
+        """Return each channel with the sizes (n,) of its whitened innovations."""
+        assert self.found is not None
+        white = np.asarray(self.found.white, float)
+        for name, rows in gathered(white, self.feed.widths, self.rows).items():
+            yield name, np.abs(rows[rows != 0.0])
 
     def at(self, objective: Objective, point: Point) -> Predictor:
-        """Return the predictor with the gains of a point."""
+        """Return the predictor once its filter has run at a point."""
         found = self._filtered(objective, point, self.strengths, self.ticks)
-        return replace(self, feed=self._fed(point), gains=found.gains)
+        return replace(self, feed=self._fed(point), found=found)
 
     @property
     def ticks(self) -> int:
@@ -180,11 +185,11 @@ class Predictor:
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:
         """Return the predictor of some flights alone."""
-        feed, gains = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[..., flights], (self.feed, self.gains)
+        feed, found = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[..., flights], (self.feed, self.found)
         )
         rows = {name: tick[:, flights] for name, tick in self.rows.items()}
-        return replace(self, feed=feed, gains=gains, rows=rows)
+        return replace(self, feed=feed, found=found, rows=rows)
 
     def information(
         self, objective: Objective, point: Point, criterion: Criterion
@@ -208,7 +213,7 @@ class Predictor:
 
         The columns of the others are zero.
         """
-        assert self.gains is not None
+        assert self.found is not None
         count = len(point.coefficients)
         size = count + len(point.offsets)
         feed, expected = self._fed(point), self._expected(objective, point)
@@ -219,7 +224,7 @@ class Predictor:
             directions = np.zeros((AT_ONCE, size))
             directions[np.arange(len(some)), some] = 1.0
             errors, derivatives = innovations(
-                self.simulator, feed, self.gains, expected, directions
+                self.simulator, feed, self.found.gains, expected, directions
             )
             residuals = gathered(errors, feed.widths, self.rows)
             for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():

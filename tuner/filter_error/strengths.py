@@ -41,12 +41,13 @@ class Likelihood(NamedTuple):
     white
         (n, m) innovations, whitened.
     whitens
-        (n, m, m) what whitens them: the inverse of their covariance's triangular root.
+        (n, m, m) what whitens them: the inverse of their covariance's triangular root. Both in
+        single precision where memory counts: only Fisher's information is made of them.
     """
 
     loss: float
-    white: Array
-    whitens: Array
+    white: NDArray[np.floating]
+    whitens: NDArray[np.floating]
 
 
 def likeliest(filtered: Callable[[Array], Likelihood], begin: Array) -> Array:
@@ -70,7 +71,7 @@ def likeliest(filtered: Callable[[Array], Likelihood], begin: Array) -> Array:
             change = np.zeros(len(begin))
             damped = bend + damping * np.diag(np.diag(bend))
             step = -np.linalg.solve(damped[np.ix_(free, free)], slope[free])
-            change[free] = step * min(1.0, FURTHEST / np.abs(step).max(initial=FURTHEST))
+            change[free] = step * (FURTHEST / np.abs(step).max(initial=FURTHEST))
             if -0.5 * (slope @ change) < ENOUGH:
                 return begin
             tried = within(begin + change)
@@ -99,5 +100,4 @@ def _slope_and_information(
         spread = (turn @ np.swapaxes(turn, 1, 2) - np.eye(turn.shape[1])) / step
         rows.append(np.concatenate([moved.ravel(), np.sqrt(0.5) * spread.ravel()]))
         slope[number] -= 0.5 * step * (rows[-1] @ rows[-1])  # of a parabola at the step's beginning
-    table = np.stack(rows)
-    return slope, table @ table.T
+    return slope, np.array([[row @ other for other in rows] for row in rows], float)

@@ -89,7 +89,7 @@ def with_disturbances(
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
     problem = full.objective, full.point, fitted.criterion
     predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
-    if not predictor.keeps_track(full.objective, point):
+    if not predictor.keeps_track:
         on_message("What pushed them cannot be followed: the model lacks something else.")
         return None
     again = polished(
