@@ -165,7 +165,10 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
 
             def compare(change: Array) -> tuple[Array, Array]:
                 moved = observer.corrected(state, change[:-COUNT], number, in_flight)
-                errors = observer.errors(observer.seen(moved, number), before, samples)
+                now = observer.seen(moved, number)
+                # a sample between two ticks tells of the state, however near the first it was taken
+                along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
+                errors = observer.errors(now, along, samples)
                 return errors, errors
 
             error, seen = _linearised(compare, zero)

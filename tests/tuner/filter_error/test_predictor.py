@@ -131,3 +131,17 @@ def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> 
     observer, state = Observer.of(strict, predictor.feed, expected)
     after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
     assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
+
+
+def test_a_sample_at_a_tick_tells_as_much_just_before_it_as_just_after(fitted) -> None:
+    """Samples lie on ticks here: a clock's hair's breadth must not put them out of use."""
+    problem, predictor, point = fitted
+    flights = gusty(problem, 1)[1]
+    losses = []
+    for late in (-1e-3, 1e-3):  # of 10 ms: a five-hundredth of a tick
+        moved = Point(point.coefficients, jnp.full_like(point.offsets, late).at[2:].set(0.0))
+        laid = Predictor.of(problem, moved, flights)
+        assert laid is not None
+        laid = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
+        losses.append(np.sum(np.asarray(laid.at(problem, moved).found.loss)))
+    assert abs(losses[0] - losses[1]) < 5.0
