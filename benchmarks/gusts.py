@@ -142,7 +142,7 @@ def section(draws: Sequence[Draw]) -> Section:
             ]
         )
         if name in BARS:
-            what = f"spread of {name} over {len(draws)} draws of gusts"
+            what = f"spread of {name} over draws of gusts"
             bars.append(Bar(what, 100 * shares[1], 100 * BARS[name], "at most", " %"))
     plain, rest = np.mean([draw.seconds for draw in draws], axis=0)
     text = (

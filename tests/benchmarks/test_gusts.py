@@ -38,7 +38,7 @@ def test_spreads_are_those_of_what_the_runs_would_give():
     assert (noise, half, held) == ("0.5 %", "1 %", "2 of 3")
     bars = {bar.what: bar for bar in section(draws).bars}
     assert len(bars) == len(BARS)
-    assert bars[f"spread of {name} over 3 draws of gusts"].measured == pytest.approx(expected)
+    assert bars[f"spread of {name} over draws of gusts"].measured == pytest.approx(expected)
 
 
 def test_a_draw_that_is_not_followed_is_that_of_least_squares():
