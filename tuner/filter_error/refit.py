@@ -58,9 +58,8 @@ def with_least_innovations(
         point = _descended(predictor, objective, point, unscaled(criterion), free)
         laid = Predictor.of(objective, point, flights)
         assert laid is not None
-        laid = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
-        predictor = laid.at(objective, point)
-    return predictor, point
+        predictor = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
+    return predictor.at(objective, point), point
 
 
 def _descended(
