@@ -100,14 +100,13 @@ def examine(
         batch = portion(objective, point, criterion, flights)
         jacobian = batch[0].jacobian(*batch[1:], columns=full_problem.columns)
         flight_names = [names[number] for number in flights]
-        moved = {
-            name: residuals_at(
-                *portion(replace(other, space=objective.space), point, criterion, flights)
-            )
+        others = {
+            name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
             for name, other in otherwise.items()
         }
+        moved = {name: residuals_at(other, *batch[1:]) for name, other in others.items()}
         if predictor is not None:
-            predicted.append(predictor.among(flights).information(*batch))
+            predicted.append(predictor.among(flights).information(*batch, others))
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
         informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
         sensitivities.append(

@@ -133,6 +133,19 @@ def _shortly_delayed(simulator: Simulator, expected: Expected) -> tuple[Simulato
     return replace(simulator, schedule=short), count
 
 
+def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) -> Gains:
+    """Return the gains of a simulator for the same in so many times finer steps of physics.
+
+    Then so many times as many commands are on their way to the motors.
+    """
+    in_flight = _shortly_delayed(simulator, expected)[1]
+    size, rotors = gains.gain.shape[1], len(expected.tunable.model.vehicle.rotors)
+    first = size - COUNT - in_flight * rotors
+    commands = np.arange(first, size - COUNT).reshape(in_flight, rotors).repeat(times, axis=0)
+    rows = np.concatenate([np.arange(first), commands.ravel(), np.arange(size - COUNT, size)])
+    return replace(gains, gain=gains.gain[:, rows])
+
+
 def filtered(simulator: Simulator, feed: Feed, expected: Expected, ticks: int) -> Filtered:
     """Return the Kalman gains, the innovations, and how likely they are.
 

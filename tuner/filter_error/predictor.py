@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.filter_error.disturbances import USUAL
-from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations
+from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations, stepped
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
 from tuner.filter_error.strengths import Likelihood, likeliest
@@ -192,11 +193,16 @@ class Predictor:
         return replace(self, feed=feed, found=found, rows=rows)
 
     def information(
-        self, objective: Objective, point: Point, criterion: Criterion
+        self,
+        objective: Objective,
+        point: Point,
+        criterion: Criterion,
+        otherwise: Mapping[str, Objective] = MappingProxyType({}),
     ) -> FisherInformation:
         """Return what the innovations of these flights say at a point, see `with_hidden`.
 
-        Its criterion gives no scales: innovations are whitened.
+        Its criterion gives no scales: innovations are whitened. ``otherwise``: what might be
+        simulated differently -> the problem so simulated; gains stay.
         """
         moved = np.flatnonzero(~hidden(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
@@ -206,6 +212,24 @@ class Predictor:
             own,
             unscaled(criterion),
             self.jacobian(objective, own, [*moved, *offsets]),
+            otherwise={
+                name: self._stepped(other, own).jacobian(objective, own, []).residuals
+                for name, other in otherwise.items()
+            },
+        )
+
+    def _stepped(self, other: Objective, point: Point) -> Predictor:
+        """Return the predictor whose physics runs in the finer steps of another problem."""
+        assert self.found is not None
+        times = other.schedule.physics_rate // self.simulator.schedule.physics_rate
+        segments, found = self.feed.segments, self.found
+        inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
+        gains = stepped(found.gains, self.simulator, self._expected(other, point), times)
+        return replace(
+            self,
+            simulator=other.simulator,
+            feed=replace(self.feed, segments=replace(segments, inlet=inlet)),
+            found=Filtered(gains, found.white, found.loss),
         )
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
@@ -221,7 +245,7 @@ class Predictor:
         residuals: dict[str, Any] = {}
         for first in range(0, max(len(moved), 1), AT_ONCE):
             some = list(moved[first : first + AT_ONCE])
-            directions = np.zeros((AT_ONCE, size))
+            directions = np.zeros((AT_ONCE if some else 0, size))
             directions[np.arange(len(some)), some] = 1.0
             errors, derivatives = innovations(
                 self.simulator, feed, self.found.gains, expected, directions
@@ -264,6 +288,10 @@ def with_hidden(
         predicted,
         blocks=predicted.blocks + np.where(np.outer(upstream, upstream), blocks, 0.0),
         score=predicted.score + np.where(upstream, looped.score @ clear.T, 0.0),
+        changes={
+            name: change + np.where(upstream, looped.changes[name] @ clear.T, 0.0)
+            for name, change in predicted.changes.items()
+        },
     )
 
 

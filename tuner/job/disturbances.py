@@ -23,6 +23,7 @@ from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
 from tuner.job.selected import Selected
 from tuner.job.terms import candidates_of
+from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -105,9 +106,9 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    doubt = _in_doubt(selected, again, predictor)
-    examination = examine(again, predictor=predictor, in_doubt=doubt)
-    before = examine(fitted, in_doubt=selected.in_doubt)
+    doubt, otherwise = _in_doubt(selected, again, predictor), alternatives_of(fitted.objective)
+    examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=doubt)
+    before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
     if not _agree(examination.uncertainty, before.uncertainty):
         on_message("It contradicts the fit of the simulated flights, which is kept.")
         return None

@@ -18,6 +18,7 @@ from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, unscaled
 from tuner.filter_error.refit import with_least_innovations
 from tuner.flights.flight import Flight, InitialState, Series
+from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import beginning_of, trace_of
@@ -145,3 +146,26 @@ def test_a_sample_at_a_tick_tells_as_much_just_before_it_as_just_after(fitted) -
         laid = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
         losses.append(np.sum(np.asarray(laid.at(problem, moved).found.loss)))
     assert abs(losses[0] - losses[1]) < 5.0
+
+
+def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has_them(
+    fitted,
+) -> None:
+    problem, predictor, point = fitted
+    late = eqx.tree_at(
+        lambda o: o.model.vehicle.setup.actuator_latency, problem, jnp.asarray(0.007)
+    )  # two commands on their way, three in finer steps
+    finer = alternatives_of(late)[STEP]
+    predictor = replace(predictor, simulator=late.simulator).at(late, point)
+    own = Predictor.of(finer, point, gusty(problem, 1)[1])
+    assert own is not None
+    own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
+    stepped = predictor._stepped(finer, point)
+    here, there = (np.asarray(of.found.gains.gain) for of in (stepped, own))
+    on_their_way = here[:, -COUNT - 16 : -COUNT - 4] - there[:, -COUNT - 12 : -COUNT]
+    assert np.std(on_their_way) < 0.01 * np.std(there[:, -COUNT - 12 : -COUNT])
+    coarse = predictor.jacobian(late, point, []).residuals
+    found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))
+    for channel in ("position", "attitude"):  # the others hardly change: rates are fed in
+        change = np.std(expected[channel] - coarse[channel])
+        assert np.std(found[channel] - expected[channel]) < 0.5 * change
