@@ -83,6 +83,9 @@ class Coefficient:
     mass_exponent
         The power of a common factor on all masses with which it must go so that every motion stays
         the same: 1 for masses, inertias and what forces are proportional to.
+    length_exponent
+        The power of a common factor on all lengths, with times as the root of it, with which what
+        is usual for it goes; only read where the search moves the number.
     hold_rank
         Of coefficients that trade off against each other, the one of the lowest rank is held: what
         is weighed or set rather than flown. None comes after all ranks.
@@ -121,6 +124,7 @@ class Coefficient:
     step: float = 1.0
     free: bool = False
     mass_exponent: int = 0
+    length_exponent: float = 0.0
     hold_rank: int | None = None
     neutral: float | None = None
     group: str = ""

@@ -24,6 +24,7 @@ def _effect(
     gazebo: str | Written = "Gazebo's motor model has no such term",
     px4: str = "the SIH model has no such term",
     mass_exponent: int = 0,
+    length_exponent: float = 0.0,
     informed_by: str | None = None,
     stands_in: bool = False,
     reads: str = "",
@@ -44,6 +45,7 @@ def _effect(
         prior_sd=prior_sd,
         step=step,
         mass_exponent=mass_exponent,
+        length_exponent=length_exponent,
         neutral=0.0,
         group=group,
         stands_in=stands_in,
@@ -115,6 +117,7 @@ EFFECT_ROWS = (
             prior_sd=0.2,
             step=0.1,
             mass_exponent=1,
+            length_exponent=-0.5,
             stands_in=True,
         )
         for axis, direction in _AXES.items()
@@ -129,6 +132,7 @@ EFFECT_ROWS = (
         prior_sd=0.05,
         step=0.02,
         mass_exponent=1,
+        length_exponent=-1.0,
         gazebo="the motor plugins know no drag of the body",
         px4="the SIH model's drag is linear in the velocity",
         informed_by="speed",
@@ -155,6 +159,7 @@ EFFECT_ROWS = (
             limit=0.1,
             prior_sd=0.01,
             step=0.005,
+            length_exponent=1.0,
             gazebo=Written("pose", "centre"),
             px4="the control allocation is left as it flew",
         )
@@ -183,6 +188,7 @@ EFFECT_ROWS = (
             prior_sd=0.02,
             step=0.005,
             mass_exponent=1,
+            length_exponent=1.0,
             stands_in=True,
         )
         for axis, direction in _AXES.items()
@@ -197,6 +203,7 @@ EFFECT_ROWS = (
         prior_sd=5e-5,
         step=2e-5,
         mass_exponent=1,
+        length_exponent=2.0,
         gazebo="the rotor links' inertia turns no body in the motor model's moment",
     ),
     _effect(
@@ -219,6 +226,7 @@ EFFECT_ROWS = (
         prior_sd=2e-5,
         step=5e-6,
         mass_exponent=1,
+        length_exponent=1.0,
     ),
     _effect(
         "ground_effect",
@@ -241,6 +249,7 @@ EFFECT_ROWS = (
             prior_sd=0.01,
             step=0.005,
             mass_exponent=1,
+            length_exponent=1.5,
             stands_in=True,
         )
         for axis, direction in _AXES.items()

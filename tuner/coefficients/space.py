@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from tuner.coefficients.joint_prior import JointPrior
 from tuner.coefficients.registry import COEFFICIENTS
+from tuner.coefficients.size import Size, size_of, sized
 from tuner.config import ControllerFile, JobFile, VehicleFile, initial_values
 from tuner.errors import ConfigError
 
+AS_TABLED = Size()
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
 
@@ -43,6 +45,8 @@ class Parameter:
         Whether the user gave the prior, or it is the weak default that only steadies the search.
     unit_step
         The change of the scaled coordinate that is one in the search's coordinate, mid-range.
+    usual
+        Of a linear coefficient, how large it usually is for such a vehicle; zero for others.
     moved
         Set where the start lay on or outside a bound and was moved: the value that it had.
     """
@@ -57,6 +61,7 @@ class Parameter:
     prior_sd: float
     prior_given: bool
     unit_step: float
+    usual: float = 0.0
     moved: float | None = None
 
     def scaled(self, value: float) -> float:
@@ -115,7 +120,9 @@ class Space:
         parameters: Sequence[Parameter],
         fixed: Mapping[str, float],
         joint_prior: JointPrior | None = None,
+        size: Size = AS_TABLED,
     ) -> None:
+        self.size = size
         self.parameters = tuple(parameters)
         self.fixed = dict(fixed)
         self.names = tuple(parameter.name for parameter in self.parameters)
@@ -253,8 +260,10 @@ def space_of(
         for name in group[1:]:
             groups.pop(name)
         groups[group[0]] = tuple(group)
-    parameters = [parameter_of(names, values, job) for names in groups.values()]
-    return Space(parameters, {n: v for n, v in values.items() if n not in free}, joint_prior)
+    size = size_of(vehicle)
+    parameters = [parameter_of(names, values, job, size) for names in groups.values()]
+    fixed = {n: v for n, v in values.items() if n not in free}
+    return Space(parameters, fixed, joint_prior, size)
 
 
 def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:
@@ -284,16 +293,17 @@ def extended(
     values
         Coefficient -> where it starts; of all in ``names``.
     """
-    parameters = (*space.parameters, *(parameter_of((name,), values, job) for name in names))
-    return Space(
-        parameters, {n: v for n, v in space.fixed.items() if n not in names}, space.joint_prior
-    )
+    added = (parameter_of((name,), values, job, space.size) for name in names)
+    fixed = {n: v for n, v in space.fixed.items() if n not in names}
+    return Space((*space.parameters, *added), fixed, space.joint_prior, space.size)
 
 
-def parameter_of(names: tuple[str, ...], values: Mapping[str, float], job: JobFile) -> Parameter:
+def parameter_of(
+    names: tuple[str, ...], values: Mapping[str, float], job: JobFile, size: Size
+) -> Parameter:
     """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
     name = names[0]
-    row, given, start = COEFFICIENTS[name], job.coefficients.get(name), values[name]
+    row, given, start = sized(COEFFICIENTS[name], size), job.coefficients.get(name), values[name]
     scale = given.scale if given is not None and given.scale is not None else row.scale
     bounded = given is not None and given.lower is not None and given.upper is not None
     if row.scale == "log" and start <= 0 and not (scale == "linear" and bounded):
@@ -337,5 +347,6 @@ def parameter_of(names: tuple[str, ...], values: Mapping[str, float], job: JobFi
         prior_sd=sd,
         prior_given=prior_given,
         unit_step=row.step if scale == row.scale else (upper - lower) / 4,
+        usual=row.prior_sd if row.scale == "linear" else 0.0,
         moved=moved,
     )

@@ -149,9 +149,13 @@ class Observer(eqx.Module):
 
     def _slots(self, length: int, tick: Array, in_flight: int) -> Array:
         """Return the places of the last commands in a delay line, the newest first."""
-        schedule = self.plant.schedule
-        step = tick * round(schedule.physics_rate / schedule.log_rate)
+        step = self._step(tick)
         return jnp.mod(step - 1 - jnp.arange(in_flight), length)
+
+    def _step(self, tick: Array) -> Array:
+        """Return the step of physics that begins at a tick."""
+        schedule = self.plant.schedule
+        return tick * round(schedule.physics_rate / schedule.log_rate)
 
     def next(self, state: State, disturbance: Array, tick: Array) -> State:
         """Return the state a tick later."""
@@ -173,7 +177,7 @@ class Observer(eqx.Module):
             position, attitude = markers.recorded(motion)
         command = state.command
         if "command" in self.channels:
-            command = self.plant.inlet.next_command(self.plant, state, tick).command
+            command = self.plant.inlet.next_command(self.plant, state, self._step(tick)).command
         rate = motion.body_rate
         signals = {
             "position": (position.x, position.y, position.z),

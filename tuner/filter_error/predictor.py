@@ -213,7 +213,7 @@ class Predictor:
             unscaled(criterion),
             self.jacobian(objective, own, [*moved, *offsets]),
             otherwise={
-                name: self._stepped(other, own).jacobian(objective, own, []).residuals
+                name: dict[str, Any](self._stepped(other, own).jacobian(other, own, []).residuals)
                 for name, other in otherwise.items()
             },
         )

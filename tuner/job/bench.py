@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from sim_jax.numeric import GRAVITY
 from tuner.bench.bench_json import bench_record
 from tuner.bench.combine import Combination, combine
 from tuner.bench.experiments import measure, names_of
@@ -18,6 +17,7 @@ from tuner.bench.measurement import Measurement
 from tuner.bench.plan import BenchFile, YawSpin, read_bench
 from tuner.bench.scales import error_of, scaled_of, value_of
 from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.size import size_of, sized
 from tuner.config import (
     VehicleFile,
     find_config,
@@ -51,8 +51,6 @@ from tuner.uncertainty.verdict import (
 from tuner.versions import PROGRAM, versions
 from tuner.wording.verdicts import judgement_in_words
 
-SLIGHT = 1e-3
-"""Share of the weight that, at a rotor's place, is a slight moment."""
 RELINEARISATIONS = 3
 """Times that yaw spins are linearised at the motor constant that all experiments give."""
 
@@ -283,14 +281,8 @@ def _coefficients(
 
 
 def least_noticed(name: str, vehicle: VehicleFile) -> float:
-    """Return the size of a coefficient that is no logarithm below which nobody notices it.
-
-    A steady moment counts by the vehicle's own: `SLIGHT` of its weight at a rotor's place.
-    """
-    if not name.startswith("torque_trim"):
-        return COEFFICIENTS[name].step
-    arm = float(np.mean([np.hypot(*rotor.position[:2]) for rotor in vehicle.rotors]))
-    return SLIGHT * vehicle.mass * GRAVITY * arm
+    """Return the size of a coefficient that is no logarithm below which nobody notices it."""
+    return sized(COEFFICIENTS[name], size_of(vehicle)).step
 
 
 def _judged(

@@ -181,7 +181,7 @@ def refitted(
         for parameter in fitted.objective.space.parameters
         if not set(lost).intersection(parameter.ratios)
     )
-    space = Space(parameters, {})
+    space = Space(parameters, {}, size=fitted.objective.space.size)
     model = replace(
         model_of(bare, controller_flown(job, fitted)),
         reference_voltage=fitted.objective.model.reference_voltage,
@@ -238,8 +238,9 @@ def _about(parameter: Parameter, value: float) -> Parameter:
 
     What was known of it beforehand is about the vehicle, not about a simulator that lacks terms.
     """
-    row = COEFFICIENTS[parameter.name]
-    weak = row.prior_sd if parameter.prior_given else parameter.prior_sd
+    weak = parameter.prior_sd
+    if parameter.prior_given:
+        weak = parameter.usual or COEFFICIENTS[parameter.name].prior_sd
     return replace(
         parameter,
         initial=value,

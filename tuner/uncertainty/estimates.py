@@ -222,8 +222,7 @@ def references(space: Space, vector: Array) -> Array:
 def _reference(parameter: Parameter, scaled: float) -> float:
     if parameter.scale == "log":
         return 1.0
-    row = COEFFICIENTS[parameter.name]
-    return max(abs(scaled), row.prior_sd if row.scale == "linear" else 0.0) or 1.0
+    return max(abs(scaled), parameter.usual) or 1.0
 
 
 def _limits(parameter: Parameter) -> tuple[float, float]:

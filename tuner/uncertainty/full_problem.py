@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.size import Size, sized
 from tuner.coefficients.space import Parameter, Space
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
@@ -58,8 +59,8 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     space = objective.space
     values = space.numbers(point.coefficients)
     fixed = {name: value for name, value in _fixed(objective).items() if name not in values}
-    parameters = [*space.parameters, *(_parameter(name, value) for name, value in fixed.items())]
-    full_space = Space(parameters, {}, space.joint_prior)
+    parameters = [*space.parameters, *(_parameter(*of, space.size) for of in fixed.items())]
+    full_space = Space(parameters, {}, space.joint_prior, space.size)
     vector = full_space.vector_of(values | fixed)
     vector[: len(space)] = np.asarray(point.coefficients)
     return FullProblem(
@@ -81,8 +82,8 @@ def _fixed(objective: Objective) -> Mapping[str, float]:
     }
 
 
-def _parameter(name: str, value: float) -> Parameter:
-    row = COEFFICIENTS[name]
+def _parameter(name: str, value: float, size: Size) -> Parameter:
+    row = sized(COEFFICIENTS[name], size)
     lower, upper = row.limits(value)
     return Parameter(
         name=name,
@@ -95,4 +96,5 @@ def _parameter(name: str, value: float) -> Parameter:
         prior_sd=row.prior_sd,
         prior_given=False,
         unit_step=row.step,
+        usual=row.prior_sd if row.scale == "linear" else 0.0,
     )
