@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.lab_flights import METER, Lab, drawn, write
+from benchmarks.lab_flights import METER, VOLTS, Lab, drawn, write
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure
 from sim_jax.schedule import Schedule
@@ -55,6 +55,8 @@ class Trial:
         Coefficient -> what an oracle would quote, in the estimate's standard errors.
     seconds
         Of processor time.
+    voltage
+        V at which the fit's motors were taken to run, if it has a battery.
     """
 
     lab: Lab
@@ -62,11 +64,15 @@ class Trial:
     estimates: Mapping[str, Estimate]
     oracle: Mapping[str, float]
     seconds: float
+    voltage: float | None = None
 
     def true(self, name: str) -> float:
-        """Return the true value of a coefficient."""
+        """Return the true value of a coefficient, at the voltage of the fit."""
         known, neutral = values_of(self.lab.vehicle), COEFFICIENTS[name].neutral
-        return known.get(name, 0.0 if neutral is None else neutral)
+        value = known.get(name, 0.0 if neutral is None else neutral)
+        if self.voltage is None or name not in ("input_scaling", "zero_position_armed"):
+            return value
+        return float(value * (self.voltage / VOLTS) ** known.get("battery_exponent", 0.0))
 
 
 def measure() -> Section:
@@ -161,7 +167,8 @@ def trial_of(seed: int) -> Trial:
         if name not in fitted.held
     }
     found = tuple(row.group for row in selected.rows if row.kept)
-    trial = Trial(lab, found, free, {}, seconds)
+    reference = selected.job.settings.vehicle.battery.reference_voltage
+    trial = Trial(lab, found, free, {}, seconds, reference)
     volts = _voltages(selected.job.fitted, fitted.objective.schedule)
     return replace(trial, oracle=_oracle(trial, fitted, examination.uncertainty, volts, seed))
 

@@ -53,6 +53,7 @@ class Code(StrEnum):
     FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise
     MODEL_UNMATCHED = "model_unmatched"  # unmatched, flights, noise_multiple
     FINER_THAN_STEPS = "finer_than_steps"  # seconds
+    REFERENCE_VOLTAGE = "reference_voltage"  # volts
     POORLY_MET = "poorly_met"  # noise_multiple; names: the channel
     STARTS_DISAGREE = "starts_disagree"  # starts, changed: 1 if CMA-ES ended lower, else 0
     FLIGHTS_FAR_OFF = "flights_far_off"  # far_off, flights, changed

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, Pose
+from tuner.config import VehicleFile
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
@@ -201,6 +202,15 @@ def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
         return ()
     numbers = {"seconds": STEPS_MATTER}
     return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
+
+
+def voltage_taken(given: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:
+    """Tell at which voltage the motors' curve holds, where the vehicle file left that open."""
+    volts = best.battery.reference_voltage
+    if given.battery.reference_voltage or not volts or not best.effects.get("battery_exponent"):
+        return ()
+    curve = "input_scaling, zero_position_armed"
+    return (Finding(Code.REFERENCE_VOLTAGE, "info", curve, {"volts": volts}),)
 
 
 def _size(channels: Mapping[str, float]) -> float:

@@ -35,6 +35,7 @@ from tuner.job.findings import (
     ground_conflicts,
     inputs_late,
     turning_unexplained,
+    voltage_taken,
 )
 from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
@@ -127,9 +128,8 @@ def run(
     _report(conflicts, listener, force=True)
     vehicle = vehicle_fitted(job, fitted)
     fitted, validation = _validated(job, fitted, vehicle, inertia, listener)
-    fitted = replace(
-        fitted, findings=(*fitted.findings, *finer_than_steps(uncertainty), *conflicts)
-    )
+    noticed = (*finer_than_steps(uncertainty), *voltage_taken(settings.vehicle, vehicle))
+    fitted = replace(fitted, findings=(*fitted.findings, *noticed, *conflicts))
     with span("effective coefficients"):
         effective = effective_fit(
             job,

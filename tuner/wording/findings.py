@@ -140,6 +140,13 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "Take these values as known to {twice:g} ms.",
     ),
+    Code.REFERENCE_VOLTAGE: (
+        (
+            "They are those at {volts:.2f} V, the highest voltage of these flights without load: "
+            "the vehicle file names no other."
+        ),
+        "Give battery.reference_voltage in the vehicle file for those at another voltage.",
+    ),
     Code.POORLY_MET: (
         (
             "The simulated {first} differs from the recorded one by {noise_multiple:.0f} times the "

@@ -12,10 +12,11 @@ from tuner.config import ControllerFile, JobFile
 from tuner.config.job import Search
 from tuner.findings import Code
 from tuner.job import search as module
-from tuner.job.findings import end_findings, finer_than_steps, unmatched
+from tuner.job.findings import end_findings, finer_than_steps, unmatched, voltage_taken
 from tuner.job.search import starting_vectors
 from tuner.search.fitted import Outcome
 from tuner.search.stages import left, plan
+from tuner.wording.findings import sentence
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 
@@ -105,6 +106,16 @@ def test_a_lag_known_more_finely_than_physics_steps_is_warned_of():
     assert finding.numbers == {"seconds": 1e-4}
     estimates["time_constant_up"] = SimpleNamespace(std_error=2e-4)
     assert finer_than_steps(SimpleNamespace(estimates=estimates)) == ()
+
+
+def test_a_curve_of_motors_says_at_which_voltage_it_holds(updated):
+    best = updated.replace(
+        effects={"battery_exponent": 1.0}, battery=updated.battery.replace(reference_voltage=16.36)
+    )
+    (finding,) = voltage_taken(updated, best)
+    assert "16.36 V" in sentence(finding)
+    assert voltage_taken(best, best) == ()  # given
+    assert voltage_taken(updated, best.replace(effects={})) == ()
 
 
 def test_time_left_falls_to_nothing():

@@ -143,6 +143,9 @@ MADE = {
         "model",
         {"unmatched": 3, "flights": 3, "noise_multiple": 35.0},
     ),
+    Code.REFERENCE_VOLTAGE: Finding(
+        Code.REFERENCE_VOLTAGE, "info", "input_scaling, zero_position_armed", {"volts": 16.36}
+    ),
     Code.FINER_THAN_STEPS: Finding(
         Code.FINER_THAN_STEPS, "warning", "estimate_latency", {"seconds": 1e-4}
     ),
