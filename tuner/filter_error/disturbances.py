@@ -4,6 +4,10 @@ Gusts push as the world has it, slowly; thrust wanders fast, at each rotor by it
 thrust and three moments in the body. Each process d has a standard deviation σ and a time constant
 τ: from one tick to the next it keeps exp(-h/τ) of itself.
 
+They are counted as the accelerations that they cause, for that is what samples tell of: gains that
+stay while mass and inertia move then correct a motion by as much as before, and tell nothing of
+mass and inertia themselves.
+
 Source: Gelb, "Applied optimal estimation", 1974, ch. 2 (Gauss-Markov process).
 """
 
@@ -42,12 +46,15 @@ class Processes(eqx.Module):
     Attributes
     ----------
     sd
-        (D,) in N and N m.
+        (D,) in m/s² and rad/s².
+    acts
+        (D,) kg and kg m²: what a unit of each process acts by, in N and N m.
     keeps
         (D,) share that a process keeps from one tick to the next.
     """
 
     sd: Float[Array, " D"]
+    acts: Float[Array, " D"]
     keeps: Float[Array, " D"]
 
     @property
@@ -69,7 +76,8 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -
         Hz of the ticks.
     """
     gust, lift, roll, turbulence, gust_lasts, turbulence_lasts = jnp.exp(strengths)
-    weight, count = vehicle.body.mass * GRAVITY, len(vehicle.rotors)
+    body, count = vehicle.body, len(vehicle.rotors)
+    weight, turns = body.mass * GRAVITY, (body.inertia_xx, body.inertia_yy, body.inertia_zz)
     own = turbulence * weight / count
     width = jnp.sqrt(sum(rotor.position.y**2 for rotor in vehicle.rotors))
     length = jnp.sqrt(sum(rotor.position.x**2 for rotor in vehicle.rotors))
@@ -78,11 +86,12 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -
     sd = [gust * weight, gust * weight, lift * weight, roll * weight * arm, roll * weight * arm]
     sd += [own * count**0.5, own * width, own * length, own * turning * count**0.5]
     lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
-    return Processes(jnp.stack(sd), jnp.exp(-1.0 / rate / jnp.stack(lasts)))
+    acts = jnp.stack([body.mass, body.mass, body.mass, *turns[:2], body.mass, *turns])
+    return Processes(jnp.stack(sd) / acts, acts, jnp.exp(-1.0 / rate / jnp.stack(lasts)))
 
 
 def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
-    """Return the disturbance that the processes' values are, the same throughout a tick."""
+    """Return the disturbance that values in N and N m are, the same throughout a tick."""
     rows: dict[str, Array] = {}
     for name, value in zip((*SLOW, *FAST), values, strict=True):
         rows[name] = rows[name] + value if name in rows else value

@@ -157,12 +157,12 @@ class Observer(eqx.Module):
         schedule = self.plant.schedule
         return tick * round(schedule.physics_rate / schedule.log_rate)
 
-    def next(self, state: State, disturbance: Array, tick: Array) -> State:
-        """Return the state a tick later."""
+    def next(self, state: State, pushed: Array, tick: Array) -> State:
+        """Return the state a tick later, pushed by the processes' values (D, F)."""
         environment = eqx.tree_at(
             lambda e: e.disturbance,
             self.plant.environment,
-            disturbance_of(disturbance),
+            disturbance_of(self.processes.acts[:, None] * pushed),
             is_leaf=lambda leaf: leaf is None,
         )
         plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)

@@ -62,6 +62,7 @@ def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
     for tick in range(1, ticks):
         fresh = np.sqrt(processes.added)[:, None] * rng.standard_normal((COUNT, 2))
         pushes[:, tick] = np.asarray(processes.keeps)[:, None] * pushes[:, tick - 1] + fresh
+    pushes *= np.asarray(processes.acts)[:, None, None]
     channels, setpoints = flown(exact, jnp.asarray(pushes))
     every, measured = making.SAMPLE_EVERY, {}
     for channel, old in exact.segments.measured.items():

@@ -80,7 +80,7 @@ def test_a_process_keeps_its_variance_and_forgets_within_its_time_constant() -> 
 def test_thrusts_that_wander_alone_at_each_rotor_turn_a_vehicle_as_its_arms_say() -> None:
     craft = vehicle()
     processes = processes_of(craft, jnp.asarray(USUAL), 400.0)
-    sd = dict(zip(FAST, np.asarray(processes.sd)[len(SLOW) :], strict=True))
+    sd = dict(zip(FAST, np.asarray(processes.sd * processes.acts)[len(SLOW) :], strict=True))
     each = np.exp(USUAL[3]) * float(craft.body.mass) * GRAVITY / 4.0
     rng = np.random.default_rng(0)
     thrust = each * rng.standard_normal((4, 20_000))
