@@ -11,6 +11,7 @@ import pytest
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from tests.sim_jax.support import controller, moving_start, vehicle, wobble
+from tuner.filter_error.disturbances import COUNT, USUAL, processes_of
 from tuner.filter_error.kalman import GATE, deviance
 from tuner.filter_error.observer import (
     CHANNELS,
@@ -58,6 +59,27 @@ def test_a_command_on_its_way_moves_its_rotor_when_its_time_has_come(begin, age,
     by = [float(new[0] - old[0]) for old, new in zip(*ends, strict=True)]
     assert (by[0] > 1.0) == acts
     assert by[1:] == [0.0, 0.0, 0.0]
+
+
+def test_a_push_accelerates_a_heavy_vehicle_as_a_light_one(begin):
+    """Gains that stay while mass and inertia move must tell nothing of them."""
+    observer, state = begin
+    pushed = jnp.full((COUNT, 1), 0.5)
+    gained = []
+    for times in (jnp.asarray(1.0), jnp.asarray(2.0)):
+        craft = observer.plant.vehicle
+        craft = eqx.tree_at(lambda v: v.body, craft, jax.tree.map(times.__mul__, craft.body))
+        plant = eqx.tree_at(lambda p: p.vehicle, observer.plant, craft)
+        heavier = Observer(plant, processes_of(craft, jnp.asarray(USUAL), 400.0), None, (), 400.0)
+        ends = [heavier.next(state, push, TICK).motion for push in (jnp.zeros((COUNT, 1)), pushed)]
+        gained.append(
+            [
+                getattr(ends[1], name).stacked() - getattr(ends[0], name).stacked()
+                for name in ("velocity", "body_rate")
+            ]
+        )
+    assert np.abs(gained[0]).min() > 1e-4
+    np.testing.assert_allclose(gained[0], gained[1], rtol=2e-3)
 
 
 def test_each_channels_errors_stand_where_its_columns_are_looked_for(begin):
