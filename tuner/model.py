@@ -21,7 +21,11 @@ from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tuner.coefficients import COEFFICIENTS, Coefficient
+from tuner.coefficients.size import size_of
 from tuner.config import ControllerFile, VehicleFile, initial_values
+
+RADIUS = 0.13
+"""m of the rotors of a vehicle of the registry's size; those of others are in proportion."""
 
 
 class Model(eqx.Module):
@@ -120,6 +124,7 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
             for name, value in file.effects.items()
             if value != COEFFICIENTS[name].neutral
         },
+        rotor_radius=jnp.asarray(RADIUS * size_of(file).arm),
     )
 
 

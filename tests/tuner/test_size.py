@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -68,7 +67,6 @@ def acting(vehicle: VehicleFile, size: Size) -> np.ndarray:
     speeds = tuple(jnp.asarray(s / slow) for s in (600.0, 640.0, 580.0, 620.0))
     changes = tuple(jnp.asarray(a / size.arm) for a in (300.0, -200.0, 500.0, 100.0))
     flown = model_of(vehicle, ControllerFile()).vehicle
-    flown = eqx.tree_at(lambda v: v.rotor_radius, flown, flown.rotor_radius * size.arm)
     wrench = total_wrench(
         flown, motion, speeds, Air.around(flown, motion, rotor_acceleration=changes)
     )
