@@ -19,12 +19,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.stats import norm
 from jaxtyping import Float
 
 from sim_jax.disturbance import Disturbance
-from sim_jax.numeric import GRAVITY
+from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import Vehicle
+from sim_jax.vehicle import PerRotor, Vehicle
 
 STRENGTHS = ("gust", "lift", "roll", "turbulence", "gust_lasts", "turbulence_lasts")
 """What is estimated of them: shares of the weight by which gusts push sideways and upwards, and
@@ -35,9 +36,12 @@ USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03])
 LEAST = np.log([1e-6, 1e-6, 1e-6, 1e-6, 0.2, 0.005])
 MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15])
 """Logarithms between which they are looked for."""
+STRONGEST = 1.0
+"""m/s, the strongest gusts along the rotors' axes by which a lift is explained."""
 SLOW = ("force_x", "force_y", "force_z", "moment_x", "moment_y")
 FAST = ("thrust", "moment_x", "moment_y", "moment_z")
 COUNT = len(SLOW) + len(FAST)
+THRUST = len(SLOW) + FAST.index("thrust")
 
 
 class Processes(eqx.Module):
@@ -51,11 +55,14 @@ class Processes(eqx.Module):
         (D,) kg and kg m²: what a unit of each process acts by, in N and N m.
     keeps
         (D,) share that a process keeps from one tick to the next.
+    draught
+        m/s, standard deviation of the gusts along the rotors' axes.
     """
 
     sd: Float[Array, " D"]
     acts: Float[Array, " D"]
     keeps: Float[Array, " D"]
+    draught: Scalar
 
     @property
     def added(self) -> Float[Array, " D"]:
@@ -87,7 +94,22 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -
     sd += [own * count**0.5, own * width, own * length, own * turning * count**0.5]
     lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
     acts = jnp.stack([body.mass, body.mass, body.mass, *turns[:2], body.mass, *turns])
-    return Processes(jnp.stack(sd) / acts, acts, jnp.exp(-1.0 / rate / jnp.stack(lasts)))
+    draught = jnp.minimum(lift * vehicle.aerodynamics.max_relative_airspeed, STRONGEST)
+    keeps = jnp.exp(-1.0 / rate / jnp.stack(lasts))
+    return Processes(jnp.stack(sd) / acts, acts, keeps, draught)
+
+
+def thrust_lost(vehicle: Vehicle, axial: Scalar, rotor_speed: PerRotor, draught: Scalar) -> Scalar:
+    """Return the thrust in N that gusts take in the mean, whichever way they blow.
+
+    Thrust falls with the length of the axial airspeed: of a gust w about the vehicle's own u, with
+    standard deviation σ, E|u + w| - |u| = 2σ (φ(z) - |z| Q(|z|)), z = u/σ (the folded normal
+    distribution's mean; Leone, Nelson and Nottingham 1961).
+    """
+    size = jnp.abs(axial) / draught
+    further = 2.0 * draught * (norm.pdf(size) - size * norm.sf(size))
+    air, square = vehicle.aerodynamics, sum(speed * speed for speed in rotor_speed)
+    return air.motor_constant * square * further / air.max_relative_airspeed
 
 
 def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:

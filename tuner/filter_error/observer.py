@@ -21,9 +21,16 @@ from sim_jax.rollout import begun
 from sim_jax.rotation import Quaternion
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import State
+from sim_jax.terms.air import Air
 from sim_jax.trees import replaced
 from sim_jax.vector import Vec3
-from tuner.filter_error.disturbances import Processes, disturbance_of, processes_of
+from tuner.filter_error.disturbances import (
+    THRUST,
+    Processes,
+    disturbance_of,
+    processes_of,
+    thrust_lost,
+)
 from tuner.filter_error.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.markers import markers_of
@@ -159,10 +166,14 @@ class Observer(eqx.Module):
 
     def next(self, state: State, pushed: Array, tick: Array) -> State:
         """Return the state a tick later, pushed by the processes' values (D, F)."""
+        vehicle, around, processes = self.plant.vehicle, self.plant.environment, self.processes
+        axial = Air.around(vehicle, state.motion, around).velocity.z
+        lost = thrust_lost(vehicle, axial, state.rotor_speed, processes.draught)
+        acting = (processes.acts[:, None] * pushed).at[THRUST].add(-lost)
         environment = eqx.tree_at(
             lambda e: e.disturbance,
-            self.plant.environment,
-            disturbance_of(self.processes.acts[:, None] * pushed),
+            around,
+            disturbance_of(acting),
             is_leaf=lambda leaf: leaf is None,
         )
         plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)

@@ -19,6 +19,7 @@ from tuner.filter_error.disturbances import (
     USUAL,
     disturbance_of,
     processes_of,
+    thrust_lost,
     within,
 )
 from tuner.filter_error.strengths import Likelihood, likeliest
@@ -97,3 +98,16 @@ def test_slow_and_fast_moments_add_up() -> None:
     assert acting.moment is not None
     np.testing.assert_allclose(acting.force.stacked()[:, 0, 0], [1.0, 2.0, 3.0])
     np.testing.assert_allclose(acting.moment.stacked()[:, 0, 0], [4.0 + 7.0, 5.0 + 8.0, 9.0])
+
+
+@pytest.mark.parametrize("axial", [0.0, 0.03, -0.08, 1.0])
+def test_gusts_take_thrust_in_the_mean_whichever_way_they_blow(axial: float) -> None:
+    craft, speeds = vehicle(), (jnp.asarray(600.0),) * 4
+    draught = processes_of(craft, jnp.asarray(USUAL), 400.0).draught
+    fastest = float(craft.aerodynamics.max_relative_airspeed)
+    assert float(draught) == pytest.approx(np.exp(USUAL[1]) * fastest)
+    drawn = axial + float(draught) * np.random.default_rng(0).standard_normal(400_000)
+    static = float(craft.aerodynamics.motor_constant) * 4 * 600.0**2
+    expected = static * (np.abs(drawn).mean() - abs(axial)) / fastest
+    lost = float(thrust_lost(craft, jnp.asarray(axial), speeds, draught))
+    assert lost == pytest.approx(expected, abs=5e-3 * static * float(draught) / fastest)
