@@ -29,15 +29,13 @@ FEWEST = 5
 """Readings that a smoothing spline needs; fewer are joined by lines."""
 TREND = 10.0
 """s, the load's sag is what varies faster than such a polynomial trend follows."""
-SURE = 3.0
-"""Standard errors by which a resistance differs from none."""
 IDLE = 0.1
 """Rotor speed at no command over that at full command, as armed motors idle (thesis 5.2)."""
 LAG = 0.03
 """s by which rotors follow their commands, about; the sag follows the rotors."""
 SPIKE = 3.0
-"""Robust standard deviations of the load beyond which a reading does not speak of the resistance:
-a meter that reads ten times a second misses what a saturated command does."""
+"""Robust standard deviations of a load that commands tell beyond which a reading does not speak of
+the resistance: rotors do not follow a saturated command as they follow others."""
 
 
 @dataclass(frozen=True)
@@ -60,19 +58,20 @@ class Voltage:
 def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
     """Return each flight's voltage, None where it was not recorded.
 
-    All flights share one resistance, in V per unit of load; where they do not show that the voltage
-    falls with the load, the decline alone is smoothed.
+    All flights share one resistance, in V per unit of load; where the voltage does not fall with
+    the load by more than chance lets it, the decline alone is smoothed.
     """
     readings = [
         _averaged(flight.series[VOLTAGE]) if flight.has(VOLTAGE) else None for flight in flights
     ]
-    loads = _loads(flights)
+    signal, loads = _loads(flights)
     resistance = _resistance(
         [
             (reading, load)
             for reading, load in zip(readings, loads, strict=True)
             if reading is not None and load is not None
-        ]
+        ],
+        spikes_count=signal == "rotor_speed",
     )
     return [
         None if reading is None else _smoothed(reading, load, resistance)
@@ -80,8 +79,10 @@ def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
     ]
 
 
-def _loads(flights: Sequence[Flight]) -> list[Series | None]:
+def _loads(flights: Sequence[Flight]) -> tuple[str, list[Series | None]]:
     """Return the mean cube of each flight's rotor speeds, or of its motor commands, over time.
+
+    And of which.
 
     Rotor speeds where all rotors of all flights were recorded. Over the mean of all flights, so
     that a load (n, 1) is about one; None where a flight holds neither.
@@ -91,8 +92,8 @@ def _loads(flights: Sequence[Flight]) -> list[Series | None]:
         known = [cube for cube in cubes if cube is not None]
         if known and (signal == "command" or len(known) == len(flights)):
             mean = float(np.mean(np.concatenate([cube.values for cube in known])))
-            return [cube and Series(cube.time, cube.values / mean) for cube in cubes]
-    return [None] * len(flights)
+            return signal, [cube and Series(cube.time, cube.values / mean) for cube in cubes]
+    return "", [None] * len(flights)
 
 
 def _mean_cube(flight: Flight, signal: str) -> Series | None:
@@ -126,11 +127,14 @@ def _followed(time: Numbers, values: Numbers) -> Numbers:
     return values + behind
 
 
-def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:
+def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -> float:
     """Return by how many V the voltage falls per unit of load, from readings and loads.
 
-    Each flight's decline is a polynomial that both are cleared of; zero where the fall does not
-    exceed its standard error for sure.
+    Each flight's decline is a polynomial that both are cleared of. ``spikes_count``: whether loads
+    are known in spikes as well. Flights that hardly vary their
+    load tell it badly, and one that saturates for a moment sags by far more than they do: so it is
+    shrunk by the share of chance in its square (positive-part James and Stein 1961), rather than
+    taken for nothing where it is not sure.
     """
     falls, varied = [np.empty(0)], [np.empty(0)]
     for reading, load in pairs:
@@ -142,7 +146,7 @@ def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:
         both = np.stack([reading.values[:, 0], there], axis=1)
         left = both - trend @ np.linalg.lstsq(trend, both, rcond=None)[0]
         spread = 1.4826 * np.median(np.abs(left[:, 1]))
-        calm = np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12)
+        calm = spikes_count | (np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12))
         falls.append(-left[calm, 0])
         varied.append(left[calm, 1])
     fall, vary = np.concatenate(falls), np.concatenate(varied)
@@ -150,8 +154,8 @@ def _resistance(pairs: Sequence[tuple[Series, Series]]) -> float:
     if not information > 0.0:
         return 0.0
     resistance = float(vary @ fall) / information
-    error = np.sqrt(np.mean((fall - resistance * vary) ** 2) / information)
-    return resistance if resistance > SURE * error else 0.0
+    chance = float(np.mean((fall - resistance * vary) ** 2)) / information
+    return resistance - chance / resistance if resistance**2 > chance and resistance > 0.0 else 0.0
 
 
 def _smoothed(reading: Series, load: Series | None, resistance: float) -> Voltage:

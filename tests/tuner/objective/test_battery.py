@@ -24,7 +24,7 @@ from tuner.objective.battery import (
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.voltage import IDLE, voltages_of
+from tuner.objective.voltage import IDLE, _resistance, voltages_of
 from tuner.objective.windows import Window
 from tuner.search.normal_equations import normal_equations
 
@@ -230,3 +230,28 @@ def test_the_exponent_is_estimated_with_the_derivative_that_it_has(volts):
     assert float(fit.space.values(jnp.asarray(vector))["battery_exponent"]) == pytest.approx(
         1, abs=1e-4
     )
+
+
+@pytest.mark.parametrize(("true", "at_most"), [(0.15, 0.07), (0.0, 0.045)])
+def test_a_resistance_that_loads_hardly_tell_is_shrunk_not_dropped(true, at_most):
+    """Loads that vary by 2 % tell it to 0.05 V: dropped wherever it is not sure it would be 0."""
+    random, found = np.random.default_rng(0), []
+    time, fine = np.arange(0.0, 20.0, 0.1), np.arange(0.0, 20.0, 0.01)
+    for _ in range(40):
+        pairs = []
+        for _ in range(3):
+            load = 1.0 + 0.025 * np.sin(fine * random.uniform(2.0, 6.0))
+            volts = 16.2 - 0.01 * time - true * np.interp(time, fine, load)
+            volts = volts + NOISE * random.normal(size=len(time))
+            pairs.append((series(time, volts), series(fine, load)))
+        found.append(_resistance(pairs, spikes_count=False))
+    assert np.sqrt(np.mean((np.array(found) - true) ** 2)) < at_most
+
+
+def test_a_saturated_moment_tells_the_resistance_where_rotor_speeds_were_recorded():
+    time, fine = np.arange(0.0, 20.0, 0.1), np.arange(0.0, 20.0, 0.01)
+    random = np.random.default_rng(1)
+    load = 1.0 + 0.002 * random.normal(size=len(fine)) + ((fine > 5.0) & (fine < 5.35))
+    volts = 16.2 - 0.15 * np.interp(time, fine, load) + NOISE * random.normal(size=len(time))
+    found = _resistance([(series(time, volts), series(fine, load))], spikes_count=True)
+    assert found == pytest.approx(0.15, abs=0.03)
