@@ -92,6 +92,18 @@ def test_the_tables_numbers_are_those_of_the_vehicle_a_fit_starts_from(large) ->
     assert size_of(large).arm == pytest.approx(1.0, rel=1e-4)
 
 
+def test_about_up_what_blades_take_is_usual(large) -> None:
+    """A rotor's drag torque goes with its turns against the air, to which the body's turn adds."""
+    air, turn = large.aerodynamics, 1e-3
+    hover = np.sqrt(large.mass * 9.81 / (4.0 * air.motor_constant))
+    damping = sum(
+        air.moment_constant * air.motor_constant * sense * (hover + sense * turn) ** 2
+        for sense in (1.0, -1.0, 1.0, -1.0)
+    )
+    usual = COEFFICIENTS["angular_drag_z"].prior_sd
+    assert 0.7 * usual < damping / turn < 1.4 * usual
+
+
 def test_a_small_vehicles_drag_is_known_by_its_own_size(large) -> None:
     job = JobFile(free=("angular_drag_x", "motor_constant"))
     small, usual = (

@@ -242,16 +242,21 @@ EFFECT_ROWS = (
         _effect(
             f"angular_drag_{axis}",
             "N m s/rad",
-            f"damping of rotation about {direction}",
-            "what is left of inflow and flapping: -c·ω",
+            f"damping of rotation about {_AXES[axis]}",
+            source,
             group="angular_drag",
             limit=0.5,
-            prior_sd=0.01,
-            step=0.005,
+            prior_sd=usual,
+            step=0.5 * usual,
             mass_exponent=1,
             length_exponent=1.5,
             stands_in=True,
         )
-        for axis, direction in _AXES.items()
+        for axis, usual, source in (
+            ("x", 0.01, "what is left of inflow and flapping: -c·ω"),
+            ("y", 0.01, "what is left of inflow and flapping: -c·ω"),
+            # where inflow and flapping take nothing
+            ("z", 0.003, "blades that turn against the air, not the body: -c·ω, c = 2·k_m·k_f·ΣΩ"),
+        )
     ),
 )
