@@ -35,7 +35,7 @@ LOST = 0.05
 NUMBERS = 57
 """Of a state and its disturbances that samples correct, with four commands on their way."""
 NOISIER = 1.05
-"""Root mean square of a channel's whitened innovations from which it is noisier than assumed."""
+"""Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ class Predictor:
         learnt = replace(self, strengths=likeliest(likelihood, self.strengths)).at(objective, point)
         noise = dict(self.noise)
         for name, white in learnt._sizes():
-            spread = 1.4826 * float(np.median(white)) if len(white) else 1.0
-            noise[name] *= spread if spread > NOISIER else 1.0
+            spread = noise[name] * 1.4826 * float(np.median(white)) if len(white) else 1.0
+            noise[name] = spread if spread > NOISIER else 1.0
         if noise == self.noise:
             return learnt
         return replace(learnt, noise=noise).at(objective, point)
@@ -150,6 +150,11 @@ class Predictor:
         white = np.asarray(self.found.white, float)
         for name, rows in gathered(white, self.feed.widths, self.rows).items():
             yield name, np.abs(rows[rows != 0.0])
+
+    @property
+    def loss(self) -> float:
+        """Half the sum of squares of the whitened innovations, those beyond the gate as at it."""
+        return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
 
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
@@ -257,8 +262,12 @@ class Predictor:
 
 
 def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
-    """Return (K,) which coefficients recorded set-points hide: what lies upstream of them."""
-    return np.isin(names, INLETS["body_rate"].bypasses)
+    """Return (K,) which coefficients recorded set-points hide: what lies upstream of them.
+
+    And how high the markers sit: a loop holds its height to the millimetre, whereas a filter
+    begins at the height of the first sample.
+    """
+    return np.isin(names, (*INLETS["body_rate"].bypasses, "marker_offset_z"))
 
 
 def with_hidden(

@@ -39,6 +39,8 @@ def with_least_innovations(
     flights: Sequence[Flight],
     problem: tuple[Objective, Point, Criterion],
     free: Mask,
+    *,
+    learnt_from: Sequence[float] = LEARNT_FROM,
 ) -> tuple[Predictor, Point]:
     """Return the predictor whose innovations are least, and the point at which they are.
 
@@ -50,10 +52,12 @@ def with_least_innovations(
         With the point where the descent begins, and its criterion.
     free
         (K + offsets·N,) what may move.
+    learnt_from
+        s of each flight from which strengths are learnt, before each descent.
     """
     objective, point, criterion = problem
     point = Point(point.coefficients, predictor.feed.offsets)
-    for seconds in LEARNT_FROM:
+    for seconds in learnt_from:
         predictor = predictor.learnt(objective, point, seconds)
         point = _descended(predictor, objective, point, unscaled(criterion), free)
         laid = Predictor.of(objective, point, flights)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.filter_error.predictor import with_hidden
+from tuner.filter_error.predictor import hidden, with_hidden
 from tuner.uncertainty.information import FisherInformation
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
@@ -55,3 +55,8 @@ def test_what_innovations_say_of_the_others_stays():
     )
     np.testing.assert_array_equal(joined.blocks[..., HIDDEN, others], 0.0)
     np.testing.assert_array_equal(joined.score[..., others], predicted().score[..., others])
+
+
+def test_how_high_markers_sit_is_told_by_the_loop_alone():
+    names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z", "gyro_cutoff")
+    assert hidden(names).tolist() == [False, True, False, True, True]

@@ -125,6 +125,13 @@ def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fit
     assert (np.abs(missed) < 3.5 * error).all()
 
 
+def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:
+    problem, predictor, point = fitted
+    noisy = dict.fromkeys(predictor.noise, 1.3)
+    learnt = replace(predictor, noise=noisy).learnt(problem, point, 6.0)
+    assert all(noise == 1.0 for noise in learnt.noise.values())
+
+
 def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
     """A simulation would end there: the state frozen, and all samples that follow lost."""
     problem, predictor, point = fitted
