@@ -159,7 +159,7 @@ def trial_of(seed: int) -> Trial:
         selected = search_with_terms(
             job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
         )
-        fitted, examination = examined(selected, lambda *_: None, lambda _: None)
+        selected, fitted, examination = examined(selected, lambda *_: None, lambda _: None)
         seconds = time.process_time() - clock
     free = {
         name: estimate

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
-from numpy.typing import NDArray
 
-from tuner.coefficients import conditions
 from tuner.examination.examination import Examination, examine
 from tuner.filter_error.predictor import Predictor, hidden
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
-from tuner.filter_error.refit import with_least_innovations
+from tuner.filter_error.refit import LEARNT_FROM, with_least_innovations
 from tuner.findings import Code, Finding
-from tuner.job.extension import extended
 from tuner.job.holding import with_undetermined_held
+from tuner.job.innovations import Innovations
 from tuner.job.polish import polished
 from tuner.job.prepare import Job
 from tuner.job.search import free_offsets
@@ -28,41 +25,47 @@ from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
-from tuner.selection.doubt import in_doubt
-from tuner.selection.linear import linear_of
 from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
+from tuner.wording.phrases import listed
 
 CONTRADICTS = 4.0
-"""Standard errors of least squares by which no coefficient may move. Those errors are known from
-some ten stretches that do not depend on each other: with ten degrees of freedom chance alone takes
-one of a dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
+"""Standard errors by which no coefficient may move. Those of least squares are known from some ten
+stretches that do not depend on each other: with ten degrees of freedom chance alone takes one of a
+dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
+
+SELECTIONS = 2
+"""How often innovations may call for other terms, each time beside those of the last."""
 
 
 def examined(
     selected: Selected,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
-) -> tuple[Fitted, Examination]:
+) -> tuple[Selected, Fitted, Examination]:
     """Return the fit with what pushed the flights, or with what they leave open held.
 
-    And how well each coefficient is known.
+    And how well each coefficient is known; first the terms, of which innovations may call for
+    others.
     """
     with span("disturbances"):
         followed = with_disturbances(selected, on_progress, on_message)
     on_message("Examining how well each coefficient is known.")
+    if followed is not None:
+        return followed
     with span("examination"):
-        return followed or with_undetermined_held(
+        held = with_undetermined_held(
             selected.job, selected.fitted, on_progress, on_message, in_doubt=selected.in_doubt
         )
+    return (selected, *held)
 
 
 def with_disturbances(
     selected: Selected,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
-) -> tuple[Fitted, Examination] | None:
+) -> tuple[Selected, Fitted, Examination] | None:
     """Return the fit in which what pushed the flights is estimated too, and its examination.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
@@ -82,21 +85,27 @@ def with_disturbances(
         on_message("What pushed the flights is not followed: there are too many of them for that.")
         return None
     clock = time.perf_counter()
-    names, count = full.objective.space.names, len(full.fitted)
-    moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
-    offsets = free_offsets(job)
-    enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
-    free = np.concatenate([moves & ~hidden(names), enter.ravel()])
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
-    problem = full.objective, full.point, fitted.criterion
-    predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
+    there, predictor = _descended(selected, fitted, predictor, LEARNT_FROM)
+    seen = Innovations.of(selected, there, predictor)
+    for _ in range(SELECTIONS):
+        chosen = seen.selection()
+        if chosen is None:
+            break
+        groups = [row.group for row in chosen.rows if row.kept and row not in seen.selected.rows]
+        gone = [row.group for row in chosen.rows if not row.kept and row not in seen.selected.rows]
+        on_message(_said(groups, gone))
+        there, predictor = _descended(chosen, chosen.fitted, predictor, LEARNT_FROM[-1:])
+        seen = Innovations.of(chosen, there, predictor)
     if not predictor.keeps_track:
         on_message("What pushed them cannot be followed: the model lacks something else.")
         return None
+    job = seen.selected.job
+    offsets = free_offsets(job)
     again = polished(
         job,
-        replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)),
-        free=Free(np.zeros(count, bool), offsets),
+        there,
+        free=Free(np.zeros(len(job.space), bool), offsets),
         title="clocks",
         on_progress=lambda progress: on_progress(job, progress),
         stages=1,
@@ -106,58 +115,73 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    doubt, otherwise = _in_doubt(selected, again, predictor), alternatives_of(fitted.objective)
-    examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=doubt)
+    otherwise = alternatives_of(again.objective)
+    examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt())
+    otherwise = alternatives_of(fitted.objective)
     before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
     if not _agree(examination.uncertainty, before.uncertainty):
         on_message("It contradicts the fit of the simulated flights, which is kept.")
         return None
-    return (again, examination) if _is_sharper(examination, before) else None
+    sharper = _is_sharper(examination.uncertainty, before.uncertainty)
+    return (seen.selected, again, examination) if sharper else None
 
 
-def _in_doubt(selected: Selected, again: Fitted, predictor: Predictor) -> dict[str, float]:
-    """Return how far coefficients would move with terms that were left out, by the innovations.
+def _descended(
+    selected: Selected, fitted: Fitted, predictor: Predictor, learnt_from: Sequence[float]
+) -> tuple[Fitted, Predictor]:
+    """Return the fit to least innovations from a fit on, and what predicts there.
 
-    Of what set-points hide, by least squares. A steady wind is a disturbance like others.
+    The filter goes on from its own strengths and clocks.
     """
-    groups = [names for names in selected.left_out if not set(names) & set(conditions())]
-    if not groups:
-        return dict(selected.in_doubt)
-    _, wide = extended(selected.job, again, [name for names in groups for name in names])
-    space, at = wide.objective.space, wide.point.coefficients
-    beside = replace(predictor, simulator=wide.objective.simulator)
-    information = beside.information(wide.objective, wide.point, again.criterion)
-    scaled = np.asarray(space.scaled(jnp.asarray(at)))
-    linear = linear_of(information, scaled, space.prior_mean, 0.0)
-
-    def columns(names: Collection[str]) -> NDArray[np.intp]:
-        return np.flatnonzero(np.isin(space.names, list(names)))
-
-    held = set(again.held.values())
-    seen = ~hidden(again.objective.space.names)
-    known = [n for n, there in zip(again.objective.space.names, seen, strict=True) if there]
-    model = columns([name for name in known if name not in held])
-    moves = in_doubt(linear, model, [columns(names) for names in groups])
-    return {**selected.in_doubt, **{space.names[i]: float(moves[i]) for i in model}}
+    job, own = selected.job, predictor.feed.offsets
+    full = full_problem_of(fitted.objective, fitted.point)
+    point = Point(full.point.coefficients, own)
+    laid = Predictor.of(full.objective, point, job.fitted)
+    assert laid is not None
+    predictor = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
+    names, count = full.objective.space.names, len(full.fitted)
+    moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
+    offsets = free_offsets(job)
+    enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
+    free = np.concatenate([moves & ~hidden(names), enter.ravel()])
+    problem = full.objective, point, fitted.criterion
+    predictor, point = with_least_innovations(
+        predictor, job.fitted, problem, free, learnt_from=learnt_from
+    )
+    return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
 
 
 def _agree(new: Uncertainty, old: Uncertainty) -> bool:
-    """Return whether no coefficient moved by more than the error of the fit that it moved from.
+    """Return whether no coefficient moved by more than the errors of both fits allow.
 
     A filter knows more where its noise model holds, and something else where it does not. Of the
-    two estimates least squares' is the one that stays right then (Hausman 1978).
+    two estimates least squares' is the one that stays right then (Hausman 1978, who needs its
+    error alone: his other estimate is never the less sure one, ours is of what set-points tell).
     """
     return all(
-        abs(new.estimates[name].value - estimate.value) <= CONTRADICTS * estimate.std_error
+        abs(there.value - estimate.value)
+        <= CONTRADICTS * np.hypot(estimate.std_error, there.std_error)
         for name, estimate in old.estimates.items()
-        if name in new.estimates
+        if (there := new.estimates.get(name)) is not None
     )
 
 
-def _is_sharper(new: Examination, old: Examination) -> bool:
+def _is_sharper(new: Uncertainty, old: Uncertainty) -> bool:
     """Return whether coefficients are known better, in the mean of their errors' logarithms."""
-    errors = [np.log(examination.uncertainty.covariance.error) for examination in (new, old)]
-    return bool(np.mean(errors[0] - errors[1]) < 0.0)
+    ratios = [
+        there.std_error / estimate.std_error
+        for name, estimate in old.estimates.items()
+        if (there := new.estimates.get(name)) is not None
+    ]
+    return bool(np.mean(np.log(ratios)) < 0.0)
+
+
+def _said(groups: Sequence[str], gone: Sequence[str]) -> str:
+    """Return which terms innovations call for, and which they can do without."""
+    changed = [
+        f"{word} {listed(names)}" for word, names in (("with", groups), ("without", gone)) if names
+    ]
+    return f"Samples are predicted better so: fitting again {' and '.join(changed)}."
 
 
 def _finding(predictor: Predictor) -> Finding:

@@ -1,16 +1,22 @@
-"""A job and its fit with more coefficients free: terms come in at their neutral values."""
+"""A job and its fit with more coefficients free."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
+import jax.numpy as jnp
 import numpy as np
 
+from tuner.findings import Finding
+from tuner.job.findings import findings_at
 from tuner.job.prepare import Job
+from tuner.job.selected import offsets_of
+from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
 from tuner.search.fitted import Fitted
-from tuner.selection.candidates import with_terms
+from tuner.search.progress import feedback_of, with_feedback
+from tuner.selection.candidates import Groups, coefficients_in, conditions_in, with_terms
 
 
 def extended(
@@ -41,3 +47,38 @@ def extended(
         ),
         replace(fitted, objective=objective, point=point, outcomes=outcomes),
     )
+
+
+def with_groups(
+    base: tuple[Job, Fitted],
+    groups: Groups,
+    fitted: Fitted,
+    vector: Mapping[str, float],
+    *,
+    said: Collection[Finding],
+) -> tuple[Job, Fitted]:
+    """Return a base job with some groups in it, and its fit at the numbers of another one.
+
+    Parameters
+    ----------
+    base
+        Job and fit without any groups.
+    groups
+        What is free beside the base model.
+    fitted, vector
+        Where the fit with the groups is, and coefficient -> number of its search vector.
+    said
+        What that fit's findings say of its own coefficients.
+    """
+    job, grown = extended(*base, coefficients_in(groups), around=conditions_in(groups))
+    there = replace(
+        fitted,
+        objective=with_feedback(grown.objective, feedback_of(fitted.objective)),
+        outcomes=grown.outcomes,
+        point=Point(
+            jnp.asarray([vector[name] for name in job.space.names]),
+            offsets_of(fitted, grown.objective),
+        ),
+    )
+    others = [finding for finding in fitted.findings if finding not in said]
+    return job, replace(there, findings=(*others, *findings_at(job, there)))

@@ -226,7 +226,7 @@ def _fitted(
             raise
         if selected.job is job:
             ahead.await_examination()
-        return (selected, *examined(selected, on_progress, listener.on_message))
+        return examined(selected, on_progress, listener.on_message)
 
 
 def _validated(

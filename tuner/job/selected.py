@@ -27,12 +27,15 @@ class Selected:
     in_doubt
         Coefficient -> how far it would move, in the scaled coordinate, with terms that were tried
         and not kept; empty where none was tried.
+    base
+        Job and fit without any of them; None where none was tried.
     """
 
     job: Job
     fitted: Fitted
     rows: tuple[SelectionRow, ...] = ()
     in_doubt: Mapping[str, float] = field(default_factory=dict)
+    base: tuple[Job, Fitted] | None = None
 
     @property
     def left_out(self) -> tuple[tuple[str, ...], ...]:

@@ -21,7 +21,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.job.extension import extended
+from tuner.job.extension import with_groups
 from tuner.job.findings import findings_at
 from tuner.job.polish import polished, searched_again
 from tuner.job.prepare import Job
@@ -94,25 +94,13 @@ class Selection:
             if set(grown.added) <= set(state.added):
                 break
             state = grown
-        job, fitted = extended(
-            self.job,
-            self.fitted,
-            coefficients_in(state.added),
-            around=conditions_in(state.added),
+        base = self.job, self.fitted
+        job, fitted = with_groups(
+            base, state.added, state.fitted, state.vector, said=findings_at(*base)
         )
-        vector = [state.vector[name] for name in job.space.names]
-        fitted = replace(
-            state.fitted,
-            objective=with_feedback(fitted.objective, feedback_of(state.fitted.objective)),
-            outcomes=fitted.outcomes,
-            point=Point(jnp.asarray(vector), offsets_of(state.fitted, fitted.objective)),
-        )
-        said = findings_at(self.job, self.fitted)
-        others = [finding for finding in fitted.findings if finding not in said]
-        fitted = replace(fitted, findings=(*others, *findings_at(job, fitted)))
         rows = self._rows(state, dropped)
         fitted = fitted if state.added else self.fitted
-        selected = Selected(job, fitted, rows)
+        selected = Selected(job, fitted, rows, base=base)
         return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
 
     def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:

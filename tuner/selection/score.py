@@ -27,6 +27,7 @@ EARNING = (
     SelectionCode.PREDICTS_FLIGHTS,
     SelectionCode.PREDICTS_SECTIONS,
     SelectionCode.SIGNIFICANT,
+    SelectionCode.PREDICTS_SAMPLES,
 )
 DETERMINED = 1e-8
 """Share of a group's information that must be left once the model's coefficients follow it."""
@@ -71,6 +72,7 @@ def score(
     neutral: NDArray[np.float64] | None = None,
     gone: Columns | None = None,
     no_gust: bool = False,
+    material: float = MATERIAL,
 ) -> Score:
     """Return what a group is worth beside a model.
 
@@ -107,6 +109,8 @@ def score(
     no_gust
         Whether no gust can pass for the group: its law reads a recorded signal, or the fit with it
         leaves measurement noise alone.
+    material
+        Share of the loss below which a gain is no evidence.
     """
     columns = (model, np.concatenate([model, group]))
     to_neutral = np.zeros(len(linear.scaled)) if neutral is None else neutral - linear.scaled
@@ -128,25 +132,25 @@ def score(
     if not across:
         held_out = held_out.with_flights_alike(linear.flight)
         reason = SelectionCode.PREDICTS_SECTIONS
-    elif not held_out.is_sure and held_out.share > -patience * held_out.scatter:
+    elif not held_out.is_sure(material) and held_out.share > -patience * held_out.scatter:
         by_section = _held_out(linear, columns, (without, begin), linear.section)
-        if by_section.is_sure:
+        if by_section.is_sure(material):
             held_out, reason = by_section, SelectionCode.PREDICTS_SECTIONS
     minima, limit = (alone, with_group), SIGNIFICANCE / max(candidates, 1)
     chance = _chance(linear, model, group, minima)
     stays = inside and held_out.share > -patience * held_out.scatter  # nothing contradicts it
-    of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure)
+    of_few = reason is SelectionCode.PREDICTS_SECTIONS or (stays and not held_out.is_sure(material))
     if of_few and not no_gust:
         chance = max(chance, _chance(linear, model, group, minima, every_stretch_counts=False))
     if not by_flight:
         chance = max(chance, chance_of_gusts(linear, model, group, without))
     if not _is_determined(linear, model, group):
         reason = SelectionCode.NO_INFORMATION
-    elif fit.share < MATERIAL:
+    elif fit.share < material:
         reason = SelectionCode.IMMATERIAL
     elif chance > limit:
         reason = SelectionCode.NOT_SIGNIFICANT
-    elif not held_out.is_sure:
+    elif not held_out.is_sure(material):
         reason = SelectionCode.SIGNIFICANT if stays else SelectionCode.NOT_PREDICTED
     return Score(fit.share, held_out.share, held_out.scatter, chance, reason)
 
@@ -160,6 +164,7 @@ def surviving(
     neutral: NDArray[np.float64],
     stand_ins: Collection[str] = (),
     no_gusts: Collection[str] = (),
+    material: float = MATERIAL,
 ) -> tuple[dict[str, Score], dict[str, Score]]:
     """Return the scores of the groups that a backward elimination leaves, and of those it takes.
 
@@ -171,7 +176,7 @@ def surviving(
 
     Parameters
     ----------
-    linear, candidates, neutral
+    linear, candidates, neutral, material
         As of `score`; the point is the fit with all groups.
     model
         Columns of the coefficients that stay.
@@ -196,6 +201,7 @@ def surviving(
                 neutral=neutral,
                 gone=gone,
                 no_gust=name in no_gusts,
+                material=material,
             )
         idle = [name for name, found in scores.items() if not found.earns_place]
         if not idle:
@@ -267,10 +273,9 @@ class _Gain:
         deviations = [np.sqrt(len(parts)) * np.std(parts, ddof=1) for parts in several]
         return float(max(deviations, default=np.inf) / self.loss_without)
 
-    @property
-    def is_sure(self) -> bool:
+    def is_sure(self, material: float) -> bool:
         """Whether it is material and exceeds its scatter."""
-        return self.share > max(SURE * self.scatter, MATERIAL)
+        return self.share > max(SURE * self.scatter, material)
 
 
 def _steps(

@@ -19,6 +19,8 @@ class SelectionCode(StrEnum):
     """Kept: sections of the flights are, where one flight alone shows it."""
     SIGNIFICANT = "significant"
     """Kept: chance does not explain what it is worth, and nothing left out contradicts it."""
+    PREDICTS_SAMPLES = "predicts_samples"
+    """Kept: once what pushed the flights is followed, each sample is predicted better with it."""
     ASKED_FOR = "asked_for"
     """Kept: the job file names it."""
     OPEN_LOOP = "open_loop"
