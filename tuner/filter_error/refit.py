@@ -27,6 +27,10 @@ Mask = NDArray[np.bool_]
 LEARNT_FROM = (6.0, 18.0)
 """s of each flight from which strengths are learnt, each time before a descent: at first roughly,
 what least squares leaves of the disturbances in its coefficients is still in them."""
+MORE = 4
+"""Times that they are learnt and descended from again, at most, until little is gained by it."""
+SETTLED = 20.0
+"""Gain of the logarithmic likelihood from one time to the next that is little."""
 STEPS = 3
 """Of Gauss and Newton with gains that stay, at most."""
 HALVINGS = 3
@@ -53,12 +57,18 @@ def with_least_innovations(
     free
         (K + offsets·N,) what may move.
     learnt_from
-        s of each flight from which strengths are learnt, before each descent.
+        s of each flight from which strengths are learnt, before each descent; the last of them as
+        often as it takes where the descent began far off.
     """
     objective, point, criterion = problem
     point = Point(point.coefficients, predictor.feed.offsets)
-    for seconds in learnt_from:
+    loss = np.inf
+    for number, seconds in enumerate((*learnt_from, *[learnt_from[-1]] * MORE)):
         predictor = predictor.learnt(objective, point, seconds)
+        assert predictor.found is not None
+        before, loss = loss, float(np.sum(predictor.found.loss))
+        if number >= len(learnt_from) and before - loss < SETTLED:
+            break
         point = _descended(predictor, objective, point, unscaled(criterion), free)
         laid = Predictor.of(objective, point, flights)
         assert laid is not None

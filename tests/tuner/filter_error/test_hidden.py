@@ -58,5 +58,5 @@ def test_what_innovations_say_of_the_others_stays():
 
 
 def test_how_high_markers_sit_is_told_by_the_loop_alone():
-    names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z", "gyro_cutoff")
-    assert hidden(names).tolist() == [False, True, False, True, True]
+    names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z")
+    assert hidden(names).tolist() == [False, True, False, True]
