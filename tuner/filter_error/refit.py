@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 LEARNT_FROM = (6.0, 18.0)
 """s of each flight from which strengths are learnt, each time before a descent: at first roughly,
 what least squares leaves of the disturbances in its coefficients is still in them."""
-MORE = 4
+MORE = 6
 """Times that they are learnt and descended from again, at most, until little is gained by it."""
 SETTLED = 20.0
 """Gain of the logarithmic likelihood from one time to the next that is little."""
