@@ -33,7 +33,7 @@ which they would need at a rotor's arm to turn the vehicle as they do; the share
 a rotor's thrust wanders; the s that both last."""
 USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03])
 """Logarithms of what they are before anything is known."""
-LEAST = np.log([1e-6, 1e-6, 1e-6, 1e-6, 0.2, 0.005])
+LEAST = np.log([3e-5, 3e-5, 3e-5, 3e-5, 0.2, 0.005])
 MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15])
 """Logarithms between which they are looked for."""
 STRONGEST = 1.0

@@ -17,7 +17,7 @@ from tuner.filter_error.disturbances import USUAL
 from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations, stepped
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
-from tuner.filter_error.strengths import Likelihood, likeliest
+from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of
 from tuner.flights.flight import Flight
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.inlets import INLETS
@@ -32,6 +32,8 @@ AT_ONCE = 24
 """Parameters by which is differentiated at a time."""
 LOST = 0.05
 """Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
+LEARNT_FROM = 18.0
+"""s of each flight from which strengths are learnt: each of the six takes a filter of its own."""
 NUMBERS = 57
 """Of a state and its disturbances that samples correct, with four commands on their way."""
 NOISIER = 1.05
@@ -107,12 +109,24 @@ class Predictor:
             noise=dict.fromkeys(channels, 1.0),
         )
 
-    def learnt(self, objective: Objective, point: Point, seconds: float) -> Predictor:
-        """Return the predictor with the strengths, noise and gains that fit a point.
+    def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
+        """Return the same with samples at the ticks where a point's clocks have them.
 
-        Strengths are learnt from so many s of each flight, from those that are known on.
+        Before it has run.
         """
-        some = min(round(seconds * float(objective.schedule.log_rate)), self.ticks)
+        laid = Predictor.of(objective, point, flights)
+        assert laid is not None
+        return replace(laid, strengths=self.strengths, noise=self.noise)
+
+    def slopes(self, objective: Objective, point: Point) -> Slopes:
+        """Return how the likelihood changes with the strengths; innovations lie on ticks.
+
+        All are that of the first `LEARNT_FROM` of each flight, times as much as there is.
+        """
+        assert self.found is not None
+        some = min(round(LEARNT_FROM * float(objective.schedule.log_rate)), self.ticks)
+        whole = np.asarray(self.found.white)
+        share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
 
         def likelihood(strengths: Array) -> Likelihood:
             found = self._filtered(objective, point, strengths, some)
@@ -125,14 +139,19 @@ class Predictor:
                 float(np.sum(found.loss)), white.reshape(-1, wide), whitens.reshape(-1, wide, wide)
             )
 
-        learnt = replace(self, strengths=likeliest(likelihood, self.strengths)).at(objective, point)
+        slope, information, moved = slopes_of(likelihood, self.strengths)
+        ticks = np.zeros((len(moved), *whole.shape))
+        on_ticks = moved.reshape(len(moved), some, whole.shape[-1], -1)
+        ticks[:, :some] = np.moveaxis(on_ticks, -1, 2)
+        return Slopes(slope / share, information / share, ticks / share)
+
+    def as_noisy(self, objective: Objective, point: Point) -> Predictor:
+        """Return the predictor whose samples are as noisy as the innovations, or itself."""
         noise = dict(self.noise)
-        for name, white in learnt._sizes():
+        for name, white in self._sizes():
             spread = noise[name] * 1.4826 * float(np.median(white)) if len(white) else 1.0
             noise[name] = spread if spread > NOISIER else 1.0
-        if noise == self.noise:
-            return learnt
-        return replace(learnt, noise=noise).at(objective, point)
+        return self if noise == self.noise else replace(self, noise=noise).at(objective, point)
 
     @property
     def keeps_track(self) -> bool:

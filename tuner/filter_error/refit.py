@@ -1,22 +1,31 @@
-"""The coefficients that predict best: Gauss-Newton on whitened innovations.
+"""The coefficients and disturbances that make the recordings likeliest.
 
-Strengths of the disturbances, gains, and the ticks at which samples are taken stay while a point is
-descended to, then follow it.
+Gauss and Newton's steps on the innovations' likelihood, of coefficients, clocks and the strengths
+of the disturbances together: what least squares leaves of the disturbances in its coefficients
+makes them look stronger and slower than they are, and where they are taken for that the
+coefficients are biased in turn. Learnt one after the other they approach each other slowly.
+
+Innovations are differentiated with gains that stay: at the likeliest point the gains' own
+derivatives are met by innovations that nothing of the past explains. How likely a step's end is,
+the filter says with gains of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients.space import Space
+from tuner.filter_error.disturbances import LEAST, MOST, within
 from tuner.filter_error.predictor import Predictor, unscaled
+from tuner.filter_error.recorded import gathered
 from tuner.flights.flight import Flight
-from tuner.objective.criterion import Criterion, Jacobian, Point, SegmentSums
+from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.loss import gauss_newton, robust_loss
 from tuner.objective.normal import Objective
 from tuner.search.normal_equations import normal_equations
@@ -24,18 +33,14 @@ from tuner.search.normal_equations import normal_equations
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LEARNT_FROM = (6.0, 18.0)
-"""s of each flight from which strengths are learnt, each time before a descent: at first roughly,
-what least squares leaves of the disturbances in its coefficients is still in them."""
-MORE = 6
-"""Times that they are learnt and descended from again, at most, until little is gained by it."""
-SETTLED = 20.0
-"""Gain of the logarithmic likelihood from one time to the next that is little."""
-STEPS = 3
-"""Of Gauss and Newton with gains that stay, at most."""
-HALVINGS = 3
-ENOUGH = 0.3
-"""Gain of the loss, in half a unit of χ², below which a step was the last."""
+STEPS = 16
+"""At most."""
+DAMPED = (0.0, 0.1, 1.0, 10.0, 100.0)
+"""Shares of the Hessian's diagonal that are added to it until a step leads down (Levenberg)."""
+FURTHEST = float(np.log(4.0))
+"""That a strength moves at a time: beyond, the likelihood is no parabola."""
+ENOUGH = 0.1
+"""Gain that a step promises, in half a unit of χ², below which it is not worth taking."""
 
 
 def with_least_innovations(
@@ -43,88 +48,126 @@ def with_least_innovations(
     flights: Sequence[Flight],
     problem: tuple[Objective, Point, Criterion],
     free: Mask,
-    *,
-    learnt_from: Sequence[float] = LEARNT_FROM,
 ) -> tuple[Predictor, Point]:
-    """Return the predictor whose innovations are least, and the point at which they are.
+    """Return the predictor to which the recordings are likeliest, and the point where they are.
 
     Parameters
     ----------
     predictor, flights
-        The predictor of N flights.
+        The predictor of N flights, with the strengths to begin from.
     problem
         With the point where the descent begins, and its criterion.
     free
         (K + offsets·N,) what may move.
-    learnt_from
-        s of each flight from which strengths are learnt, before each descent; the last of them as
-        often as it takes where the descent began far off.
     """
     objective, point, criterion = problem
+    criterion = unscaled(criterion)
     point = Point(point.coefficients, predictor.feed.offsets)
-    loss = np.inf
-    for number, seconds in enumerate((*learnt_from, *[learnt_from[-1]] * MORE)):
-        predictor = predictor.learnt(objective, point, seconds)
-        assert predictor.found is not None
-        before, loss = loss, float(np.sum(predictor.found.loss))
-        if number >= len(learnt_from) and before - loss < SETTLED:
-            break
-        point = _descended(predictor, objective, point, unscaled(criterion), free)
-        laid = Predictor.of(objective, point, flights)
-        assert laid is not None
-        predictor = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
-    return predictor.at(objective, point), point
-
-
-def _descended(
-    predictor: Predictor, objective: Objective, point: Point, criterion: Criterion, free: Mask
-) -> Point:
-    """Return the point of least loss, by steps that are halved if they lead up."""
-    kinds, flights = np.shape(point.offsets)
-    count = len(objective.space)
-    moved = [
-        *np.flatnonzero(free[:count]),
-        *(count + np.flatnonzero(free[count:].reshape(kinds, flights).any(axis=1))),
-    ]
-
-    def equations(at: Point) -> tuple[float, Array, Array]:
-        sums = _sums(predictor.jacobian(objective, at, moved), criterion)
-        loss, gradient, hessian = normal_equations(
-            objective.space, objective.segments.flight, at, criterion, sums
-        )
-        return float(loss), np.asarray(gradient), np.asarray(hessian)
-
-    here = equations(point)
+    predictor = predictor.at(objective, point)
     for _ in range(STEPS):
-        change = _step(objective.space, point, here[1], here[2], free)
-        for halving in range(HALVINGS + 1):
-            tried = _moved(objective.space, point, change * 0.5**halving)
-            there = equations(tried)
-            if there[0] < here[0]:
-                break
-        else:
-            return point
-        gained, here, point = here[0] - there[0], there, tried
-        if gained < ENOUGH:
+        lower = _lower(predictor, objective, point, criterion, free)
+        if lower is None:
             break
-    return point
+        predictor, point = lower
+        settled = predictor.laid(objective, point, flights)
+        if any((settled.rows[name] != predictor.rows[name]).any() for name in predictor.rows):
+            predictor = settled.at(objective, point)
+        predictor = predictor.as_noisy(objective, point)
+    return predictor, point
 
 
-def _sums(jacobian: Jacobian, criterion: Criterion) -> SegmentSums:
-    """Return each segment's loss with its derivatives, not divided by how much was compared."""
-    segments = len(jacobian.crash_time)
-    gradient, hessian = gauss_newton(
-        jacobian.columns, jacobian.residuals, criterion.scale, criterion.huber
-    )
-    return SegmentSums(
-        loss=robust_loss(jacobian.residuals, criterion.huber),
-        gradient=gradient,
-        hessian=hessian,
+def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: Criterion) -> float:
+    """Return the negative log-likelihood of the recordings, with that of the priors."""
+    assert predictor.found is not None
+    count, segments = len(objective.space) + len(point.offsets), objective.segments.flight
+    nothing = SegmentSums(
+        loss=jnp.zeros(len(segments)),
+        gradient=jnp.zeros((count, len(segments))),
+        hessian=jnp.zeros((count, count, len(segments))),
         squares={},
         counts={},
-        crash_time=jnp.full(segments, jnp.inf),
+        crash_time=jnp.full(len(segments), jnp.inf),
         states=None,
     )
+    priors = normal_equations(objective.space, segments, point, criterion, nothing)[0]
+    return float(np.sum(predictor.found.loss) + priors)
+
+
+class _Equations(NamedTuple):
+    """Gradient (P + 6,) and Hessian of the loss, by P parameters and then by the strengths."""
+
+    gradient: Array
+    hessian: Array
+
+
+def _equations(
+    predictor: Predictor,
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    moved: Sequence[int],
+) -> _Equations:
+    """Return gradient and Hessian at a point; ``moved`` of its coefficients and offsets enter."""
+    space, flight = objective.space, np.asarray(objective.segments.flight)
+    (kinds, flights), count = point.offsets.shape, len(space)
+    size = count + kinds
+    jacobian = predictor.jacobian(objective, point, moved)
+    slopes = predictor.slopes(objective, point)
+    by_strengths = gathered(slopes.moved, predictor.feed.widths, predictor.rows)
+    columns = {
+        name: jnp.concatenate([jacobian.columns[name], jnp.asarray(more)])
+        for name, more in by_strengths.items()
+    }
+    gradient, hessian = gauss_newton(columns, jacobian.residuals, criterion.scale, criterion.huber)
+    sums = SegmentSums(
+        loss=robust_loss(jacobian.residuals, criterion.huber),
+        gradient=gradient[:size],
+        hessian=hessian[:size, :size],
+        squares={},
+        counts={},
+        crash_time=jacobian.crash_time,
+        states=None,
+    )
+    _, own, among = map(np.asarray, normal_equations(space, flight, point, criterion, sums))
+    across = np.asarray(hessian[:size, size:])
+    owner = flight[:, None] == np.arange(flights)
+    of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
+    across = np.concatenate([across[:count].sum(axis=-1), of_flights])
+    # the loss of a strength that vanishes goes with its square, of which Fisher knows nothing
+    bend = slopes.information + np.diag(2.0 * np.maximum(slopes.slope, 0.0) + 1e-9)
+    return _Equations(
+        np.concatenate([own, slopes.slope]), np.block([[among, across], [across.T, bend]])
+    )
+
+
+def _lower(
+    predictor: Predictor,
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    free: Mask,
+) -> tuple[Predictor, Point] | None:
+    """Return what predicts at the end of a step, and where that is; None if nothing is gained."""
+    kinds, flights = np.shape(point.offsets)
+    count, parameters, strengths = len(objective.space), len(free), predictor.strengths
+    by_kind = free[count:].reshape(kinds, flights).any(axis=1)
+    moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
+    gradient, hessian = _equations(predictor, objective, point, criterion, moved)
+    slope = gradient[parameters:]
+    held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
+    free = np.concatenate([free, ~held])
+    here = _loss(predictor, objective, point, criterion)
+    for damping in DAMPED:
+        damped = hessian + damping * np.diag(np.diag(hessian))
+        change = _step(objective.space, point, gradient, damped, free)
+        if -0.5 * (gradient @ change) < ENOUGH:
+            return None
+        by_strengths = np.clip(change[parameters:], -FURTHEST, FURTHEST)
+        to = _moved(objective.space, point, change[:parameters])
+        tried = replace(predictor, strengths=within(strengths + by_strengths)).at(objective, to)
+        if _loss(tried, objective, to, criterion) < here:
+            return tried, to
+    return None
 
 
 def _step(space: Space, point: Point, gradient: Array, hessian: Array, free: Mask) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from tuner.examination.examination import Examination, examine
 from tuner.filter_error.predictor import Predictor, hidden
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
-from tuner.filter_error.refit import LEARNT_FROM, with_least_innovations
+from tuner.filter_error.refit import with_least_innovations
 from tuner.findings import Code, Finding
 from tuner.job.holding import with_undetermined_held
 from tuner.job.innovations import Innovations
@@ -86,7 +86,7 @@ def with_disturbances(
         return None
     clock = time.perf_counter()
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
-    there, predictor = _descended(selected, fitted, predictor, LEARNT_FROM)
+    there, predictor = _descended(selected, fitted, predictor)
     seen = Innovations.of(selected, there, predictor)
     for _ in range(SELECTIONS):
         chosen = seen.selection()
@@ -95,7 +95,7 @@ def with_disturbances(
         groups = [row.group for row in chosen.rows if row.kept and row not in seen.selected.rows]
         gone = [row.group for row in chosen.rows if not row.kept and row not in seen.selected.rows]
         on_message(_said(groups, gone))
-        there, predictor = _descended(chosen, chosen.fitted, predictor, LEARNT_FROM[-1:])
+        there, predictor = _descended(chosen, chosen.fitted, predictor)
         seen = Innovations.of(chosen, there, predictor)
     if not predictor.keeps_track:
         on_message("What pushed them cannot be followed: the model lacks something else.")
@@ -127,7 +127,7 @@ def with_disturbances(
 
 
 def _descended(
-    selected: Selected, fitted: Fitted, predictor: Predictor, learnt_from: Sequence[float]
+    selected: Selected, fitted: Fitted, predictor: Predictor
 ) -> tuple[Fitted, Predictor]:
     """Return the fit to least innovations from a fit on, and what predicts there.
 
@@ -136,18 +136,14 @@ def _descended(
     job, own = selected.job, predictor.feed.offsets
     full = full_problem_of(fitted.objective, fitted.point)
     point = Point(full.point.coefficients, own)
-    laid = Predictor.of(full.objective, point, job.fitted)
-    assert laid is not None
-    predictor = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
+    predictor = predictor.laid(full.objective, point, job.fitted)
     names, count = full.objective.space.names, len(full.fitted)
     moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
     offsets = free_offsets(job)
     enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
     free = np.concatenate([moves & ~hidden(names), enter.ravel()])
     problem = full.objective, point, fitted.criterion
-    predictor, point = with_least_innovations(
-        predictor, job.fitted, problem, free, learnt_from=learnt_from
-    )
+    predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
     return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
 
 

@@ -13,7 +13,7 @@ import pytest
 from sim_jax.crash import Limits
 from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
-from tuner.filter_error.disturbances import COUNT, disturbance_of, processes_of
+from tuner.filter_error.disturbances import COUNT, USUAL, disturbance_of, processes_of
 from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, unscaled
 from tuner.filter_error.refit import with_least_innovations
@@ -125,11 +125,32 @@ def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fit
     assert (np.abs(missed) < 3.5 * error).all()
 
 
+def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
+    """Where coefficients and disturbances explain each other's innovations, both have to move."""
+    problem, predictor, point = fitted
+    flights = gusty(exact, 1)[1]
+    criterion = making.fitted_of(problem, point).criterion
+    vector, free = np.array(point.coefficients), np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
+    wrong = {"inertia_xx": 1.15, "inertia_yy": 1.2, "time_constant_up": 1.8}
+    for name, factor in wrong.items():
+        vector[exact.space.names.index(name)] *= factor
+    begin = replace(predictor, strengths=USUAL + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0]))
+    where = Point(jnp.asarray(vector), point.offsets)
+    again, there = with_least_innovations(begin, flights, (problem, where, criterion), free)
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    slope = exact.space.slope(np.asarray(point.coefficients))
+    moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
+    assert (np.abs(moved) < 0.5 * error).all()
+    assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=0.5)
+
+
 def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:
     problem, predictor, point = fitted
-    noisy = dict.fromkeys(predictor.noise, 1.3)
-    learnt = replace(predictor, noise=noisy).learnt(problem, point, 6.0)
-    assert all(noise == 1.0 for noise in learnt.noise.values())
+    noisy = replace(predictor, noise=dict.fromkeys(predictor.noise, 1.3)).at(problem, point)
+    assert all(noise == 1.0 for noise in noisy.as_noisy(problem, point).noise.values())
 
 
 def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
