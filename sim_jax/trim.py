@@ -1,7 +1,9 @@
 """A vehicle in trim: the level hover in which nothing pushes or turns it.
 
 An offset centre of mass, uneven rotors or a steady moment ask different rotors for different
-speeds, which the rate controller's integrator has found long before a mission starts.
+speeds, which the rate controller's integrator has found long before a mission starts. And the
+commands that are on their way to the motors then are those that hold these speeds: the first that
+is recorded may answer the mission's first set-point already.
 """
 
 from __future__ import annotations
@@ -23,9 +25,6 @@ from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 
-UNEVEN = ("center_of_mass", "rotor_thrust_scale", "torque_trim")
-"""Beginnings of the effects' names with which rotors in trim differ."""
-
 _Row: TypeAlias = list[Scalar]
 
 
@@ -43,7 +42,7 @@ def in_trim(
     Parameters
     ----------
     vehicle, controller
-        Of the flight; a quadrotor. One whose rotors are even starts as it would without this.
+        Of the flight. One without four rotors starts as it would without this.
     start
         Level where it rests.
     resting
@@ -53,9 +52,7 @@ def in_trim(
     gravity
         m/s².
     """
-    if len(vehicle.rotors) != ROTORS or not any(
-        name.startswith(UNEVEN) for name in vehicle.effects
-    ):
+    if len(vehicle.rotors) != ROTORS:
         return start
     speeds = trim_speeds(vehicle, gravity=gravity)
     asked = speeds if speed_factor is None else tuple(speed / speed_factor for speed in speeds)

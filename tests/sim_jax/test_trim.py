@@ -60,9 +60,16 @@ def test_a_battery_asks_for_larger_commands_and_the_same_speeds():
         assert 0.95 * reference_speed(craft.motor, command) == pytest.approx(speed)
 
 
-def test_an_even_or_a_moving_vehicle_starts_as_recorded():
+def test_an_even_vehicle_rests_whatever_its_first_command_answers():
     level = hover(vehicle(), vec(0.0, 0.0, 1.0))
-    assert in_trim(vehicle(), controller(), level, AT_REST) is level
+    pushed = replace(level, command=tuple(command + 0.2 for command in level.command))
+    trimmed = in_trim(vehicle(), controller(), pushed, AT_REST)
+    for kept, held in zip(jax.tree.leaves(trimmed), jax.tree.leaves(level), strict=True):
+        np.testing.assert_allclose(kept, held, atol=1e-12)
+
+
+def test_a_moving_vehicle_starts_as_recorded():
+    level = hover(vehicle(), vec(0.0, 0.0, 1.0))
     moving = in_trim(uneven(**UNEVEN), controller(), level, jnp.asarray(False))
     for kept, recorded in zip(jax.tree.leaves(moving), jax.tree.leaves(level), strict=True):
         np.testing.assert_array_equal(kept, recorded)
