@@ -9,6 +9,9 @@ from __future__ import annotations
 from tuner.coefficients.coefficient import EFFECTS, Coefficient, NotCarried, Written
 
 _AXES = {"x": "forward", "y": "left", "z": "up"}
+_CENTRED = {"x": 0.01, "y": 0.01, "z": 0.03}
+"""m by which the centre of mass is usually elsewhere: builders balance a vehicle about its rotors,
+but how far below them its battery hangs is rarely measured."""
 
 
 def _effect(
@@ -157,7 +160,7 @@ EFFECT_ROWS = (
             "a battery is never quite in the middle",
             group="center_of_mass",
             limit=0.1,
-            prior_sd=0.01,
+            prior_sd=_CENTRED[axis],
             step=0.005,
             length_exponent=1.0,
             gazebo=Written("pose", "centre"),
