@@ -49,9 +49,9 @@ def air(
     random
         Where chance comes from.
     shape
-        Control ticks, and flights.
+        Ticks, and flights.
     rate
-        Hz of the ticks.
+        Hz of the ticks: enough for what forgets in `WANDER_TIME`.
     mass
         kg.
     places
@@ -72,4 +72,5 @@ def air(
         gust=Vec3(*(jnp.asarray(wind[:, axis]) for axis in range(3))),
         thrust=jnp.asarray(thrust.sum(axis=1)),
         moment=Vec3(*(jnp.asarray(np.einsum("r,trf->tf", arm, thrust)) for arm in arms)),
+        rate=rate,
     )

@@ -233,8 +233,8 @@ def _flier(schedule: Schedule) -> Callable[..., Rollout]:
 
 
 def _air(lab: Lab, random: np.random.Generator, schedule: Schedule) -> Disturbance:
-    """Return what pushes a laboratory's flights."""
-    rate = schedule.position_control_rate
+    """Return what pushes a laboratory's flights, anew with every step of physics."""
+    rate = float(schedule.physics_rate)
     return air(
         random,
         shape=(round(SECONDS * rate) + 4, len(TRAJECTORIES)),

@@ -108,7 +108,7 @@ def recorded(
 
 def _air(objective: Objective, model: Model, random: np.random.Generator) -> Disturbance:
     vehicle = model.vehicle
-    rate = float(objective.schedule.position_control_rate)
+    rate = float(objective.schedule.physics_rate)
     ticks = int(np.ceil(objective.samples * rate / objective.schedule.log_rate)) + 2
     return air(
         random,

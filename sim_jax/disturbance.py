@@ -15,7 +15,7 @@ from sim_jax.vector import Vec3
 
 
 class Disturbance(eqx.Module):
-    """Series with a value for every control tick, linear in between; what is None is not there.
+    """Series with a value for every tick, linear in between; what is None is not there.
 
     After its end the last value stays.
     """
@@ -28,16 +28,19 @@ class Disturbance(eqx.Module):
     """N along body z."""
     moment: Vec3 | None = None
     """N m about the centre of mass, body axes, leaves (ticks, \\*batch)."""
+    rate: float | None = eqx.field(static=True, default=None)
+    """Hz of the ticks; None for those of position control."""
 
     @property
     def at_first(self) -> Disturbance:
-        """The values at the first control tick, every leaf (\\*batch)."""
+        """The values at the first tick, every leaf (\\*batch)."""
         first: Disturbance = jax.tree.map(lambda series: series[0], self)
         return first
 
     def during(self, step: Int[Array, ""], schedule: Schedule) -> Disturbance:
         """Return the values in the middle of a physics step, every leaf (\\*batch)."""
-        ticks = (step + 0.5) * (schedule.position_control_rate / schedule.physics_rate)
+        rate = schedule.position_control_rate if self.rate is None else self.rate
+        ticks = (step + 0.5) * (rate / schedule.physics_rate)
         tick = jnp.floor(ticks)
         before, share = tick.astype(step.dtype), ticks - tick
 

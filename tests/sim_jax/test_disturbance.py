@@ -92,6 +92,14 @@ def test_values_are_linear_between_control_ticks() -> None:
     assert float(last.thrust) == pytest.approx(0.1 * (TICKS - 1))
 
 
+def test_ticks_of_their_own_rate_are_as_fine_as_that() -> None:
+    rate = 2.0 * SCHEDULE.physics_rate
+    ramp = Disturbance(thrust=jnp.arange(40) * 0.1, rate=rate)
+    middle = ramp.during(jnp.asarray(5), SCHEDULE)  # 5.5 steps of two ticks
+    assert middle.thrust is not None
+    assert float(middle.thrust) == pytest.approx(0.1 * 11.0)
+
+
 def test_a_flights_derivative_by_a_push_is_finite() -> None:
     def end(thrust: jax.Array) -> jax.Array:
         around = Environment(disturbance=Disturbance(thrust=thrust))
