@@ -109,6 +109,8 @@ def test_what_is_learnt_of_the_disturbances_is_what_pushed(fitted) -> None:
     _, predictor, _ = fitted
     gust = np.exp(predictor.strengths[0] - STRENGTHS[0])
     assert 1.0 / 3.0 < gust < 3.0  # of twelve seconds, in which gusts last one
+    turbulence = np.exp(predictor.strengths[3] - STRENGTHS[3])
+    assert turbulence == pytest.approx(1.0, abs=0.15)  # 0.75 where it begins
 
 
 def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fitted, exact) -> None:
