@@ -43,6 +43,28 @@ T = TypeVar("T")
 
 GATE = 4.0
 """Standard deviations beyond which an innovation corrects no further: an outlier."""
+WIDER = 4.0
+"""Times, each innovation in a row that lies beyond."""
+WIDEST = 5
+"""In a row beyond which the gate grows no further."""
+
+
+def gated(white: Array, beyond: Array) -> tuple[Array, Array]:
+    """Return what whitened innovations correct by, and how many in a row lie beyond the gate.
+
+    One is an outlier; the next ones say that the filter has lost the flight, which at its gate it
+    would never find again: each in a row widens it, so after a few they correct as they are.
+
+    Parameters
+    ----------
+    white
+        (m, F); zero where nothing was sampled.
+    beyond
+        (m, F) how many in a row before these.
+    """
+    gate = GATE * WIDER ** jnp.minimum(beyond, WIDEST)
+    outside = jnp.where(jnp.abs(white) > GATE, beyond + 1, 0)
+    return jnp.clip(white, -gate, gate), jnp.where(white != 0.0, outside, beyond)
 
 
 def deviance(white: Array) -> Array:
@@ -173,7 +195,7 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
         sd = jnp.concatenate([jnp.asarray(first_sd), processes.sd])
 
         def tick(number: Array, carried: Any) -> Any:
-            state, pushed, covariance, before, loss, kept = carried
+            state, pushed, covariance, before, beyond, loss, kept = carried
             samples = row_of(feed.samples, number)
 
             def compare(change: Array) -> tuple[Array, Array]:
@@ -202,7 +224,8 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
                 kept,
                 (jnp.moveaxis(gain, 0, -1), jnp.moveaxis(whitens, 0, -1), white),
             )
-            change = -jnp.einsum("fik,kf->if", gain, jnp.clip(white, -GATE, GATE))
+            corrects, beyond = gated(white, beyond)
+            change = -jnp.einsum("fik,kf->if", gain, corrects)
             state, pushed = (
                 observer.corrected(state, change[:-COUNT], number, in_flight),
                 pushed + change[-COUNT:],
@@ -224,6 +247,7 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
                 pushed * processes.keeps[:, None],
                 covariance,
                 before,
+                beyond,
                 loss + 0.5 * deviance(white).sum(axis=0) + scatter,
                 kept,
             )
@@ -237,6 +261,7 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
             jnp.zeros((COUNT, segments)),
             jnp.broadcast_to(jnp.diag(sd**2), (segments, size, size)),
             observer.seen(first, jnp.asarray(0)),
+            jnp.zeros((wide, segments), int),
             jnp.zeros(segments),
             empty,
         )
@@ -282,23 +307,27 @@ def _innovations(
             in_flight = commands_in_flight(state, gains.gain.shape[1] - COUNT)
 
             def tick(carried: Any, given: Any) -> tuple[Any, Array]:
-                state, pushed, before = carried
+                state, pushed, before, beyond = carried
                 number, samples, gain = given
                 error = observer.errors(observer.seen(state, number), before, samples)
                 white = jnp.einsum("kmf,mf->kf", gain.whitens, error)
-                change = -jnp.einsum("ikf,kf->if", gain.gain, jnp.clip(white, -GATE, GATE))
+                corrects, beyond = gated(white, beyond)
+                change = -jnp.einsum("ikf,kf->if", gain.gain, corrects)
                 state, pushed = (
                     observer.corrected(state, change[:-COUNT], number, in_flight),
                     pushed + change[-COUNT:],
                 )
                 before = observer.seen(state, number)
                 after = observer.next(state, pushed, number)
-                return (after, pushed * observer.processes.keeps[:, None], before), white
+                pushed = pushed * observer.processes.keeps[:, None]
+                return (after, pushed, before, beyond), white
 
+            segments, wide = offsets.shape[-1], gains.whitens.shape[1]
             begin = (
                 state,
-                jnp.zeros((COUNT, offsets.shape[-1])),
+                jnp.zeros((COUNT, segments)),
                 observer.seen(state, jnp.asarray(0)),
+                jnp.zeros((wide, segments), int),
             )
             numbers = jnp.arange(gains.gain.shape[0])
             white: Array = lax.scan(tick, begin, (numbers, feed.samples, gains))[1]

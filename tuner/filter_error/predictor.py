@@ -157,7 +157,7 @@ class Predictor:
     def keeps_track(self) -> bool:
         """Whether few innovations of any channel are outliers, and all are finite.
 
-        Beyond the gate an innovation corrects no further: a filter that is lost stays lost.
+        Outliers are rare; many are samples of what the model does not do.
         """
         return all(
             np.mean(~(white <= GATE)) <= LOST for _, white in self._sizes() if len(white) > 0

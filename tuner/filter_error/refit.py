@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 STEPS = 16
-"""At most."""
+"""At most, by default."""
 DAMPED = (0.0, 0.1, 1.0, 10.0, 100.0)
 """Shares of the Hessian's diagonal that are added to it until a step leads down (Levenberg)."""
 FURTHEST = float(np.log(4.0))
@@ -48,6 +48,7 @@ def with_least_innovations(
     flights: Sequence[Flight],
     problem: tuple[Objective, Point, Criterion],
     free: Mask,
+    steps: int = STEPS,
 ) -> tuple[Predictor, Point]:
     """Return the predictor to which the recordings are likeliest, and the point where they are.
 
@@ -59,12 +60,14 @@ def with_least_innovations(
         With the point where the descent begins, and its criterion.
     free
         (K + offsets·N,) what may move.
+    steps
+        At most.
     """
     objective, point, criterion = problem
     criterion = unscaled(criterion)
     point = Point(point.coefficients, predictor.feed.offsets)
     predictor = predictor.at(objective, point)
-    for _ in range(STEPS):
+    for _ in range(steps):
         lower = _lower(predictor, objective, point, criterion, free)
         if lower is None:
             break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from tuner.examination.examination import Examination, examine
 from tuner.filter_error.predictor import Predictor, hidden
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
-from tuner.filter_error.refit import with_least_innovations
+from tuner.filter_error.refit import STEPS, with_least_innovations
 from tuner.findings import Code, Finding
 from tuner.job.holding import with_undetermined_held
 from tuner.job.innovations import Innovations
@@ -35,8 +35,10 @@ CONTRADICTS = 4.0
 stretches that do not depend on each other: with ten degrees of freedom chance alone takes one of a
 dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
 
-SELECTIONS = 2
+SELECTIONS = 3
 """How often innovations may call for other terms, each time beside those of the last."""
+ROUGHLY = 2
+"""Steps before they do so first: what is missing would in time be taken for disturbances."""
 
 
 def examined(
@@ -86,17 +88,17 @@ def with_disturbances(
         return None
     clock = time.perf_counter()
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
-    there, predictor = _descended(selected, fitted, predictor)
+    there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
     seen = Innovations.of(selected, there, predictor)
-    for _ in range(SELECTIONS):
+    for number in range(SELECTIONS):
         chosen = seen.selection()
-        if chosen is None:
+        if chosen is None and number > 0:
             break
-        groups = [row.group for row in chosen.rows if row.kept and row not in seen.selected.rows]
-        gone = [row.group for row in chosen.rows if not row.kept and row not in seen.selected.rows]
-        on_message(_said(groups, gone))
-        there, predictor = _descended(chosen, chosen.fitted, predictor)
-        seen = Innovations.of(chosen, there, predictor)
+        if chosen is not None:
+            on_message(_said(seen.selected, chosen))
+            selected, there = chosen, chosen.fitted
+        there, predictor = _descended(selected, there, predictor)
+        seen = Innovations.of(selected, there, predictor)
     if not predictor.keeps_track:
         on_message("What pushed them cannot be followed: the model lacks something else.")
         return None
@@ -127,7 +129,7 @@ def with_disturbances(
 
 
 def _descended(
-    selected: Selected, fitted: Fitted, predictor: Predictor
+    selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = STEPS
 ) -> tuple[Fitted, Predictor]:
     """Return the fit to least innovations from a fit on, and what predicts there.
 
@@ -143,7 +145,7 @@ def _descended(
     enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
     free = np.concatenate([moves & ~hidden(names), enter.ravel()])
     problem = full.objective, point, fitted.criterion
-    predictor, point = with_least_innovations(predictor, job.fitted, problem, free)
+    predictor, point = with_least_innovations(predictor, job.fitted, problem, free, steps)
     return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
 
 
@@ -172,8 +174,11 @@ def _is_sharper(new: Uncertainty, old: Uncertainty) -> bool:
     return bool(np.mean(np.log(ratios)) < 0.0)
 
 
-def _said(groups: Sequence[str], gone: Sequence[str]) -> str:
+def _said(before: Selected, after: Selected) -> str:
     """Return which terms innovations call for, and which they can do without."""
+    changes = [row for row in after.rows if row not in before.rows]
+    groups = [row.group for row in changes if row.kept]
+    gone = [row.group for row in changes if not row.kept]
     changed = [
         f"{word} {listed(names)}" for word, names in (("with", groups), ("without", gone)) if names
     ]

@@ -14,6 +14,7 @@ from sim_jax.crash import Limits
 from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
 from tuner.filter_error.disturbances import COUNT, USUAL, disturbance_of, processes_of
+from tuner.filter_error.kalman import GATE
 from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, unscaled
 from tuner.filter_error.refit import with_least_innovations
@@ -200,3 +201,22 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     for channel in ("position", "attitude"):  # the others hardly change: rates are fed in
         change = np.std(expected[channel] - coarse[channel])
         assert np.std(found[channel] - expected[channel]) < 0.5 * change
+
+
+def test_one_outlier_is_not_believed_and_many_in_a_row_are(fitted) -> None:
+    """Markers that are moved by a metre, for a sample and for good."""
+    problem, predictor, point = fitted
+    sampled = predictor.feed.samples["position"]
+    ticks = np.flatnonzero(np.asarray(sampled.weight)[:, 0, 0])
+
+    def sizes(moved: np.ndarray) -> np.ndarray:
+        values = sampled.values.at[moved, 1, 0].add(1.0)
+        feed = eqx.tree_at(lambda f: f.samples["position"].values, predictor.feed, values)
+        found = replace(predictor, feed=feed).at(problem, point).found
+        return np.abs(np.asarray(found.white)[ticks, 1, 0])
+
+    middle = len(ticks) // 2
+    once, for_good = sizes(ticks[middle : middle + 1]), sizes(ticks[middle:])
+    assert min(once[middle], for_good[middle]) > 50.0
+    assert (np.delete(once, middle) < GATE).all()
+    assert (for_good[-50:] < GATE).all()  # of 150, as long as it takes to unlearn a velocity

@@ -10,8 +10,9 @@ from typing import Any, cast
 import pytest
 
 from tuner.config import JobFile
+from tuner.filter_error.refit import STEPS
 from tuner.job import disturbances
-from tuner.job.disturbances import with_disturbances
+from tuner.job.disturbances import ROUGHLY, with_disturbances
 from tuner.job.prepare import Job
 from tuner.job.selected import Selected
 from tuner.search.fitted import COLOURED, Fitted
@@ -89,3 +90,44 @@ def test_two_fits_contradict_each_other_by_the_errors_of_both(moved, errors, agr
     )
     new.estimates["freed"] = SimpleNamespace(value=1e9, std_error=1.0)
     assert disturbances._agree(new, old) == agrees
+
+
+@pytest.mark.parametrize(
+    ("called_for", "descents"),
+    [
+        ([None, None], [ROUGHLY, STEPS]),
+        (["drag", None], [ROUGHLY, STEPS]),
+        ([None, "drag", None], [ROUGHLY, STEPS, STEPS]),
+        (["drag", "battery", "inflow", "more"], [ROUGHLY, STEPS, STEPS, STEPS]),
+    ],
+    ids=["nothing", "at once", "later", "again and again"],
+)
+def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_for, descents):
+    """What is missing would be taken for disturbances by a descent to its end."""
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    predictor = SimpleNamespace(memory=0, keeps_track=False)
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
+    begin = Selected(job, fitted(2.0 * COLOURED))
+    taken, within, asked = [], [], iter(called_for)
+
+    def descended(selected: Selected, there: Fitted, own: Any, steps: int = STEPS) -> Any:
+        taken.append(steps)
+        within.append([row.group for row in selected.rows])
+        return there, own
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        def selection() -> Selected | None:
+            group = next(asked)
+            row = SimpleNamespace(group=group, kept=True)
+            return replace(selected, rows=(*selected.rows, row)) if group else None
+
+        return SimpleNamespace(selected=selected, selection=selection)
+
+    monkeypatch.setattr(disturbances, "_descended", descended)
+    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    assert with_disturbances(begin, lambda *_: None, lambda _: None) is None  # keeps no track
+    assert taken == descents
+    assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
