@@ -23,6 +23,7 @@ from tuner.flights.sidecar import Sidecar, sidecar_path
 from tuner.flights.stale import without_stale
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
+from tuner.flights.units import LENGTHS, are_millimetres, to_si
 
 
 @dataclass(frozen=True)
@@ -207,11 +208,17 @@ def _clean(
 ) -> tuple[dict[str, Series], int, list[Note]]:
     first = [raw["position"]] if "position" in raw else list(raw.values())
     epoch = min((int(data.time.min()) for data in first), default=0)
-    series = {}
+    series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
     for signal, data in raw.items():
         seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
-        time, values, dropped = clean(signal, data.topic, seconds, data.values)
+        recorded = data.values
+        if signal in LENGTHS and are_millimetres(signal, seconds, recorded):
+            recorded, names = to_si(recorded, "mm"), (signal, "in millimetres")
+            units.append(
+                Note(NoteCode.UNIT_READ, "warning", data.topic, len(recorded), names=names)
+            )
+        time, values, dropped = clean(signal, data.topic, seconds, recorded)
         for note in dropped:  # signals of one message lack the same samples
             alike = (note.code, note.topic, note.count, tuple(note.numbers.items()))
             before = notes[alike].names if alike in notes else ()
@@ -222,7 +229,7 @@ def _clean(
         if needed not in series:
             where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
             raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
-    return series, epoch, list(notes.values())
+    return series, epoch, [*units, *notes.values()]
 
 
 def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:

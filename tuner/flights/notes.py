@@ -46,6 +46,7 @@ class NoteCode(StrEnum):
     SIGNAL_UNKNOWN = "signal_unknown"  # seconds, longest (s)
     NO_TACHOMETER = "no_tachometer"  # names: the rotors
     FRAME_TURNED = "frame_turned"  # names: the signal, the frame that it is in
+    UNIT_READ = "unit_read"  # names: the signal, the unit that it is in
     ATTITUDE_DOUBTED = "attitude_doubted"  # agreement, upright
     BODY_RATE_DOUBTED = "body_rate_doubted"  # left (share)
     VELOCITY_DOUBTED = "velocity_doubted"  # agreement

@@ -58,6 +58,7 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.SIGNAL_UNKNOWN: "{first} is unknown for {seconds:.2f} s, {longest:.2f} s at a time",
     NoteCode.NO_TACHOMETER: "rotors {all} have no tachometer",
     NoteCode.FRAME_TURNED: "{first} is {second}, which the topic map does not say: turned",
+    NoteCode.UNIT_READ: "{first} is {second}, which the topic map does not say: read so",
     NoteCode.ATTITUDE_DOUBTED: (
         "the attitude does not tilt as the vehicle accelerates (agreement {agreement:.2f}, "
         "upright {upright:.2f}): check its frame and order"

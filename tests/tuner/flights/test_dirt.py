@@ -17,6 +17,7 @@ from tuner.flights.damage import Cause
 from tuner.flights.flight import Series
 from tuner.flights.frames import correct_frames
 from tuner.flights.notes import Note, NoteCode
+from tuner.flights.units import are_millimetres
 from tuner.trajectory_settings import TrajectorySettings
 from tuner.wording.notes import damage_sentence
 from tuner.yaml_files.section import build
@@ -169,6 +170,43 @@ def test_wrong_frame_and_order_are_turned(clean: Flight, dirty: Any) -> None:
     near(got, clean, position=1e-9, signal="body_rate")
     assert noted(got, NoteCode.FRAME_TURNED, "attitude", "scalar-last").count > 1000
     assert noted(got, NoteCode.FRAME_TURNED, "body_rate", "in FRD axes").count > 1000
+
+
+def test_a_position_in_millimetres_is_read_so(clean: Flight, dirty: Any) -> None:
+    """As motion capture has it; nothing of it is taken for outliers or for a leap."""
+
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic == POSE:
+            p = message.pose.position
+            p.x, p.y, p.z = 1e3 * p.x, 1e3 * p.y, 1e3 * p.z
+        return [(time, message)]
+
+    got = dirty(change)
+    near(got, clean, position=1e-9)
+    note = noted(got, NoteCode.UNIT_READ, "position", "in millimetres", topic=POSE)
+    assert note.kind == "warning"
+    assert [n for n in got.notes if n.topic == POSE and n.kind == "warning"] == [note]
+
+
+@pytest.mark.parametrize(
+    ("signal", "factor", "times", "is_so"),
+    [
+        ("position", 1e3, 1.0, True),
+        ("position", 1.0, 1.0, False),
+        ("position", 1.0, 30.0, False),
+        ("position", 1e3, 0.01, False),
+        ("velocity", 1e3, 1.0, True),
+        ("velocity", 1.0, 30.0, False),
+    ],
+)
+def test_millimetres_are_told_by_their_speed(signal, factor, times, is_so) -> None:
+    """Of a flight of 1 m/s, of a race, and of a hover; stamps out of order, gaps of NaN."""
+    time = np.random.default_rng(2).permutation(np.arange(0.0, 20.0, 0.01))
+    turned = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
+    values = factor * times * turned
+    values[5:50] = np.nan
+    assert are_millimetres(signal, time, values) == is_so
+    assert not are_millimetres(signal, time[:1], values[:1] * np.nan)
 
 
 def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:
