@@ -27,6 +27,9 @@ FEEDBACK_AT = 3.0
 WEIGHED = 1e-3
 """Tolerance of windows' first polish, which is there for the residuals that it leaves: these are
 the last one's weights. Open loops meet no recording so well that less would change them."""
+LAST = 60
+"""Iterations of the last stage at most: where coefficients hardly differ in what they do, their
+valley is long."""
 WHOLE = "whole length"
 USUAL = 5
 """Steps that a stage usually takes: predicts the time that is left."""
@@ -131,7 +134,11 @@ def window_schedule(samples: int, rate: float, *, robust: bool, steps: int) -> t
 def _whole_stages(samples: int, *, robust: bool, steps: int) -> tuple[Stage, Stage, Stage]:
     whole = Stage(WHOLE, samples, 1.0, False, True, min(10, steps), 1e-3, True, False)
     polish = replace(whole, robust=robust, tolerance=1e-5, prunes=True, steps=min(15, steps))
-    return (whole, replace(polish, name="polish"), replace(polish, name="polish again"))
+    return (
+        whole,
+        replace(polish, name="polish"),
+        replace(polish, name="polish again", steps=min(LAST, steps)),
+    )
 
 
 def left(stages: tuple[Stage, ...], stage: int, steps: int, spent: float) -> float:
