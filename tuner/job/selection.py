@@ -340,11 +340,24 @@ class Selection:
             else row_of(group, self.candidates[group], found, dropped.get(group), kept=False)
             for group, found in scores.items()
         ]
-        rows += [
-            row_of(group, names, self._worth(state, names), SelectionCode.OPEN_LOOP, kept=True)
-            for group, names in groups_in(self.job.space, self.job.first_terms).items()
-        ]
+        free = groups_in(self.job.space, self.job.first_terms)
+        rows += self._rows_of(state, free, SelectionCode.OPEN_LOOP)
+        rows += self._rows_of(state, self.job.first_terms, SelectionCode.HOVERS_TILTED)
         return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
+
+    def rows_of_named(self) -> tuple[SelectionRow, ...]:
+        """Return the rows of the terms that the job names, with what each is worth in the fit."""
+        state = self.seen(self.fitted, {})
+        return tuple(self._rows_of(state, self.job.first_terms, SelectionCode.ASKED_FOR))
+
+    def _rows_of(
+        self, state: Standing, groups: Groups, reason: SelectionCode
+    ) -> list[SelectionRow]:
+        """Return the rows of groups of the base model."""
+        return [
+            row_of(group, names, self._worth(state, names), reason, kept=True)
+            for group, names in groups.items()
+        ]
 
     def _worth(self, state: Standing, names: Sequence[str]) -> Score:
         """Return what a group of the base model is worth beside all else in the model."""

@@ -17,7 +17,6 @@ from tuner.objective.inlets import INLETS
 from tuner.search.fitted import Fitted
 from tuner.search.point_estimate import PointEstimate
 from tuner.selection.candidates import Groups, candidate_groups, groups_around
-from tuner.selection.table import SelectionCode, SelectionRow
 from tuner.spans import span
 
 
@@ -79,13 +78,12 @@ def _selected(
     job: Job, fitted: Fitted, on_progress: OnProgress, on_message: Callable[[str], None]
 ) -> Selected:
     if not isinstance(job.settings.job.terms, str):
-        return Selected(job, fitted, _first_rows(job, SelectionCode.ASKED_FOR))
+        named = Selection(job, fitted, {}, on_progress, on_message).rows_of_named()
+        return Selected(job, fitted, named)
     candidates = candidates_of(job)
     if not candidates:
         return Selected(job, fitted)
-    selected = Selection(job, fitted, candidates, on_progress, on_message).run()
-    first = _first_rows(job, SelectionCode.HOVERS_TILTED)
-    return replace(selected, rows=(*first, *selected.rows))
+    return Selection(job, fitted, candidates, on_progress, on_message).run()
 
 
 def candidates_of(job: Job) -> Groups:
@@ -98,11 +96,3 @@ def candidates_of(job: Job) -> Groups:
         **candidate_groups(job.settings.vehicle, job.space, settings),
         **groups_around(job.objective, closed_loop=closed),
     }
-
-
-def _first_rows(job: Job, reason: SelectionCode) -> tuple[SelectionRow, ...]:
-    """Return the rows of the terms that the search began with."""
-    return tuple(
-        SelectionRow(group=group, names=names, kept=True, reason=reason)
-        for group, names in job.first_terms.items()
-    )

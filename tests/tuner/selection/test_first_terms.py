@@ -10,6 +10,7 @@ from tests.tuner.selection.making import BASE, hovering, unfitted_with
 from tuner.config import JobFile
 from tuner.job.first_terms import hover_tilt, with_first_terms
 from tuner.job.terms import with_terms_selected
+from tuner.selection.candidates import with_terms
 from tuner.selection.table import SelectionCode
 
 MARKERS = {f"marker_{kind}_{axis}" for kind in ("offset", "tilt") for axis in "xyz"}
@@ -64,8 +65,30 @@ def test_named_terms_are_free_from_the_start_and_stand_in_the_table(jobs):
         "marker_tilt_y",
         "marker_tilt_z",
     )
+    fitted = with_free(fitted, begun.space.names[-4:], file)
     rows = with_terms_selected(begun, fitted, lambda *_: None, lambda _: None).rows
     assert [(row.group, row.kept, row.reason) for row in rows] == [
         ("fuselage_drag", True, SelectionCode.ASKED_FOR),
         ("marker_tilt", True, SelectionCode.ASKED_FOR),
     ]
+
+
+def with_free(fitted, names, file):
+    """Return a fit in a space that is wider by some terms, at their neutral values."""
+    objective, point = with_terms(fitted.objective, fitted.point, names, file)
+    return replace(fitted, objective=objective, point=point)
+
+
+def test_a_named_term_has_a_row_with_what_it_is_worth(jobs):
+    """On flights that know nothing of it as on flights through a drag of 0.05."""
+    file, worth = JobFile(terms=("fuselage_drag",)), []
+    for job, fitted in (jobs[(0.0, 0.001)], unfitted_with(0.05, seed=0, tilt=(0.0, 0.001))):
+        begun = with_first_terms(with_file(job, file))
+        there = with_free(fitted, ("fuselage_drag",), file)
+        (row,) = with_terms_selected(begun, there, lambda *_: None, lambda _: None).rows
+        worth.append((row.gain_fit, row.gain_holdout, row.scatter))
+    (fit, held_out, scatter), (fit_there, held_out_there, scatter_there) = worth
+    assert abs(fit) < 0.02
+    assert abs(held_out) < 3.0 * scatter
+    assert fit_there > 0.2
+    assert held_out_there > 2.0 * scatter_there
