@@ -41,7 +41,6 @@ REFUSED = (
     SelectionCode.IMMATERIAL,
     SelectionCode.NOT_PREDICTED,
     SelectionCode.WORSE_AFTER_REFIT,
-    *EARNING,  # it would, had the rounds of selection not come to an end
 )
 """Why least squares may have left out what innovations call for."""
 

@@ -14,7 +14,12 @@ def row_of(
     *,
     kept: bool,
 ) -> SelectionRow:
-    """Return the row of a group; its reason is the score's unless another is known."""
+    """Return the row of a group; its reason is the score's unless another is known.
+
+    One that would earn its place, and is not kept, did not hold it beside the others.
+    """
+    if not kept and found.earns_place:
+        reason = reason or SelectionCode.WORSE_AFTER_REFIT
     return SelectionRow(
         group=group,
         names=names,

@@ -164,12 +164,6 @@ def test_a_term_that_stood_in_for_another_goes_as_that_one_comes(chosen) -> None
     ]
 
 
-def test_a_term_that_least_squares_came_too_late_to_is_judged(chosen) -> None:
-    late = row("thrust_inflow", SelectionCode.PREDICTS_FLIGHTS)
-    innovation = seen([DRAG, late], {"thrust_inflow_coefficient": 0.5})
-    assert set(chosen(innovation)[1]["groups"]) == {"thrust_inflow"}
-
-
 @pytest.mark.parametrize(
     "rows",
     [

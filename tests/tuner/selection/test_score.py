@@ -7,6 +7,7 @@ import pytest
 
 from tuner.selection.linear import Linear
 from tuner.selection.prediction import lost_by_sections
+from tuner.selection.rows import row_of
 from tuner.selection.score import Score, _Gain, score, surviving
 from tuner.selection.table import SelectionCode
 
@@ -325,3 +326,19 @@ def test_flights_show_what_surrounds_them_however_strongly_each_does():
 def test_noise_buys_no_column_for_each_flight(seed, correlated):
     own = by_flight(linear_fit(0.0, seed=seed, correlated=correlated), 1)
     assert not score(own, MODEL, 3 + np.arange(FLIGHTS), candidates=2).earns_place
+
+
+@pytest.mark.parametrize(
+    ("found", "kept", "reason"),
+    [
+        (SelectionCode.PREDICTS_FLIGHTS, True, SelectionCode.PREDICTS_FLIGHTS),
+        (SelectionCode.PREDICTS_FLIGHTS, False, SelectionCode.WORSE_AFTER_REFIT),
+        (SelectionCode.IMMATERIAL, False, SelectionCode.IMMATERIAL),
+    ],
+)
+def test_the_table_does_not_say_that_what_is_left_out_predicts(found, kept, reason):
+    """A group may earn its place beside one fit, and not hold it beside what came with it."""
+    worth = Score(0.1, 0.1, 0.01, 1e-6, found)
+    assert row_of("drag", ("drag_x",), worth, kept=kept).reason is reason
+    given = row_of("drag", ("drag_x",), worth, SelectionCode.NOT_SIGNIFICANT, kept=kept)
+    assert given.reason is SelectionCode.NOT_SIGNIFICANT
