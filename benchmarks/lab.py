@@ -102,8 +102,8 @@ def section(trials: Sequence[Trial]) -> Section:
         "An oracle knows the truth and the laws of the gusts and of the voltmeter: it flies the "
         "fit's model at the truth again, in other gusts, with other noise and other readings, and "
         "quotes how far linear fits to those flights scatter; beside it the median of how many "
-        "times as wide the quoted interval is. It does not know by how much these fits miss: they "
-        f"lack terms that flew, and have some that did not. {_held_of_all(trials)}"
+        "times as wide the quoted interval is. It knows nothing of terms that a fit lacks, or has "
+        f"in vain. {_held_of_all(trials)}"
         f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
     )
     head = [
