@@ -157,10 +157,11 @@ def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_the
     rows = selection.Selection(job, None, groups, print, print)._rows(standing, {})
     assert [(row.group, row.kept, row.reason) for row in rows] == [
         (LINEAR, True, SelectionCode.OPEN_LOOP),
+        ("marker_tilt", True, SelectionCode.HOVERS_TILTED),
         ("fuselage_drag", False, SelectionCode.NOT_SIGNIFICANT),
     ]
     assert (rows[0].names, rows[0].gain_fit, rows[0].gain_holdout) == (drag, 0.4, 0.3)
-    assert selection_in_words(rows) == f"Added to Gazebo's motor model: {LINEAR}."
+    assert selection_in_words(rows) == f"Added to Gazebo's motor model: {LINEAR} and marker_tilt."
 
 
 def test_a_job_that_wants_no_terms_gets_none():
