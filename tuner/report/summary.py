@@ -43,8 +43,15 @@ def _counted(verdicts: Sequence[Verdict]) -> str:
     """Return how many coefficients have each verdict, as a clause."""
     counts = Counter(verdict_in_words(verdict) for verdict in verdicts)
     if len(counts) == 1 and len(verdicts) > 1:
-        return f"all {len(verdicts)} are {next(iter(counts))}"
-    return listed([f"{n} {'is' if n == 1 else 'are'} {words}" for words, n in counts.items()])
+        return f"all {len(verdicts)} are {_of_many(next(iter(counts)))}"
+    return listed(
+        [f"1 is {one}" if n == 1 else f"{n} are {_of_many(one)}" for one, n in counts.items()]
+    )
+
+
+def _of_many(words: str) -> str:
+    """Return a verdict as it is said of several coefficients."""
+    return words.replace("at its initial value", "at their initial values")
 
 
 def of_run(result: RunResult) -> str:

@@ -12,6 +12,9 @@ def test_held_coefficients_are_counted_as_held():
         "2 are well known, 1 is held at its initial value and 1 is not identifiable"
     )
     assert _counted([Verdict.WELL_KNOWN] * 3) == "all 3 are well known"
+    assert _counted([Verdict.HELD] * 2) == "all 2 are held at their initial values"
+    two = _counted([Verdict.HELD, Verdict.WELL_KNOWN, Verdict.HELD])
+    assert two == "2 are held at their initial values and 1 is well known"
 
 
 def test_an_examination_without_a_fit_is_summed_up_from_what_is_known():
