@@ -40,6 +40,8 @@ ATTITUDES = {"attitude", "attitude_setpoint"}
 LENGTHS = {"position": False, "velocity": True}
 #: m/s that no multirotor flies: a tenth of it is flown soon, were it a tenth of a metre.
 FASTEST = 100.0
+#: s between samples of which a speed is made: stamps of a burst of messages are microseconds apart.
+APART = 0.1
 
 
 def to_si(values: Array, unit: str) -> Array:
@@ -64,8 +66,9 @@ def are_millimetres(signal: str, time: Array, values: Array) -> bool:
     """
     if not LENGTHS[signal]:
         order = np.argsort(time, kind="stable")
+        order = order[np.unique(np.floor(time[order] / APART), return_index=True)[1]]
         span, moved = np.diff(time[order]), np.diff(values[order], axis=0)
-        values = moved[span > 0.0] / span[span > 0.0, None]
+        values = moved[span > 0.5 * APART] / span[span > 0.5 * APART, None]
     speed = np.linalg.norm(values, axis=1)
     speed = speed[np.isfinite(speed)]
     factor, _ = UNITS["mm"]

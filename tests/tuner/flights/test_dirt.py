@@ -209,6 +209,15 @@ def test_millimetres_are_told_by_their_speed(signal, factor, times, is_so) -> No
     assert not are_millimetres(signal, time[:1], values[:1] * np.nan)
 
 
+def test_a_burst_of_messages_is_no_speed() -> None:
+    """A queue that is emptied ten at a time stamps a millimetre within microseconds."""
+    sent = np.arange(0.0, 20.0, 0.01)
+    time = np.floor(sent / 0.1) * 0.1 + 2e-6 * np.arange(len(sent))
+    turned = np.column_stack([np.sin(sent), np.cos(sent), 0.0 * sent])
+    assert not are_millimetres("position", time, turned)
+    assert are_millimetres("position", time, 1e3 * turned)
+
+
 def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:
     lost = range(1_664_800_008_000_000_000, 1_664_800_008_600_000_000)
 
