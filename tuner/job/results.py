@@ -134,7 +134,7 @@ def offsets_by_flight(job: Job, fitted: Fitted) -> dict[str, JsonValue]:
 
 
 def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
-    """Return by how much the initial states of windows were moved; empty for whole flights.
+    """Return by how much free initial states were moved: of windows, and of spins.
 
     State -> root mean square in its unit: what was ascribed to initial states and
     not to coefficients.

@@ -43,12 +43,33 @@ ROWS: Mapping[str, slice] = {
 }
 """State -> its rows in the vector of a start."""
 
+YAW_INTEGRAL_GAIN, TICKS = 0.1, 2.0
+"""PX4's default of MC_YAWRATE_I; and by how many ticks it is open when it integrates."""
+
 
 def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
     """Return the standard deviations (L,) of a start; zero where one is ignored."""
     return np.concatenate(
         [np.full(count, 0.0 if name in ignored else sd) for name, (count, sd) in STATES.items()]
     )
+
+
+def freedom_of_spin(yaw_rate: NDArray[np.float64], rate: float) -> dict[int, NDArray[np.float64]]:
+    """Return row of a start -> its standard deviations (F,): what a yaw step leaves open.
+
+    It saturates rotors, and the integrator stops while one is clipped: from which tick to which is
+    a matter of a rounding error, and a tick's share of yaw rate and integral gain turns the vehicle
+    for seconds. No controller has a hold on the heading of a spin, so that all samples after that
+    are off by the same angle.
+
+    Parameters
+    ----------
+    yaw_rate
+        (F,) rad/s that is asked for at once; zero for no spin.
+    rate
+        Hz of rate control.
+    """
+    return {ROWS["rate_integral"].stop - 1: TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate}
 
 
 def whole(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:

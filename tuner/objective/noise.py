@@ -87,6 +87,21 @@ def channel_noise(flights: Sequence[Flight], channel: str) -> float:
     return max(float(np.median(known)) if known else 0.0, FLOOR[channel])
 
 
+def repeats(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how many samples in a row hold the same value as each of some (n, k), 1 for most.
+
+    What was rounded is off by the same in all of them as long as it rests: they are one reading.
+    Taken for as many, those of a steady yaw spin said more of a moment constant than all else did,
+    and something wrong.
+    """
+    counts = np.ones(values.shape)
+    for column, samples in enumerate(values.T):
+        begins = np.flatnonzero(np.append(True, samples[1:] != samples[:-1]))
+        lengths = np.diff(np.append(begins, len(samples)))
+        counts[:, column] = np.repeat(lengths, lengths)
+    return counts
+
+
 def _step(series: Series) -> float:
     """Return the smallest step between different values of a quantised signal."""
     values = np.unique(series.values[np.isfinite(series.values)])

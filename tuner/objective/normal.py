@@ -213,7 +213,7 @@ def _shared_sums(simulator: Simulator, derivatives: bool) -> Callable[..., Segme
         return sums
 
     def segmentwise(data: SegmentData, *rest: Any) -> SegmentSums:
-        moving = len(rest[0].coordinates) if derivatives or data.states is not None else 0
+        moving = len(rest[0].coordinates) if derivatives else 0
         pieces = in_pieces(some, simulator.segments_at_once(data, moving))
         sums: SegmentSums = pieces(data, *rest)
         return sums

@@ -25,9 +25,12 @@ from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
-from tuner.objective.initial_conditions import moved, spun_up, trimmed, whole
+from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole
 from tuner.objective.markers import markers_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
+
+RAMP = 0.25
+"""Share of the time between two jumps of a zero-order hold that the ramp to the next takes."""
 
 
 class Trace(eqx.Module):
@@ -141,7 +144,8 @@ def beginning_of(
     if states is not None and segments.freedom is not None:
         change = whole(states * segments.freedom, segments.freed)
         start = moved(start, change)
-        inlet = trimmed(inlet, model.vehicle, change)
+        if ROWS["trim"].start in segments.freed:
+            inlet = trimmed(inlet, model.vehicle, change)
     return start, inlet, environment
 
 
@@ -276,14 +280,24 @@ def _linear_interpolation(
 def _zero_order_hold_moved(
     series: Float[Array, "samples c F"], before: Float[Array, "n F"], place: Float[Array, "n F"]
 ) -> Float[Array, "n c F"]:
-    """Read a zero-order hold, moved a little along the series' linear interpolation.
+    """Read a zero-order hold, moved a little along a ramp into each of its next values.
 
-    Half a sample earlier the interpolation is the mean of the signal that holds.
+    A sample whose stamp falls well between two jumps does not move: samples that were taken in
+    step with the jumps say nothing of a clock but where it passes one. Those of any other times
+    are on a ramp so often that their mean moves as the signal does.
     """
     step = jnp.take_along_axis(series, _below(series, before), axis=0)
-    return step + (
-        _linear_interpolation(series, place - 0.5) - _linear_interpolation(series, before - 0.5)
-    )
+    return step + _ramps(series, place) - _ramps(series, before)
+
+
+def _ramps(
+    series: Float[Array, "samples c F"], place: Float[Array, "n F"]
+) -> Float[Array, "n c F"]:
+    below = _below(series, place)
+    value = jnp.take_along_axis(series, below, axis=0)
+    following = jnp.take_along_axis(series, below + 1, axis=0)
+    risen = jnp.clip(1.0 - (1.0 - (place[:, None] - below)) / RAMP, 0.0, 1.0)
+    return value + risen * (following - value)
 
 
 def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Float[Array, "n 3 F"]:

@@ -13,7 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
-from sim_jax.inlet import Inlet
+from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from tuner.coefficients import recording_offsets
@@ -21,8 +21,9 @@ from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
 from tuner.objective.battery import log_voltage_of
-from tuner.objective.initial_conditions import freedom_of
+from tuner.objective.initial_conditions import freedom_of, freedom_of_spin
 from tuner.objective.inlets import INLETS, inlet_of
+from tuner.objective.noise import repeats
 from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
@@ -113,6 +114,7 @@ def segments_of(
     noise: Mapping[str, float],
     weights: Mapping[str, Mapping[str, float]] | None = None,
     schedule: Schedule | None = None,
+    free_starts: bool = False,
 ) -> Segments:
     """Lay whole flights side by side for the ``reference`` inlet.
 
@@ -126,6 +128,8 @@ def segments_of(
         Flight name -> channel -> factor on the residuals.
     schedule
         On whose control ticks the battery's voltage is laid out.
+    free_starts
+        Whether the yaw integrator of a spin is free at its start, near trim: see `freedom_of_spin`.
 
     Raises
     ------
@@ -143,14 +147,22 @@ def segments_of(
                 "name its trajectory in the job file, or fit through another inlet",
             )
     wander = wander_of(flights)
+    inlet = INLETS["reference"].lay(flights, schedule)
+    assert isinstance(inlet, ReferenceInlet)
+    freed = {}
+    if free_starts and bool(jnp.any(inlet.spins)):
+        rate = jnp.where(inlet.spins, inlet.yaw_rate, 0.0)
+        freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate)
     return Segments(
-        inlet=INLETS["reference"].lay(flights, schedule),
+        inlet=inlet,
         start=start_of([flight.initial for flight in flights]),
         measured=_all_measured(flights, noise, weights),
         flight=jnp.arange(len(flights)),
         resting=jnp.asarray([rests(flight.initial) for flight in flights]),
         wander=None if wander is None else jnp.asarray(wander),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
+        freedom=jnp.asarray(np.stack(list(freed.values()))) if freed else None,
+        freed=tuple(freed),
     )
 
 
@@ -284,6 +296,8 @@ def _measured(
         factor = weights.get(flight.name, {}).get(channel, 1.0)
         finite = np.isfinite(values)
         scale = finite * (factor / sigma)
+        if channel == "command":
+            scale = scale / np.sqrt(repeats(values))
         times.append(np.pad(time, (0, padding)))
         filled = np.where(finite, values, 0.0)
         filled = np.pad(filled, ((0, padding), (0, 0)))

@@ -54,10 +54,10 @@ class Simulator:
     def segments_at_once(self, data: SegmentData, moving: int) -> int:
         """Return how many of a device's segments fly at a time: what fits its cache and the memory.
 
-        ``moving`` is how many parameters it differentiates by; zero if it does not.
+        ``moving`` is how many parameters it differentiates by; zero if only by free starts.
         """
         starts = 0 if data.states is None else len(data.states)
-        columns = moving + len(self.conditions) + starts if moving else 1
+        columns = moving + len(self.conditions) + starts if moving else 1 + starts
         recorded = sum(
             m.values.shape[0] * m.values.shape[1] for m in data.segments.measured.values()
         )
@@ -146,7 +146,9 @@ class Simulator:
     ) -> SegmentSums:
         """Return what some segments contribute; see `Objective.sums`."""
         if derivatives or data.states is not None:
-            trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
+            trace, errors, columns = self._with_columns(
+                data, model, coefficients, horizon, starts_only=not derivatives
+            )
         else:
             trace, errors = self.compared(data, model, coefficients, horizon)
             columns = None
@@ -163,13 +165,15 @@ class Simulator:
             None,
         )
         if columns is not None:
-            gradient, hessian = gauss_newton(columns, scaled, data.scale, huber)
-        if data.states is not None:
-            loss, gradient, hessian, states = eliminated(loss, gradient, hessian, data.states)
-            change = states - data.states
-            for name, column in (columns or {}).items():
-                there = errors[name] + jnp.einsum("lnkf,lf->nkf", column[size:], change)
-                squares[name] = jnp.sum(there * there, axis=(0, 1))
+            slope, square = gauss_newton(columns, scaled, data.scale, huber)
+            if data.states is not None:
+                loss, slope, square, states = eliminated(loss, slope, square, data.states)
+                for name, column in columns.items():
+                    by_start = column[len(column) - len(states) :]
+                    change = jnp.einsum("lnkf,lf->nkf", by_start, states - data.states)
+                    squares[name] = jnp.sum((errors[name] + change) ** 2, axis=(0, 1))
+            if derivatives:
+                gradient, hessian = slope, square
         return SegmentSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
 
     def jacobian(
@@ -179,14 +183,22 @@ class Simulator:
         trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
         return Jacobian(errors, columns, trace.crash_time)
 
-    @partial(jax.jit, static_argnums=0)
+    @partial(jax.jit, static_argnums=0, static_argnames="starts_only")
     def _with_columns(
-        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
+        self,
+        data: SegmentData,
+        model: Tunable,
+        coefficients: Array,
+        horizon: Array,
+        *,
+        starts_only: bool = False,
     ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
         """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
 
-        An offset does not enter the simulation, so that its column costs an interpolation; what
-        surrounds a flight does. Compiled by name, so that what builds on it is traced only once.
+        By coefficients, offsets, what surrounds a flight, and starts; or by the last alone, which
+        is all that a loss without them needs. An offset does not enter the simulation, so that its
+        column costs an interpolation; what surrounds a flight does. Compiled by name, so that what
+        builds on it is traced only once.
         """
         offsets = data.offsets[: len(OFFSETS)]
         trace, moved = _jacobian_forward(
@@ -196,6 +208,7 @@ class Simulator:
             coefficients,
             data.states,
             self.conditions_in(data.offsets),
+            starts_only=starts_only,
         )
 
         def compare(flown: Trace, late: Array) -> dict[str, Array]:
@@ -204,6 +217,8 @@ class Simulator:
         by_flight = jax.vmap(
             lambda change: jax.jvp(lambda flown: compare(flown, offsets), (trace,), (change,))[1]
         )(moved)
+        if starts_only:
+            return trace, compare(trace, offsets), by_flight
         each = jnp.eye(len(offsets), dtype=offsets.dtype)[:, :, None] * jnp.ones_like(offsets)
         by_offset = jax.vmap(
             lambda change: jax.jvp(lambda late: compare(trace, late), (offsets,), (change,))[1]
@@ -221,13 +236,17 @@ def _jacobian_forward(
     vector: Array,
     states: Array | None,
     conditions: Array | None,
+    *,
+    starts_only: bool,
 ) -> tuple[Trace, Trace]:
     """Return a simulation and its derivatives by a vector (K,), conditions and starts (rows, F).
 
-    All segments' starts, or conditions, move at once: a segment depends on its own alone.
+    Or by the starts alone. All segments' starts, or conditions, move at once: a segment depends on
+    its own alone.
     """
     count, rows = len(vector), 0 if conditions is None else len(conditions)
     basis = jnp.eye(count + rows + (0 if states is None else len(states)), dtype=vector.dtype)
+    basis = basis[count + rows :] if starts_only else basis
 
     def push(direction: Array) -> tuple[Trace, Trace]:
         if states is None and conditions is None:

@@ -1,16 +1,28 @@
 """Free starts: eliminated as linear algebra says, and moved as their names say."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
-from tests.tuner.uncertainty.making import controller_file, vehicle_file
+from tests.tuner.uncertainty.making import (
+    PHYSICS,
+    controller_file,
+    criterion_of,
+    problem,
+    truth,
+    vehicle_file,
+    with_data,
+)
 from tuner.model import model_of
 from tuner.objective.initial_conditions import (
+    ROWS,
     eliminated,
     freedom_of,
+    freedom_of_spin,
     moved,
     spun_up,
     whole,
@@ -85,3 +97,40 @@ def test_a_rotor_without_tachometer_turns_as_its_command_asks(still):
     assert float(there.rotor_speed[0][1]) == pytest.approx(asked)
     for rotor in range(1, 4):
         np.testing.assert_array_equal(there.rotor_speed[rotor][1], start.rotor_speed[rotor])
+
+
+YAW = ROWS["rate_integral"].stop - 1
+SPIN = np.array([0.0, 2.0])
+"""rad/s of the two flights of `problem`."""
+
+
+def test_a_yaw_step_leaves_a_tick_of_its_integrator_open_and_nothing_else():
+    (row, freedom), *others = freedom_of_spin(SPIN, 400.0).items()
+    assert not others
+    names = [name for name, rows in ROWS.items() if row in range(rows.start, rows.stop)]
+    assert (names, row) == (["rate_integral"], YAW)
+    assert freedom == pytest.approx([0.0, 2 * 0.1 * 2.0 / 400.0])
+
+
+def test_a_heading_that_a_tick_of_the_integrator_turned_says_nothing_of_the_coefficients():
+    """Flown with an integrator a tick off, the truth fits as well as noise allows."""
+    free = ("inertia_zz", "moment_constant", "rotor_drag_coefficient")
+    fit = problem(free)
+    freedom = freedom_of_spin(SPIN, PHYSICS)
+    tick = 0.5 * freedom[YAW]
+    start = fit.segments.start
+    turned = replace(start.rate_integral, z=start.rate_integral.z + tick)
+    off = replace(fit, segments=replace(fit.segments, start=replace(start, rate_integral=turned)))
+    recorded = with_data(off, truth(fit)).segments.measured
+    known = replace(fit.segments, measured=recorded)
+    open_ = replace(known, freedom=jnp.asarray(np.stack([*freedom.values()])), freed=(*freedom,))
+    criterion, losses, pulls = criterion_of(fit, prior=0.0), [], []
+    for segments, states in ((known, None), (open_, jnp.zeros((1, 2)))):
+        sums = replace(fit, segments=segments).sums(
+            truth(fit), replace(criterion, states=states), derivatives=True
+        )
+        losses.append(float(jnp.sum(sums.loss)))
+        pulls.append(np.abs(np.asarray(sums.gradient)[: len(free), 1]))
+    assert losses[0] > 20.0
+    assert losses[1] == pytest.approx(0.5 * 0.5**2, rel=0.1)  # of the prior: it is half its width
+    assert np.all(pulls[1] < 0.05 * pulls[0])

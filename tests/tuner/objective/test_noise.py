@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tuner.flights.flight import Series
-from tuner.objective.noise import white_noise
+from tuner.objective.noise import repeats, white_noise
+from tuner.objective.segments import segments_of
 
 
 @pytest.mark.parametrize("sigma", [5e-4, 5e-3])
@@ -29,3 +32,26 @@ def test_a_column_that_was_not_measured_has_no_noise():
     noise = white_noise(Series(np.arange(100) / 100, values))
     assert np.isfinite(noise[0])
     assert np.isnan(noise[1])
+
+
+def test_a_value_that_rests_is_one_reading():
+    values = np.array([[1.0, 1.0], [1.0, 2.0], [1.0, 3.0], [2.0, 3.0], [np.nan, np.nan]])
+    assert repeats(values).tolist() == [[3, 1], [3, 1], [3, 2], [1, 2], [1, 1]]
+    assert repeats(values[:0]).shape == (0, 2)
+
+
+def test_a_steady_command_that_was_rounded_says_what_one_reading_says(flight):
+    """A signal that rests between two steps is off by the same in all of its samples."""
+    series = flight.series["command"]
+    steady = np.full_like(series.values, 0.488)
+    moving = np.round(0.3 + 0.4 * np.random.default_rng(4).random(series.values.shape), 3)
+    weights = []
+    for values in (steady, moving):
+        at_rest = replace(
+            flight, series={**flight.series, "command": replace(series, values=values)}
+        )
+        segments = segments_of([at_rest], noise={"command": 1e-3})
+        weights.append(np.asarray(segments.measured["command"].weight)[..., 0])
+    told = [(weight**2).sum(axis=0) * 1e-6 for weight in weights]
+    assert told[0] == pytest.approx(np.ones(4))
+    assert told[1] == pytest.approx(np.full(4, len(series.time)), rel=0.05)
