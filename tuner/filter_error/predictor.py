@@ -324,6 +324,6 @@ def with_hidden(
 
 
 def unscaled(criterion: Criterion) -> Criterion:
-    """Return a criterion for residuals that are whitened already, where a filter knows the start."""
+    """Return a criterion for residuals that are whitened already, a filter knowing the start."""
     ones = {name: jnp.ones_like(scale) for name, scale in criterion.scale.items()}
     return replace(criterion, scale=ones, states=None)

@@ -26,6 +26,7 @@ from tuner.selection.candidates import (
     Groups,
     is_stand_in,
     names_in,
+    presence_of,
     start_of,
 )
 from tuner.selection.doubt import SMALLEST, in_doubt
@@ -85,7 +86,11 @@ class Innovations:
         Of what set-points hide, by least squares.
         """
         outside = _outside(self.selected)
-        groups = [columns for n in outside.values() if len(columns := self._columns(n))]
+        groups = [
+            (columns, presence_of(names))
+            for names in outside.values()
+            if len(columns := self._columns(names))
+        ]
         if not groups:
             return dict(self.selected.in_doubt)
         model = self._model(self.fitted.objective.space.names)

@@ -1,9 +1,9 @@
 """Which terms beyond the base model a job's fit holds, and the fit with them.
 
-One Jacobian scores all candidate groups at the fitted point. If one of them predicts what is left
-out of the fit, all that gain by more than chance are fitted together; backward elimination takes
-away those that do not hold their places beside the others. The rest stays if each flight, predicted
-by a fit to the others, is then met better by more than the scatter.
+One Jacobian scores all candidate groups at the fitted point. If one of them gains by more than
+chance all are fitted together, from where the search began; backward elimination takes away those
+that do not hold their places beside the others. The rest stays if each flight, predicted by a fit
+to the others, is then met better by more than the scatter.
 
 What surrounds each flight (its wind, the decline of its battery) has a column for each flight.
 Other flights cannot predict it, sections of its own can; a flight that is left out keeps it, as it
@@ -40,6 +40,7 @@ from tuner.selection.candidates import (
     groups_in,
     is_stand_in,
     names_in,
+    presence_of,
     reads_recording,
     start_of,
     with_terms,
@@ -82,7 +83,7 @@ class Selection:
         """Add groups until none earns its place."""
         state = self.seen(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
-        if self._wanted(state, dropped):
+        if self._worth_fitting(state, dropped):
             state = self._with_all(state) or state
         for _ in range(MAX_ROUNDS):
             wanted = self._wanted(state, dropped)
@@ -106,7 +107,7 @@ class Selection:
     def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
         names = [*self.job.space.names, *names_in(state.added)]
-        outside = [self._columns(group) for group in groups]
+        outside = [(self._columns(group), presence_of(group)) for group in groups]
         moves = in_doubt(state.linear, self._columns(names), outside)
         coefficients = [name for name in names if name not in conditions_in(self.candidates)]
         return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
@@ -117,22 +118,28 @@ class Selection:
         As long as terms are missing, those that are there stand in for them and even what is true
         may seem not to predict; fitted with all others, each has to.
         """
-        scores = {
+        scores = self._worth_fitting(state, dropped)
+        return scores if any(found.earns_place for found in scores.values()) else {}
+
+    def _worth_fitting(
+        self, state: Standing, dropped: Mapping[str, SelectionCode]
+    ) -> dict[str, Score]:
+        """Return the groups that gain by more than chance in the fit, whatever they predict."""
+        return {
             group: found
             for group in self.candidates
             if group not in state.added and group not in dropped
             if (found := self._score(state, group)).reason in WORTH_FITTING
         }
-        return scores if any(found.earns_place for found in scores.values()) else {}
 
     def _with_all(self, base: Standing) -> Standing | None:
         """Return what backward elimination leaves of all groups, if it predicts better.
 
         Where something is missing the base fit lies anywhere, and what little it shows of the
-        missing terms picks those that stand in for them. So the search begins again where it
-        began, with every candidate in the model but those that describe as a whole what others do
-        one by one: beside them nothing else would seem needed, and noise would choose. They are
-        added if something is left to explain.
+        missing terms picks those that stand in for them, or lets none of them predict by itself. So
+        the search begins again where it began, with every candidate in the model but those that
+        describe as a whole what others do one by one: beside them nothing else would seem needed,
+        and noise would choose. They are added if something is left to explain.
         """
         groups = {
             group: names for group, names in self.candidates.items() if not is_stand_in(group)

@@ -16,6 +16,10 @@ from tuner.objective.normal import Objective
 Groups = Mapping[str, tuple[str, ...]]
 """Group -> its coefficients."""
 
+STANDS_IN = 0.1
+"""Probability a priori that a vehicle has what one group describes as a whole and others, which are
+candidates beside it, do one by one."""
+
 
 def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups:
     """Return the groups that may be added: no coefficient of theirs is given, free or fixed."""
@@ -92,6 +96,15 @@ def groups_named(terms: Sequence[str], space: Space) -> Groups:
 def is_stand_in(group: str) -> bool:
     """Return whether a group describes as a whole what other terms do one by one."""
     return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
+
+
+def presence_of(names: Collection[str]) -> float:
+    """Return the probability a priori that a vehicle has a group of these coefficients.
+
+    What is an effect of its own every vehicle has, however small.
+    """
+    stands_in = any(name in COEFFICIENTS and COEFFICIENTS[name].stands_in for name in names)
+    return STANDS_IN if stands_in else 1.0
 
 
 def reads_recording(group: str) -> bool:

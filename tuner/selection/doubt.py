@@ -21,16 +21,16 @@ FLAT = 1e-10
 least: what is less is rounding, and leaves it to the prior."""
 
 
-def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array:
+def in_doubt(linear: Linear, model: Columns, groups: Iterable[tuple[Columns, float]]) -> Array:
     """Return how far each parameter (P,) of the model would move with what it lacks.
 
-    Each group is added by itself, to first order, as large as the flights let it be: a priori its
-    coefficients are normal about their neutral values, as likely small as large (the logarithm of
-    their size is uniform, from what is as good as absent to the usual size), and models with the
-    group in each of these sizes are averaged by what the flights say of them. So a term that
-    chance explains counts for little however much a refit would move with it, and one that the
-    flights call for, but not surely enough to be added, for all of its move. The moves of all
-    groups count together as the root of the sum of their mean squares.
+    Each group is added by itself, to first order, as large as the flights let it be: a priori it is
+    absent, or its coefficients are normal about their neutral values, as likely small as large (the
+    logarithm of their size is uniform, from what is as good as absent to the usual size), and
+    models without the group and with it in each of these sizes are averaged by what the flights say
+    of them. So a term that chance explains counts for little however much a refit would move with
+    it, and one that the flights call for, but not surely enough to be added, for all of its move.
+    The moves of all groups count together as the root of the sum of their mean squares.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array
     model
         Columns of what is in the model.
     groups
-        Columns of each group that is not.
+        Columns of each group that is not, and the probability a priori that the vehicle has it.
 
     Notes
     -----
@@ -54,9 +54,9 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[Columns]) -> Array
     everything = np.ones(len(linear.flight), bool)
     alone = linear.step(model, inside=everything)
     squares = np.zeros(len(linear.scaled))
-    for group in groups:
+    for group, presence in groups:
         evidence = Evidence.of(linear, square, alone, model, group)
-        squares[model] += evidence.mean_square
+        squares[model] += evidence.mean_square(presence)
     return np.asarray(np.sqrt(squares))
 
 
@@ -103,15 +103,22 @@ class Evidence:
         value = -axes.T @ inverse @ (slope * usual)
         return Evidence(follow * usual @ axes, value, np.maximum(variance, 0.0))
 
-    @property
-    def mean_square(self) -> Array:
-        """Mean squares (K,) of the moves, over all sizes by what the flights say of each."""
+    def mean_square(self, presence: float) -> Array:
+        """Return mean squares (K,) of the moves, over all sizes by what the flights say of each.
+
+        Parameters
+        ----------
+        presence
+            Probability a priori of a size other than zero.
+        """
         told = np.exp(0.5 * np.mean(np.log(np.maximum(self.variance, 1e-300))))
         smallest = min(SMALLEST, HIDDEN * float(told))
-        sizes = np.exp(np.linspace(np.log(smallest), 0.0, SIZES))[:, None] ** 2
-        allowed = sizes + self.variance
-        log_weight = -0.5 * (np.log(allowed) + self.value**2 / allowed).sum(axis=1)
-        weight = np.exp(log_weight - log_weight.max())
+        present = np.exp(2.0 * np.linspace(np.log(smallest), 0.0, SIZES))
+        sizes = np.append(present, 0.0)[:, None]
+        prior = np.append(np.full(SIZES, presence / SIZES), 1.0 - presence)
+        allowed = np.maximum(sizes + self.variance, 1e-300)
+        log_likelihood = -0.5 * (np.log(allowed) + self.value**2 / allowed).sum(axis=1)
+        weight = prior * np.exp(log_likelihood - log_likelihood.max())
         weight /= weight.sum()
         centres = (sizes / allowed * self.value) @ self.moves.T
         scatters = (sizes * self.variance / allowed) @ (self.moves**2).T

@@ -9,6 +9,8 @@ from tuner.selection.doubt import Evidence, in_doubt
 from tuner.selection.linear import Linear
 
 MODEL, TERM = np.array([0]), np.array([1])
+PRESENT = (TERM, 1.0)
+"""A term that is there, however small."""
 FLIGHTS, STRETCHES, SAMPLES = 4, 12, 50
 LIKE = 0.95
 """Correlation of what the term does with what the model does."""
@@ -67,7 +69,7 @@ def share(fits, size, *, with_part):
     for linear, alone in fits:
         fit = with_term(linear, size)
         off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
-        error = max(alone, in_doubt(fit, MODEL, [TERM])[0] if with_part else 0.0)
+        error = max(alone, in_doubt(fit, MODEL, [PRESENT])[0] if with_part else 0.0)
         held.append(abs(off) < 1.96 * error)
     return np.mean(held)
 
@@ -86,7 +88,7 @@ def test_where_flights_say_little_of_a_term_chance_counts_for_less_than_a_refit_
         every = np.ones(len(linear.flight), bool)
         moved = linear.step(np.array([0, 1]), inside=every) - linear.step(MODEL, inside=every)
         steps.append(moved[0] ** 2)
-        parts.append(in_doubt(linear, MODEL, [TERM])[0] ** 2)
+        parts.append(in_doubt(linear, MODEL, [PRESENT])[0] ** 2)
     assert np.sqrt(np.mean(parts)) < 0.6 * np.sqrt(np.mean(steps))
 
 
@@ -95,7 +97,17 @@ def test_what_the_flights_call_for_counts_in_full(fits):
         fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
         every = np.ones(len(fit.flight), bool)
         moved = fit.step(np.array([0, 1]), inside=every) - fit.step(MODEL, inside=every)
-        assert in_doubt(fit, MODEL, [TERM])[0] == pytest.approx(abs(moved[0]), rel=0.15)
+        assert in_doubt(fit, MODEL, [PRESENT])[0] == pytest.approx(abs(moved[0]), rel=0.15)
+
+
+def test_what_is_seldom_there_counts_for_less_and_in_full_where_the_flights_call_for_it(fits):
+    seldom = (TERM, 0.1)
+    absent = [[in_doubt(fit, MODEL, [g])[0] for g in (seldom, PRESENT)] for fit, _ in fits]
+    assert np.median([one / other for one, other in absent]) < 0.4
+    for linear, _ in fits[:20]:
+        fit = with_term(replace(linear, prior_sd=np.array([1e3, 30.0])), 12.0)
+        called_for = [in_doubt(fit, MODEL, [group])[0] for group in (seldom, PRESENT)]
+        assert called_for[0] == pytest.approx(called_for[1], rel=1e-3)
 
 
 def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
@@ -108,7 +120,7 @@ def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
     )
     sizes = np.exp(np.linspace(np.log(0.1), 0.0, 25))
     expected = USUAL * np.sqrt(np.mean(sizes**2))
-    assert in_doubt(same, MODEL, [TERM])[0] == pytest.approx(expected, rel=0.05)
+    assert in_doubt(same, MODEL, [PRESENT])[0] == pytest.approx(expected, rel=0.05)
 
 
 def crowded(random, count):
@@ -147,7 +159,10 @@ def test_an_absent_term_is_told_no_surer_than_it_is_whatever_a_fit_takes_out_of_
 
 def test_groups_add_up_as_squares(fits):
     linear, _ = fits[1]
-    one, both = in_doubt(linear, MODEL, [TERM])[0], in_doubt(linear, MODEL, [TERM, TERM])[0]
+    one, both = (
+        in_doubt(linear, MODEL, [PRESENT])[0],
+        in_doubt(linear, MODEL, [PRESENT, PRESENT])[0],
+    )
     assert both == pytest.approx(np.sqrt(2.0) * one)
     assert in_doubt(linear, MODEL, [])[0] == 0.0
 
@@ -157,4 +172,4 @@ def test_a_term_of_which_the_flights_say_nothing_changes_nothing(said):
     linear, _ = flown(np.random.default_rng(4))
     mute = np.diag([1.0, np.sqrt(said)])
     linear = replace(linear, hessian=mute @ linear.hessian @ mute, score=linear.score @ mute)
-    assert in_doubt(linear, MODEL, [TERM]) == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert in_doubt(linear, MODEL, [PRESENT]) == pytest.approx([0.0, 0.0], abs=1e-9)
