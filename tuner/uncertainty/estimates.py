@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 AT_BOUND = 2e-3
 """Distance from a bound, as a share of the range, within which a fit has ended at it."""
+DELAYS = ("actuator_latency",)
+"""By which a rotor's command is late, beside the rotor's own time constants."""
 
 
 @dataclass(frozen=True)
@@ -206,10 +208,14 @@ def _estimates(
 def _lags(space: Space, scaled: Array) -> Array:
     """Return how far each scaled coordinate (K,) moves for each s by which a rotor's lag is longer.
 
-    What the set-up delays it shifts in time, in no simulator's steps.
+    A rotor's time constants, and the delay of its command, which a simulator begins to follow at a
+    step's beginning or at its end. The estimate of the state is shifted in time, in no simulator's
+    steps.
     """
     rows = [COEFFICIENTS[name] for name in space.names]
-    is_lag = np.array([row.unit == "s" and row.scope == "vehicle" for row in rows])
+    is_lag = np.array(
+        [row.unit == "s" and (row.scope == "vehicle" or row.name in DELAYS) for row in rows]
+    )
     return np.asarray(is_lag / np.where(space.is_log, np.exp(np.where(is_lag, scaled, 0.0)), 1.0))
 
 

@@ -10,7 +10,7 @@ from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
 from tuner.search.normal_equations import normal_equations
-from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
+from tuner.uncertainty.estimates import Uncertainty, _lags, uncertainty_of
 from tuner.uncertainty.information import information_at
 from tuner.uncertainty.verdict import Verdict
 
@@ -145,3 +145,13 @@ def test_tied_coefficients_share_their_estimate() -> None:
     assert second.std_error / first.std_error == pytest.approx(second.value / first.value)
     assert second.verdict is Verdict.TIED
     assert second.reason == first.reason.model_copy(update={"tied_to": "inertia_xx"})
+
+
+def test_a_rotor_and_what_delays_its_command_are_lags_the_estimate_of_the_state_is_none() -> None:
+    fit = making.problem(("inertia_xx", "time_constant_up", "estimate_latency", "actuator_latency"))
+    moved = fit.space.values(jnp.asarray(fit.space.initial))
+    lags = _lags(fit.space, np.asarray(fit.space.scaled(jnp.asarray(fit.space.initial))))
+    by_name = dict(zip(fit.space.names, lags, strict=True))
+    assert by_name["time_constant_up"] == pytest.approx(1.0 / float(moved["time_constant_up"]))
+    assert by_name["actuator_latency"] == 1.0
+    assert by_name["estimate_latency"] == by_name["inertia_xx"] == 0.0
