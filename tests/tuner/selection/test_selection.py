@@ -139,6 +139,36 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
     assert judged == ["battery"]
 
 
+@pytest.mark.parametrize(
+    ("reason", "tried"),
+    [
+        (SelectionCode.NOT_PREDICTED, True),
+        (SelectionCode.PREDICTS_FLIGHTS, True),
+        (SelectionCode.NOT_SIGNIFICANT, False),
+        (SelectionCode.IMMATERIAL, False),
+    ],
+)
+def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
+    monkeypatch, reason, tried
+):
+    """The base fit of a vehicle that lacks several lies anywhere."""
+    searched, own = [], selection.Selection
+    fitted = SimpleNamespace(leaves_noise_alone=False, point=None, objective=None)
+    standing = Standing(fitted, {}, None)
+    monkeypatch.setattr(Standing, "vector", {})
+    monkeypatch.setattr(own, "_score", lambda *_: Score(0.4, 0.3, 0.1, 0.5, reason))
+    monkeypatch.setattr(own, "seen", lambda *_: standing)
+    monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))
+    monkeypatch.setattr(own, "_grown", lambda *_: standing)
+    monkeypatch.setattr(own, "_rows", lambda *_: ())
+    monkeypatch.setattr(own, "_in_doubt", lambda *_: {})
+    monkeypatch.setattr(selection, "findings_at", lambda *_: ())
+    monkeypatch.setattr(selection, "with_groups", lambda base, *_, **__: base)
+    groups = {"fuselage_drag": ("fuselage_drag",)}
+    own(SimpleNamespace(), fitted, groups, print, print).run()
+    assert bool(searched) is tried
+
+
 @pytest.mark.slow
 def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_they_are_worth(
     monkeypatch,
