@@ -271,10 +271,16 @@ def _linear_interpolation(
     series: Float[Array, "samples c F"], place: Float[Array, "n F"]
 ) -> Float[Array, "n c F"]:
     """Read a series at fractional sample numbers by linear interpolation."""
+    first, second, share = _around(series, place)
+    return first + share * (second - first)
+
+
+def _around(series: Float[Array, "samples c F"], place: Float[Array, "n F"]) -> tuple[Array, ...]:
+    """Return the samples (n, c, F) before and after places, and the share (n, 1, F) between."""
     below = _below(series, place)
     first = jnp.take_along_axis(series, below, axis=0)
     second = jnp.take_along_axis(series, below + 1, axis=0)
-    return first + (place[:, None] - below) * (second - first)
+    return first, second, place[:, None] - below
 
 
 def _zero_order_hold_moved(
@@ -293,11 +299,9 @@ def _zero_order_hold_moved(
 def _ramps(
     series: Float[Array, "samples c F"], place: Float[Array, "n F"]
 ) -> Float[Array, "n c F"]:
-    below = _below(series, place)
-    value = jnp.take_along_axis(series, below, axis=0)
-    following = jnp.take_along_axis(series, below + 1, axis=0)
-    risen = jnp.clip(1.0 - (1.0 - (place[:, None] - below)) / RAMP, 0.0, 1.0)
-    return value + risen * (following - value)
+    first, second, share = _around(series, place)
+    risen = jnp.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
+    return first + risen * (second - first)
 
 
 def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Float[Array, "n 3 F"]:

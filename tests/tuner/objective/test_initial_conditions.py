@@ -17,6 +17,7 @@ from tests.tuner.uncertainty.making import (
     vehicle_file,
     with_data,
 )
+from tuner.filter_error.predictor import unscaled
 from tuner.model import model_of
 from tuner.objective.initial_conditions import (
     ROWS,
@@ -104,6 +105,11 @@ SPIN = np.array([0.0, 2.0])
 """rad/s of the two flights of `problem`."""
 
 
+def test_a_filter_knows_the_start_that_a_fit_leaves_open():
+    free = replace(criterion_of(problem(("inertia_zz",))), states=jnp.zeros((1, 2)))
+    assert unscaled(free).states is None
+
+
 def test_a_yaw_step_leaves_a_tick_of_its_integrator_open_and_nothing_else():
     (row, freedom), *others = freedom_of_spin(SPIN, 400.0).items()
     assert not others
@@ -130,6 +136,14 @@ def test_a_heading_that_a_tick_of_the_integrator_turned_says_nothing_of_the_coef
             truth(fit), replace(criterion, states=states), derivatives=True
         )
         losses.append(float(jnp.sum(sums.loss)))
+        alone = replace(fit, segments=segments).sums(
+            truth(fit), replace(criterion, states=states), derivatives=False
+        )
+        np.testing.assert_allclose(alone.loss, sums.loss, rtol=1e-9, atol=1e-15)
+        for channel, squares in sums.squares.items():
+            np.testing.assert_allclose(alone.squares[channel], squares, rtol=1e-9, atol=1e-15)
+        assert np.shape(alone.gradient) == np.shape(sums.gradient)
+        assert not np.any(alone.gradient)
         pulls.append(np.abs(np.asarray(sums.gradient)[: len(free), 1]))
     assert losses[0] > 20.0
     assert losses[1] == pytest.approx(0.5 * 0.5**2, rel=0.1)  # of the prior: it is half its width
