@@ -9,6 +9,7 @@ import numpy as np
 
 from tuner.selection.linear import RIDGE, Array, Columns, Linear
 from tuner.uncertainty.covariance import scatter
+from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.stretches import STRETCH
 
 HIDDEN, SMALLEST = 0.4, 0.1
@@ -47,8 +48,10 @@ def in_doubt(linear: Linear, model: Columns, groups: Iterable[tuple[Columns, flo
     evidence takes errors as large as they are, gusts included: they are those of a fit with the
     group, by how much stretches of time scatter about it, corrected for what it takes out of them
     (`tuner.uncertainty.covariance.scatter`; a fit of twenty coefficients and a group to a minute of
-    flight leaves a fraction). What a refit would do is no measure where the flights can hardly tell
-    a term from the model: that is chance.
+    flight leaves a fraction). They are weighed against those of noise as a fit's own are
+    (`tuner.uncertainty.overdispersion`), along axes that noise chooses: of a few stretches' scatter
+    there is always an axis along which it is far too small. What a refit would do is no measure
+    where the flights can hardly tell a term from the model: that is chance.
     """
     square = linear.information() + linear.prior
     everything = np.ones(len(linear.flight), bool)
@@ -85,23 +88,24 @@ class Evidence:
         follow = -unit[:, None] * np.linalg.solve(own, unit[:, None] * square[np.ix_(model, group)])
         left = square[np.ix_(group, group)] + square[np.ix_(group, model)] @ follow
         pull = linear.pull + linear.prior @ alone
-        slope = (linear.slopes(alone).sum(axis=0) + pull)[group]
-        step = -np.linalg.solve(left, slope)
-        wider = alone.copy()
-        wider[group] += step
-        wider[model] += follow @ step
-        both = np.concatenate([model, group])
-        stretches = linear.stretches(both, wider, STRETCH)
-        meat, _ = scatter(stretches, square[np.ix_(both, both)])
-        along = np.vstack([follow, np.eye(len(group))]) * usual
+        slope = (linear.slopes(alone).sum(axis=0) + pull)[group] * usual
         known = left * np.outer(usual, usual) - np.eye(len(group))  # by the flights alone
-        values, vectors = np.linalg.eigh(0.5 * (known + known.T))
-        inverse = (vectors / np.maximum(values, FLAT * max(values[-1], 1.0))) @ vectors.T
-        spread = along.T @ meat @ along + known / stretches.count
-        covariance = inverse @ spread @ inverse
-        variance, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
-        value = -axes.T @ inverse @ (slope * usual)
-        return Evidence(follow * usual @ axes, value, np.maximum(variance, 0.0))
+        values, axes = np.linalg.eigh(0.5 * (known + known.T))
+        values = np.maximum(values, FLAT * max(values[-1], 1.0))
+        slope, moves = axes.T @ slope, follow * usual @ axes
+        both = np.concatenate([model, group])
+        along = np.zeros((len(square), len(group)))
+        along[both] = np.vstack([moves, usual[:, None] * axes])
+        wider = alone - along @ (slope / (values + 1.0))
+        turned = np.hstack([np.eye(len(square))[:, model], along])[both]
+        meat, freedom = scatter(
+            linear.stretches(both, wider, STRETCH).projected(turned),
+            turned.T @ square[np.ix_(both, both)] @ turned,
+        )
+        seen, freedom = np.diag(meat)[len(model) :] / values, freedom[len(model) :]
+        alike = np.ones(len(group))
+        allowed = allowed_for(seen, freedom, np.diag(alike), alike)
+        return Evidence(moves, -slope / values, allowed**2 / values)
 
     def mean_square(self, presence: float) -> Array:
         """Return mean squares (K,) of the moves, over all sizes by what the flights say of each.

@@ -40,6 +40,10 @@ class Stretches:
         """How many there are."""
         return len(self.score)
 
+    def projected(self, axes: Array) -> Stretches:
+        """Return what they say along other axes, the columns of a matrix (K, L)."""
+        return Stretches(axes.T @ self.information @ axes, self.score @ axes)
+
 
 def stretches_of(information: FisherInformation) -> Stretches:
     """Return all flights in stretches of `STRETCH`, shorter ones where that makes too few."""

@@ -123,9 +123,9 @@ def test_what_no_flight_tells_from_the_model_is_as_wide_as_it_may_be(fits):
     assert in_doubt(same, MODEL, [PRESENT])[0] == pytest.approx(expected, rel=0.05)
 
 
-def crowded(random, count):
-    """Return a loss of many columns and one that is absent, from a minute in gusts of seconds."""
-    size, shape = count + 1, (3 * 9, 40)
+def crowded(random, count, absent=1):
+    """Return a loss of many columns and some that are absent, from a minute in gusts of seconds."""
+    size, shape = count + absent, (3 * 9, 40)
     columns = random.normal(size=(*shape, size)) + random.normal(size=(shape[0], 1, size))
     gusts = np.zeros(shape[0])
     for stretch in range(shape[0]):
@@ -136,9 +136,9 @@ def crowded(random, count):
         scaled=np.zeros(size),
         hessian=columns.transpose(0, 2, 1) @ columns,
         score=np.einsum("sip,si->sp", columns, residual),
-        prior=np.diag([*[1e-9] * count, 1.0]),
+        prior=np.diag([*[1e-9] * count, *[1.0] * absent]),
         pull=np.zeros(size),
-        prior_sd=np.array([*[1e3] * count, 1.0]),
+        prior_sd=np.array([*[1e3] * count, *[1.0] * absent]),
         flight=np.repeat(np.arange(3), 9),
         section=np.tile(np.repeat(np.arange(3), 3), 3),
         loss=1.0,
@@ -155,6 +155,18 @@ def test_an_absent_term_is_told_no_surer_than_it_is_whatever_a_fit_takes_out_of_
         found = Evidence.of(linear, square, alone, model, term)
         held.append(abs(found.value[0]) < 1.96 * np.sqrt(found.variance[0]))
     assert np.mean(held) > 0.86  # 0.79 were twenty coefficients' leverage not allowed for
+
+
+def test_of_many_axes_of_a_group_none_is_told_much_surer_than_it_is_by_the_scatter_of_a_few():
+    """Six stretches of time always scatter little along some axis of six."""
+    random, model, group = np.random.default_rng(5), np.arange(4), np.arange(4, 10)
+    sizes = []
+    for linear in (crowded(random, 4, absent=6) for _ in range(DRAWS)):
+        square = linear.information() + linear.prior
+        alone = linear.step(model, inside=np.ones(len(linear.flight), bool))
+        found = Evidence.of(linear, square, alone, model, group)
+        sizes.append(np.sort(np.abs(found.value) / np.sqrt(found.variance))[-1])
+    assert np.median(sizes) < 2.5  # 1.6 of six normal ones
 
 
 def test_groups_add_up_as_squares(fits):
