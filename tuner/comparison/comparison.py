@@ -57,7 +57,7 @@ from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
 from tuner.parallel import padded_size
 from tuner.recordings import Recording
-from tuner.search.continuation import FAR
+from tuner.search.free_starts import FAR
 from tuner.search.progress import plain_criterion
 from tuner.simulation.forces import Forces, acting, in_order
 from tuner.simulation.table import roll_pitch_yaw

@@ -19,6 +19,7 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.clocks import clocks_that_differ
 from tuner.search.evolution import CmaEs
+from tuner.search.free_starts import starts_asked_for
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
@@ -34,8 +35,6 @@ NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
 differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
 gyro that reads so little when at rest is taken to have no bias."""
-FAR = 5.0
-"""Standard deviations beyond which no start is believed to lie."""
 
 OnProgress = Callable[[Progress], None]
 
@@ -211,12 +210,6 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
         return progress
     residual = root_mean_squares(problem.objective, iterate.losses, iterate.sums)
     scales = misfit(residual) if stage.weighs else strays(residual, stage.noise_inflation)
-    return replace(progress, scales=scales, states=_states(iterate, progress.states))
-
-
-def _states(iterate: Iterate, before: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """Return the segments' starts (L, F) that the best of the points asks for."""
-    if before is None or iterate.sums is None or iterate.sums.states is None:
-        return before
-    asked = np.asarray(iterate.sums.states[int(np.argmin(iterate.losses))])
-    return np.clip(np.where(np.isfinite(asked), asked, before), -FAR, FAR)
+    best = int(np.argmin(iterate.losses))
+    states = starts_asked_for(iterate.sums, best, progress.states)
+    return replace(progress, scales=scales, states=states)

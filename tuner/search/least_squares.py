@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
+from tuner.search.free_starts import are_far, starts_asked_for
 from tuner.search.levenberg_marquardt import Step, advance, begin, on_host, proposed
 from tuner.search.optimiser import Iterate, Onward, Optimiser, StageProblem
 from tuner.search.weights import NEAR, worst_channels
@@ -34,11 +37,18 @@ class Descent:
     ----------
     step
         Where the solver stands.
+    states
+        (L, F) starts of the segments about which the next point is linearised: those that the best
+        point asks for. None where they are known.
+    reference
+        (L, F) those about which the best point was.
     losses
         The losses (S,) after each step so far.
     """
 
     step: Step
+    states: NDArray[np.float64] | None
+    reference: NDArray[np.float64] | None
     losses: tuple[NDArray[np.float64], ...] = ()
 
 
@@ -49,12 +59,20 @@ class LeastSquares(Optimiser):
 
     def init(self, problem: StageProblem) -> Descent:
         """Return the solver before its first step from the stage's points."""
-        return Descent(begin(on_host(problem.points), problem.damping))
+        given = problem.criterion.states
+        states = None if given is None else np.asarray(given)
+        return Descent(begin(on_host(problem.points), problem.damping), states, states)
 
     def step(self, problem: StageProblem, state: Descent) -> tuple[Descent, Iterate]:
-        """Fly every start's next point with derivatives; keep those that are better."""
+        """Fly every start's next point with derivatives; keep those that are better.
+
+        Where segments' starts are free, each point is flown from those that the best one asks for.
+        A point that was linearised about others may have seemed better than it is: if none is found
+        to be better still, it is flown again.
+        """
         free = np.concatenate([problem.free.coefficients, problem.free.offsets.ravel()])
-        step = advance(problem.objective, state.step, problem.criterion, free.astype(float))
+        criterion = replace(problem.criterion, states=cast(Array | None, state.states))
+        step = advance(problem.objective, state.step, criterion, free.astype(float))
         losses = np.asarray(step.loss)
         best = int(np.argmin(losses))
         iterate = Iterate(
@@ -63,10 +81,15 @@ class LeastSquares(Optimiser):
             accepted=np.asarray(step.accepted),
             position_rmse=_position_rmse(problem.objective, step, best),
             damping=float(step.damping[best]),
-            sums=step.sums,
+            sums=step.best,
             onward=_onward(problem, step),
         )
-        return Descent(step, (*state.losses, losses)), iterate
+        states = starts_asked_for(step.best, best, state.states)
+        if step.accepted[best]:
+            return Descent(step, states, state.states, (*state.losses, losses)), iterate
+        if are_far(states, state.reference):
+            return Descent(begin(step.point, np.asarray(step.damping)), states, states), iterate
+        return replace(state, step=step, losses=(*state.losses, losses)), iterate
 
     def terminate(self, problem: StageProblem, state: Descent) -> bool:
         """Return whether every start is good enough for the next stage, or gains no more.

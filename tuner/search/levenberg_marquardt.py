@@ -65,6 +65,8 @@ class Step(eqx.Module):
         optimistix's state; its ``y_eval`` is the point to be tried next.
     sums
         The segments' sums at the point that was tried, gradient and Hessian included; None before.
+    best
+        Those at the best point.
     loss
         Scalar: the loss at the best point, per compared value.
     accepted
@@ -82,6 +84,7 @@ class Step(eqx.Module):
     point: Point
     solver: Any
     sums: SegmentSums | None
+    best: SegmentSums | None
     loss: Float[Array, ""]
     accepted: Bool[Array, ""]
     damping: Float[Array, ""]
@@ -135,12 +138,16 @@ def _step(
         still, _ = _SOLVER.terminate(
             residuals_at, parameters, linear, _NO_OPTIONS, solver, _NO_TAGS
         )
+        accepted = solver.num_steps_since_acceptance == 0
         return Step(
             point=_unpack(parameters, before.point),
             solver=solver,
             sums=before.sums,
+            best=jax.tree.map(
+                lambda new, old: jnp.where(accepted, new, old), before.sums, before.best
+            ),
             loss=solver.f_info.as_min(),
-            accepted=solver.num_steps_since_acceptance == 0,
+            accepted=accepted,
             damping=1.0 / solver.search_state.step_size,
             still=still,
             promise=_promise(solver.f_info),
@@ -175,6 +182,7 @@ def begin(points: Point, damping: NDArray[np.float64] | None = None) -> Step:
                 point=points,
                 solver=_init(jax.vmap(_pack)(points), first),
                 sums=None,
+                best=None,
                 loss=jnp.full(starts, jnp.inf),
                 accepted=jnp.ones(starts, bool),
                 damping=first,
@@ -202,10 +210,11 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     free
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
+    sums = sums_at(objective, proposed(before), criterion)
     after = _step(
         objective.space.coordinates,
         np.asarray(objective.segments.flight),
-        replace(before, sums=sums_at(objective, proposed(before), criterion)),
+        replace(before, sums=sums, best=sums if before.best is None else before.best),
         criterion,
         np.asarray(free),
     )
@@ -227,7 +236,8 @@ def make_ready(objective: Objective, points: Point, criterion: Criterion) -> Non
         crash_time=nothing,
         states=None if criterion.states is None else jnp.stack([criterion.states] * starts),
     )
-    step = replace(begin(cast(Point, on_host(points))), sums=cast(SegmentSums, on_host(sums)))
+    sums = cast(SegmentSums, on_host(sums))
+    step = replace(begin(cast(Point, on_host(points))), sums=sums, best=sums)
     free = np.ones(step.solver.y_eval.shape[-1])
     _step(objective.space.coordinates, flights, step, criterion, free)
 

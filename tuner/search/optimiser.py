@@ -107,8 +107,8 @@ class Iterate:
     damping
         λ of the best start's next step; NaN for an optimiser without.
     sums
-        The segments' sums at the points tried, S first; None where they were not computed. The
-        next stage's weights follow from those of the last step.
+        The segments' sums at the best points, S first; None where they were not computed. The next
+        stage's weights and starts follow from those of the last step.
     onward
         What the next stage begins with, if there is one; None for ``points`` and a damping of 1.
     """

@@ -1,0 +1,89 @@
+"""A search whose segments' starts are free: the losses it compares are those of its points."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import PHYSICS, problem, truth, with_data
+from tuner.objective.criterion import Point
+from tuner.objective.initial_conditions import ROWS, freedom_of_spin
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
+from tuner.search.free_starts import FAR, are_far, starts_asked_for
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning, criterion_of
+from tuner.search.stages import plan
+
+FREE = ("inertia_zz", "moment_constant", "rotor_drag_coefficient")
+YAW = ROWS["rate_integral"].stop - 1
+OFF = 3.0
+"""Standard deviations by which the spin's integrator was off as the flight began."""
+
+
+def begun_elsewhere():
+    """Return a spin whose yaw integrator began far from where it is taken to begin, both free.
+
+    So far that what it does to the flight is no line.
+    """
+    fit = problem(FREE)
+    freedom = {row: 10.0 * sd for row, sd in freedom_of_spin(np.array([0.0, 2.0]), PHYSICS).items()}
+    start = fit.segments.start
+    turned = start.rate_integral.z + OFF * freedom[YAW]
+    there = replace(start, rate_integral=replace(start.rate_integral, z=turned))
+    flown = with_data(replace(fit, segments=replace(fit.segments, start=there)), truth(fit))
+    return replace(
+        fit,
+        segments=replace(
+            fit.segments,
+            measured=flown.segments.measured,
+            freedom=jnp.asarray(np.stack([*freedom.values()])),
+            freed=(*freedom,),
+        ),
+    )
+
+
+@pytest.mark.parametrize("away", [0.05, 0.4])
+def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away):
+    fit = begun_elsewhere()
+    rate = float(fit.schedule.log_rate)
+    *_, last = plan("gradient", fit.samples, rate, windows=False, robust=False, steps=60)
+    true = np.asarray(truth(fit).coefficients)
+    progress = grow(
+        fit,
+        (last,),
+        beginning(fit, true[None] + away),
+        free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
+        clipped=False,
+        on_progress=lambda _: None,
+    )
+    found = Point(progress.points.coefficients[0], progress.points.offsets[0])
+    criterion = criterion_of(last, progress.scales, np.asarray(found.offsets), progress.states)
+    sums = fit.sums(found, criterion, derivatives=False)
+    compared = sum(float(np.sum(n)) for n in sums.counts.values())
+    assert progress.states[0] == pytest.approx([0.0, OFF], abs=0.01)
+    assert progress.losses[0] * compared == pytest.approx(0.5 * OFF**2, rel=0.01)  # its prior's
+    assert float(jnp.sum(sums.loss)) == pytest.approx(0.5 * OFF**2, rel=0.01)
+    assert np.asarray(found.coefficients) == pytest.approx(true, abs=1e-3)
+
+
+def test_a_start_is_believed_within_reason_and_left_where_nothing_tells_it():
+    fit = begun_elsewhere()
+    criterion = replace(
+        criterion_of(
+            plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=1)[-1],
+            {name: np.ones(2) for name in fit.segments.measured},
+            np.zeros((len(OFFSETS), 2)),
+        ),
+        states=jnp.zeros((1, 2)),
+    )
+    sums = fit.sums(truth(fit), criterion, derivatives=False)
+    before = np.array([[0.5, 0.0]])
+    asked = replace(sums, states=np.array([[[np.nan, 1e9]]]))
+    np.testing.assert_array_equal(starts_asked_for(asked, 0, before), [[0.5, FAR]])
+    assert starts_asked_for(asked, 0, None) is None
+    assert starts_asked_for(None, 0, before) is before
+    assert are_far(before, np.zeros((1, 2)))
+    assert not are_far(before, before + 0.1)
+    assert not are_far(None, None)
