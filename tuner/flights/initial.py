@@ -46,6 +46,23 @@ def initial_state(series: Mapping[str, Series]) -> InitialState:
     )
 
 
+def position_error(series: Mapping[str, Series], noise: float) -> float:
+    """Return the standard error in m of the position (each axis) in `initial_state`.
+
+    That of the end of a line through samples of a second, or of the middle of a parabola through
+    those around the start.
+
+    Parameters
+    ----------
+    noise
+        m, standard deviation of a sample.
+    """
+    hover = in_hover(series)
+    near = series["position"].between(*((-HOVER, 0.0) if hover else (-AROUND, AROUND)))
+    count = int(np.isfinite(near.values).all(axis=1).sum())
+    return float((2.0 if hover else 1.5) * noise / np.sqrt(max(count, 1)))
+
+
 def in_hover(series: Mapping[str, Series]) -> bool:
     """Return whether the vehicle hovers through the last second before time 0."""
     position = series["position"].between(-HOVER, 0.0)

@@ -54,13 +54,17 @@ def freedom_of(ignored: Collection[str]) -> NDArray[np.float64]:
     )
 
 
-def freedom_of_spin(yaw_rate: NDArray[np.float64], rate: float) -> dict[int, NDArray[np.float64]]:
-    """Return row of a start -> its standard deviations (F,): what a yaw step leaves open.
+def freedom_of_spin(
+    yaw_rate: NDArray[np.float64], rate: float, position: NDArray[np.float64]
+) -> dict[int, NDArray[np.float64]]:
+    """Return row of a start -> its standard deviations (F,): what a spin does not forget.
 
-    It saturates rotors, and the integrator stops while one is clipped: from which tick to which is
-    a matter of a rounding error, and a tick's share of yaw rate and integral gain turns the vehicle
-    for seconds. No controller has a hold on the heading of a spin, so that all samples after that
-    are off by the same angle.
+    Its yaw step saturates rotors, and the integrator stops while one is clipped: from which tick to
+    which is a matter of a rounding error, and a tick's share of yaw rate and integral gain turns
+    the vehicle for seconds. No controller has a hold on the heading of a spin, so that all samples
+    after that are off by the same angle. And as its attitude is held level about axes that turn, it
+    sways, more and more: a vehicle whose mass is not in the middle doubles a tenth of a millimetre
+    by which it began elsewhere every two or three seconds.
 
     Parameters
     ----------
@@ -68,8 +72,17 @@ def freedom_of_spin(yaw_rate: NDArray[np.float64], rate: float) -> dict[int, NDA
         (F,) rad/s that is asked for at once; zero for no spin.
     rate
         Hz of rate control.
+    position
+        (F,) m, standard errors of where the flights are taken to begin.
     """
-    return {ROWS["rate_integral"].stop - 1: TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate}
+    spins = yaw_rate != 0.0
+    x, y, _ = range(*ROWS["position"].indices(_ENDS[-1]))
+    yaw = ROWS["rate_integral"].stop - 1
+    return {
+        x: position * spins,
+        y: position * spins,
+        yaw: TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate,
+    }
 
 
 def whole(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:

@@ -20,6 +20,7 @@ from tuner.coefficients import recording_offsets
 from tuner.config.job import InletName
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
+from tuner.flights.initial import position_error
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import freedom_of, freedom_of_spin
 from tuner.objective.inlets import INLETS, inlet_of
@@ -129,7 +130,7 @@ def segments_of(
     schedule
         On whose control ticks the battery's voltage is laid out.
     free_starts
-        Whether the yaw integrator of a spin is free at its start, near trim: see `freedom_of_spin`.
+        Whether what a spin does not forget is free at its start: see `freedom_of_spin`.
 
     Raises
     ------
@@ -152,7 +153,8 @@ def segments_of(
     freed = {}
     if free_starts and bool(jnp.any(inlet.spins)):
         rate = jnp.where(inlet.spins, inlet.yaw_rate, 0.0)
-        freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate)
+        begun = [position_error(flight.series, noise["position"]) for flight in flights]
+        freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
     return Segments(
         inlet=inlet,
         start=start_of([flight.initial for flight in flights]),

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tuner.flights.flight import Series
-from tuner.flights.initial import in_hover, initial_state
+from tuner.flights.initial import in_hover, initial_state, position_error
 
 
-def _flight(speed: float, turn: float) -> dict[str, Series]:
-    random = np.random.default_rng(0)
+def _flight(speed: float, turn: float, seed: int = 0) -> dict[str, Series]:
+    random = np.random.default_rng(seed)
     time = np.arange(-2, 2, 0.01) + 0.003
     noise = random.normal(0, 5e-4, (len(time), 3))
     path = np.column_stack([speed * time, 0.8 * speed * time**2, np.ones_like(time)])
@@ -51,3 +51,11 @@ def test_what_follows_the_start_does_not_reach_into_a_hover() -> None:
     moved[series["position"].time > 0] += 0.5
     series["position"] = Series(series["position"].time, moved)
     assert initial_state(series).position == pytest.approx([0, 0, 1], abs=3e-4)
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.0, 0.0), (3.0, 1.5)])
+def test_the_position_at_the_start_scatters_as_is_said(speed: float, turn: float) -> None:
+    flights = [_flight(speed, turn, seed) for seed in range(300)]
+    found = np.array([initial_state(series).position for series in flights])
+    error = position_error(flights[0], 5e-4)
+    assert found.std(axis=0) == pytest.approx(np.full(3, error), rel=0.15)

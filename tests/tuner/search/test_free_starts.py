@@ -28,7 +28,8 @@ def begun_elsewhere():
     So far that what it does to the flight is no line.
     """
     fit = problem(FREE)
-    freedom = {row: 10.0 * sd for row, sd in freedom_of_spin(np.array([0.0, 2.0]), PHYSICS).items()}
+    told = freedom_of_spin(np.array([0.0, 2.0]), PHYSICS, np.array([1e-4, 1e-4]))
+    freedom = {row: 10.0 * sd for row, sd in told.items()}
     start = fit.segments.start
     turned = start.rate_integral.z + OFF * freedom[YAW]
     there = replace(start, rate_integral=replace(start.rate_integral, z=turned))
@@ -62,7 +63,7 @@ def test_a_search_ends_where_its_loss_is_least_from_the_start_that_it_found(away
     criterion = criterion_of(last, progress.scales, np.asarray(found.offsets), progress.states)
     sums = fit.sums(found, criterion, derivatives=False)
     compared = sum(float(np.sum(n)) for n in sums.counts.values())
-    assert progress.states[0] == pytest.approx([0.0, OFF], abs=0.01)
+    assert progress.states[-1] == pytest.approx([0.0, OFF], abs=0.01)
     assert progress.losses[0] * compared == pytest.approx(0.5 * OFF**2, rel=0.01)  # its prior's
     assert float(jnp.sum(sums.loss)) == pytest.approx(0.5 * OFF**2, rel=0.01)
     assert np.asarray(found.coefficients) == pytest.approx(true, abs=1e-3)
@@ -76,14 +77,15 @@ def test_a_start_is_believed_within_reason_and_left_where_nothing_tells_it():
             {name: np.ones(2) for name in fit.segments.measured},
             np.zeros((len(OFFSETS), 2)),
         ),
-        states=jnp.zeros((1, 2)),
+        states=jnp.zeros((3, 2)),
     )
     sums = fit.sums(truth(fit), criterion, derivatives=False)
-    before = np.array([[0.5, 0.0]])
-    asked = replace(sums, states=np.array([[[np.nan, 1e9]]]))
-    np.testing.assert_array_equal(starts_asked_for(asked, 0, before), [[0.5, FAR]])
+    before = np.array([[0.5, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    asked = replace(sums, states=np.array([[[np.nan, 1e9], [1.0, -2.0], [0.0, 0.0]]]))
+    expected = [[0.5, FAR], [1.0, -2.0], [0.0, 0.0]]
+    np.testing.assert_array_equal(starts_asked_for(asked, 0, before), expected)
     assert starts_asked_for(asked, 0, None) is None
     assert starts_asked_for(None, 0, before) is before
-    assert are_far(before, np.zeros((1, 2)))
+    assert are_far(before, np.zeros((3, 2)))
     assert not are_far(before, before + 0.1)
     assert not are_far(None, None)
