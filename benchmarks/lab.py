@@ -26,7 +26,8 @@ from tuner.engine import Report, engine_for
 from tuner.flights.flight import Array, Flight
 from tuner.job.disturbances import examined
 from tuner.job.first_terms import with_first_terms
-from tuner.job.prepare import job_of
+from tuner.job.prepare import Job, job_of
+from tuner.job.selected import Selected
 from tuner.job.terms import search_with_terms
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.voltage import VOLTAGE
@@ -146,19 +147,28 @@ def _task(seed: int, report: Report) -> Trial:
     return trial_of(seed)
 
 
+def job_at(lab: Lab, folder: Path, *, seed: int) -> Job:
+    """Fly a laboratory, and return the job of fitting its flights."""
+    paths = write(lab, folder, seed=seed)
+    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    recordings, _ = read_usable(settings)
+    return with_first_terms(job_of(settings, recordings))
+
+
+def searched(job: Job, folder: Path) -> Selected:
+    """Return the fit of a job, with the terms that its flights call for."""
+    return search_with_terms(
+        job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
+    )
+
+
 def trial_of(seed: int) -> Trial:
     """Fly and fit the laboratory of a seed."""
     lab = drawn(seed)
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        paths = write(lab, folder, seed=seed)
-        settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
-        recordings, _ = read_usable(settings)
-        job = with_first_terms(job_of(settings, recordings))
+        job = job_at(lab, Path(name), seed=seed)
         clock = time.process_time()
-        selected = search_with_terms(
-            job, folder, resume=False, on_progress=lambda *_: None, on_message=lambda _: None
-        )
+        selected = searched(job, Path(name))
         selected, fitted, examination = examined(selected, lambda *_: None, lambda _: None)
         seconds = time.process_time() - clock
     free = {

@@ -138,4 +138,4 @@ def _select(job: Job, fitted: Fitted) -> None:
 
 
 def _examine(fitted: Fitted) -> None:
-    examine(fitted, otherwise=alternatives_of(fitted.objective))
+    examine(fitted, otherwise=alternatives_of(fitted.objective, fitted.point))

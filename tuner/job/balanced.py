@@ -186,7 +186,7 @@ def with_inputs_balanced(
     point = Point(jnp.asarray(vector), fitted.point.offsets)
     taken = as_balanced <= (1.0 + TOLERATED) * as_fitted
     findings = _findings(fitted, point, as_balanced / as_fitted, taken=taken)
-    otherwise = alternatives_of(objective)
+    otherwise = alternatives_of(objective, fitted.point)
     if not taken:
         space = objective.space
         here, there = (np.asarray(space.scaled(jnp.asarray(v))) for v in (begin, balanced))

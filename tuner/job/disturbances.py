@@ -117,9 +117,9 @@ def with_disturbances(
         wall_time=fitted.wall_time + time.perf_counter() - clock,
         findings=(*again.findings, _finding(predictor)),
     )
-    otherwise = alternatives_of(again.objective)
+    otherwise = alternatives_of(again.objective, again.point)
     examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt())
-    otherwise = alternatives_of(fitted.objective)
+    otherwise = alternatives_of(fitted.objective, fitted.point)
     before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
     if not _agree(examination.uncertainty, before.uncertainty):
         on_message("It contradicts the fit of the simulated flights, which is kept.")

@@ -56,7 +56,8 @@ def with_undetermined_held(
     """
 
     def examined(fitted: Fitted) -> Examination:
-        return examine(fitted, otherwise=alternatives_of(fitted.objective), in_doubt=in_doubt)
+        otherwise = alternatives_of(fitted.objective, fitted.point, job.fitted)
+        return examine(fitted, otherwise=otherwise, in_doubt=in_doubt)
 
     examination = examined(fitted)
     segments = fitted.objective.segments

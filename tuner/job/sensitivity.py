@@ -112,7 +112,9 @@ def examine_vehicle(
     fitted = unfitted(job)
     fitted = replace(fitted, findings=(*noticed, *fitted.findings))
     on_message("simulating, and differentiating by every coefficient")
-    examination = examine(fitted, otherwise=alternatives_of(fitted.objective), at_minimum=False)
+    examination = examine(
+        fitted, otherwise=alternatives_of(fitted.objective, fitted.point), at_minimum=False
+    )
     knowledge = write_knowledge(out, job, examination, fitted)
     on_message("simulating what could be flown next")
     proposals = write_next_flight(out, job, examination, fitted, arena)

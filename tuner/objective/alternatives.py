@@ -2,36 +2,77 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
+import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
+from tuner.flights.flight import Flight
+from tuner.objective.battery import log_voltage_of
 from tuner.objective.criterion import Criterion, Point, SegmentData
 from tuner.objective.normal import Objective
 from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable
+from tuner.objective.voltage import read_again
+from tuner.objective.windows import Window
 from tuner.parallel import in_pieces, over_devices
 
 STEP = "step"
 """Half the physics step, controllers and log at their own rates."""
+READINGS = "readings"
+"""The battery's voltmeter read again, a few times."""
+DRAWS = 6
+"""How many times: an error that is told by so many is told to a third."""
 
 
-def alternatives_of(objective: Objective) -> dict[str, Objective]:
+def alternatives_of(
+    objective: Objective, point: Point, flights: Sequence[Flight] = ()
+) -> dict[str, Objective]:
     """Return what might be simulated differently -> the problem so simulated.
 
     Physics runs in the same steps where a recording is fed in step by step: it is laid out for
     those.
+
+    Parameters
+    ----------
+    objective, point
+        The fit.
+    flights
+        Those that are flown whole in it, to have their voltmeters read again where the fit has a
+        battery; none for a fit in which that is not asked.
     """
-    others = {}
-    if isinstance(objective.segments.inlet, ReferenceInlet):
-        schedule = objective.schedule
-        finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
-        others[STEP] = replace(objective, schedule=finer)
+    if not isinstance(objective.segments.inlet, ReferenceInlet):
+        return {}
+    schedule = objective.schedule
+    finer = replace(schedule, physics_rate=2 * schedule.physics_rate)
+    return {STEP: replace(objective, schedule=finer), **_read_again(objective, point, flights)}
+
+
+def _read_again(
+    objective: Objective, point: Point, flights: Sequence[Flight]
+) -> dict[str, Objective]:
+    """Return the problem with other readings of the voltmeters, if they matter to a fit."""
+    segments = objective.segments
+    vehicle = objective.tunable.at(jnp.asarray(point.coefficients)).vehicle
+    windows = [Window(flight, 0.0) for flight in flights]
+    as_read = log_voltage_of(flights, windows, objective.schedule) if flights else None
+    if segments.log_voltage is None or as_read is None:
+        return {}
+    if not float(vehicle.effects.get("battery_exponent", 0.0)):
+        return {}
+    random, others = np.random.default_rng(0), {}
+    for number in range(DRAWS):
+        again = log_voltage_of(read_again(flights, random), windows, objective.schedule)
+        assert again is not None, "there is a voltmeter"
+        volts = segments.log_voltage + (again - as_read)
+        others[f"{READINGS} {number}"] = replace(
+            objective, segments=replace(segments, log_voltage=volts)
+        )
     return others
 
 

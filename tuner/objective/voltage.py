@@ -13,7 +13,7 @@ smoothing spline, its stiffness chosen by generalised cross-validation (Craven a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -77,6 +77,26 @@ def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
         None if reading is None else _smoothed(reading, load, resistance)
         for reading, load in zip(readings, loads, strict=True)
     ]
+
+
+def read_again(flights: Sequence[Flight], random: np.random.Generator) -> list[Flight]:
+    """Return flights whose voltmeter was read once more, with errors like those that it made.
+
+    What a reading is off from `voltages_of` it is off again, to one side or the other (the wild
+    bootstrap: Wu, "Jackknife, bootstrap and other resampling methods in regression analysis",
+    1986).
+    """
+    others = []
+    for flight, curve in zip(flights, voltages_of(flights), strict=True):
+        if curve is None:
+            others.append(flight)
+            continue
+        readings = flight.series[VOLTAGE]
+        expected = np.interp(readings.time, curve.time, curve.volts)[:, None]
+        sides = random.choice([-1.0, 1.0], size=readings.values.shape)
+        other = Series(readings.time, expected + sides * (readings.values - expected))
+        others.append(replace(flight, series={**flight.series, VOLTAGE: other}))
+    return others
 
 
 def _loads(flights: Sequence[Flight]) -> tuple[str, list[Series | None]]:

@@ -26,6 +26,9 @@ class ErrorParts(Part):
     step
         Its move when the physics step is halved, and for a rotor's lag half of the finest step in
         which simulators take it; None where that was not asked.
+    readings
+        How it scatters when the battery's voltmeter is read again, with errors like those that it
+        made; None where the fit has no battery, or follows what pushed the flights.
     search
         How far one more linear step would move it: a search ends where its steps gain nothing.
     """
@@ -35,4 +38,5 @@ class ErrorParts(Part):
     left_out: FiniteOrNone = None
     terms: FiniteOrNone = None
     step: FiniteOrNone = None
+    readings: FiniteOrNone = None
     search: FiniteOrNone = None

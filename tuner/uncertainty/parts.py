@@ -1,4 +1,4 @@
-"""What a standard error is made of: noise, residuals, flights, terms, physics steps."""
+"""What a standard error is made of: noise, residuals, flights, terms, physics steps, readings."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.objective.alternatives import STEP
+from tuner.objective.alternatives import DRAWS, READINGS, STEP
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
@@ -19,6 +20,8 @@ Array = NDArray[np.float64]
 SIMULATORS_STEP = 1.0 / 4000.0
 """s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
 step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order."""
+WIDER = float(stdtrit(DRAWS, 0.975) / ndtri(0.975))
+"""Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
 FEWEST = 3
 """Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
 TELLS = 1e-3
@@ -37,6 +40,7 @@ class Spread:
     left_out: Array | None
     terms: Array | None
     step: Array | None
+    readings: Array | None
     search: Array
 
     @property
@@ -45,14 +49,16 @@ class Spread:
 
         Noise, residuals, left-out flights and left-out terms show the same errors in four ways, of
         which the largest counts; what steps do comes on top, those of the simulation and those that
-        the search did not take.
+        the search did not take, and what inputs do that were read with errors.
         """
         error = np.maximum(self.noise, self.residuals)
         for part in (self.left_out, self.terms):
             if part is not None:
                 error = np.maximum(error, part)
-        error = np.hypot(error, self.search)
-        return np.asarray(error if self.step is None else np.hypot(error, self.step))
+        for part in (self.search, self.step, self.readings):
+            if part is not None:
+                error = np.hypot(error, part)
+        return np.asarray(error)
 
     def of(self, index: int, slope: float) -> ErrorParts:
         """Return the parts of one parameter's coefficient, which changes by a slope with it."""
@@ -82,12 +88,14 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
     }
     if STEP in moved:
         moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0)
+    drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
     return Spread(
         noise=noise_alone(information),
         residuals=residuals,
         left_out=left_out(information),
         terms=information.in_doubt,
         step=moved.get(STEP),
+        readings=WIDER * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
         search=np.abs(inverse.matrix @ information.slope),
     )
 

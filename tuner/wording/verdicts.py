@@ -58,6 +58,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "left-out flights": parts.left_out,
         "left-out terms": parts.terms,
         "step": parts.step,
+        "voltmeter": parts.readings,
         "rest of the search": parts.search,
     }
     least = NEGLIGIBLE * max(error or 0.0 for error in named.values())

@@ -187,7 +187,7 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     late = eqx.tree_at(
         lambda o: o.model.vehicle.setup.actuator_latency, problem, jnp.asarray(0.007)
     )  # two commands on their way, three in finer steps
-    finer = alternatives_of(late)[STEP]
+    finer = alternatives_of(late, point)[STEP]
     predictor = replace(predictor, simulator=late.simulator).at(late, point)
     own = Predictor.of(finer, point, gusty(problem, 1)[1])
     assert own is not None

@@ -51,7 +51,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     fitted = SimpleNamespace(objective=objective, criterion=None, point=1000.0, held={})
     traded = {"motor_constant": "input_scaling", "input_scaling": "input_scaling"}
     alone = {"time_constant_up": "time_constant_up"}  # open by itself: predicting fits keep it
-    monkeypatch.setattr(holding, "alternatives_of", lambda _: None)
+    monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
     nothing = SimpleNamespace(uncertainty=SimpleNamespace(names=()))
     monkeypatch.setattr(holding, "examine", lambda *_, **__: nothing)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded | alone)
@@ -62,7 +62,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
 
     monkeypatch.setattr(holding, "hold", hold)
     said = []
-    job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()))
+    job = SimpleNamespace(settings=SimpleNamespace(job=JobFile()), fitted=())
     rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
     assert rest.held == (traded if is_held else {})
     assert ("all keep their values" in said[-1]) is not is_held
@@ -91,12 +91,12 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
     name, objective = idle["name"], SimpleNamespace(segments=SimpleNamespace(windowed=True))
     objective.segments.freedom = freedom
     traded = {name: "input_scaling", "input_scaling": "input_scaling"}
-    fitted = SimpleNamespace(objective=objective, held=traded)
+    fitted = SimpleNamespace(objective=objective, point=None, held=traded)
     estimate = SimpleNamespace(reason=Reason(code=idle["code"], bound=idle["bound"]))
     examined = SimpleNamespace(
         uncertainty=SimpleNamespace(names=(name,), estimates={name: estimate})
     )
-    monkeypatch.setattr(holding, "alternatives_of", lambda _: None)
+    monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
     monkeypatch.setattr(holding, "examine", lambda *_, **__: examined)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded)
 
@@ -105,7 +105,8 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
 
     monkeypatch.setattr(holding, "hold", hold)
     terms = {"ground_effect": ("ground_effect",)}
-    job, said = SimpleNamespace(settings=SimpleNamespace(job=file), first_terms=terms), []
+    settings = SimpleNamespace(job=file)
+    job, said = SimpleNamespace(settings=settings, first_terms=terms, fitted=()), []
     rest, _ = with_undetermined_held(job, fitted, lambda *_: None, said.append)
     assert rest.held == (traded | {name: name} if goes else traded)
     assert any("taken out of the model" in line for line in said) is goes

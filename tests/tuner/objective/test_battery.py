@@ -18,13 +18,14 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, InitialState, Series
+from tuner.objective.alternatives import DRAWS, STEP, alternatives_of
 from tuner.objective.battery import (
     log_voltage_of,
     require_voltage,
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.voltage import IDLE, _resistance, voltages_of
+from tuner.objective.voltage import IDLE, _resistance, read_again, voltages_of
 from tuner.objective.windows import Window
 from tuner.search.normal_equations import normal_equations
 
@@ -255,3 +256,37 @@ def test_a_saturated_moment_tells_the_resistance_where_rotor_speeds_were_recorde
     volts = 16.2 - 0.15 * np.interp(time, fine, load) + NOISE * random.normal(size=len(time))
     found = _resistance([(series(time, volts), series(fine, load))], spikes_count=True)
     assert found == pytest.approx(0.15, abs=0.03)
+
+
+def test_a_voltmeter_that_is_read_again_scatters_a_curve_as_other_readings_do():
+    curves, again, random = [], [], np.random.default_rng(2)
+    for seed in range(20):
+        known, _ = loaded(seed)
+        (curve,), (other,) = voltages_of([known]), voltages_of(read_again([known], random))
+        curves.append(curve.volts)
+        again.append(other.volts - curve.volts)
+    scatter = np.sqrt(np.mean(np.var(curves, axis=0, ddof=1)))
+    assert np.sqrt(np.mean(np.square(again))) == pytest.approx(scatter, rel=0.2)
+    silent = flight("silent")
+    assert read_again([silent], random)[0] is silent
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0])
+def test_a_fit_is_simulated_with_other_readings_where_they_matter_to_it(exponent):
+    flights = [loaded(seed)[0] for seed in range(2)]
+    plain = problem(("battery_exponent",))
+    windows = [Window(known, 0.0) for known in flights]
+    volts = np.exp(np.asarray(log_voltage_of(flights, windows, plain.schedule)))
+    fit = with_battery(plain, volts)
+    vector = fit.space.vector_of({"battery_exponent": exponent})
+    point = Point(jnp.asarray(vector), jnp.zeros((5, 2)))
+    others = alternatives_of(fit, point, flights)
+    assert next(iter(others)) == STEP
+    assert len(others) == 1 + (DRAWS if exponent else 0)
+    for name, other in others.items():
+        if name == STEP:
+            continue
+        off = np.exp(np.asarray(other.segments.log_voltage)) - volts
+        assert 0.0 < off.std() < NOISE
+    assert list(alternatives_of(fit, point)) == [STEP]
+    assert list(alternatives_of(plain, point, flights)) == [STEP]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tuner.objective.alternatives import DRAWS, READINGS
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.parts import left_out, noise_alone, spread_of
@@ -151,6 +152,24 @@ def test_a_lag_is_known_no_better_than_half_a_simulators_step():
     assert spread.step is not None
     assert spread.step[0] == pytest.approx(time_constant - as_if, rel=0.01)
     assert spread.step[1:] == pytest.approx(0.0)
+
+
+def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
+    """Each draw moves them by a normal error: 95 % of the truth's lie within what is quoted."""
+    information, _ = regression(np.random.default_rng(6), apart=0.0)
+    total, random, held = information.total, np.random.default_rng(7), []
+    for _ in range(400):
+        moves = random.normal(size=(DRAWS + 1, COUNT))
+        changes = {f"{READINGS} {i}": (total @ moves[i])[None] for i in range(DRAWS)}
+        spread = spread_of(
+            replace(information, changes=changes), np.full(COUNT, 1e-9), np.zeros(COUNT)
+        )
+        assert spread.step is None
+        held.append(np.abs(moves[-1]) < 1.96 * spread.readings)
+    assert np.mean(held) == pytest.approx(0.95, abs=0.015)
+    without = spread_of(replace(information, changes={}), np.full(COUNT, 1e-9), np.zeros(COUNT))
+    assert without.readings is None
+    assert spread.quoted == pytest.approx(np.hypot(without.quoted, spread.readings))
 
 
 @pytest.mark.parametrize("excess", [0.0, 1.0, 5.0, 1e4])
