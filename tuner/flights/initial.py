@@ -58,7 +58,7 @@ def position_error(series: Mapping[str, Series], noise: float) -> float:
         m, standard deviation of a sample.
     """
     hover = in_hover(series)
-    near = series["position"].between(*((-HOVER, 0.0) if hover else (-AROUND, AROUND)))
+    near = _near_start(series["position"], hover)
     count = int(np.isfinite(near.values).all(axis=1).sum())
     return float((2.0 if hover else 1.5) * noise / np.sqrt(max(count, 1)))
 
@@ -78,9 +78,14 @@ def in_hover(series: Mapping[str, Series]) -> bool:
     return len(rates) > 0 and bool(np.abs(np.median(rates, axis=0)).max() < STILL)
 
 
+def _near_start(series: Series, hover: bool) -> Series:
+    """Return the samples that tell of the start."""
+    return series.between(-HOVER, 0.0) if hover else series.between(-AROUND, AROUND)
+
+
 def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: int = 0) -> float:
     """Return one column, or its derivative, at time 0."""
-    near = series.between(-HOVER, 0.0) if hover else series.between(-AROUND, AROUND)
+    near = _near_start(series, hover)
     measured = np.isfinite(near.values[:, column])
     time, values = near.time[measured], near.values[measured, column]
     if len(time) == 0:

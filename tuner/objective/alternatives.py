@@ -59,12 +59,12 @@ def _read_again(
     """Return the problem with other readings of the voltmeters, if they matter to a fit."""
     segments = objective.segments
     vehicle = objective.tunable.at(jnp.asarray(point.coefficients)).vehicle
+    matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
+    if not flights or segments.log_voltage is None or not matters:
+        return {}
     windows = [Window(flight, 0.0) for flight in flights]
-    as_read = log_voltage_of(flights, windows, objective.schedule) if flights else None
-    if segments.log_voltage is None or as_read is None:
-        return {}
-    if not float(vehicle.effects.get("battery_exponent", 0.0)):
-        return {}
+    as_read = log_voltage_of(flights, windows, objective.schedule)
+    assert as_read is not None, "the segments hold what was read"
     random, others = np.random.default_rng(0), {}
     for number in range(DRAWS):
         again = log_voltage_of(read_again(flights, random), windows, objective.schedule)

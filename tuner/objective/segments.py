@@ -153,7 +153,8 @@ def segments_of(
     freed = {}
     if free_starts and bool(jnp.any(inlet.spins)):
         rate = jnp.where(inlet.spins, inlet.yaw_rate, 0.0)
-        begun = [position_error(flight.series, noise["position"]) for flight in flights]
+        known = noise.get("position", 0.0)  # where no position is compared, none is corrected
+        begun = [position_error(flight.series, known) for flight in flights]
         freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
     return Segments(
         inlet=inlet,

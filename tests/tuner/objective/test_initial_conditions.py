@@ -1,6 +1,7 @@
 """Free starts: eliminated as linear algebra says, and moved as their names say."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from tests.tuner.uncertainty.making import (
     with_data,
 )
 from tuner.filter_error.predictor import unscaled
+from tuner.flights.load import load_flight
 from tuner.model import model_of
 from tuner.objective.initial_conditions import (
     ROWS,
@@ -28,7 +30,9 @@ from tuner.objective.initial_conditions import (
     spun_up,
     whole,
 )
+from tuner.objective.segments import segments_of
 
+ROOT = Path(__file__).resolve().parents[3]
 COUNT = len(freedom_of(()))
 
 
@@ -122,6 +126,18 @@ def test_a_spin_leaves_a_tick_of_its_integrator_and_where_it_began_open_and_noth
     assert list(freedom)[2] == YAW
     assert freedom[ROWS["position"].start] == pytest.approx([0.0, 2e-4])
     assert freedom[YAW] == pytest.approx([0.0, 2 * 0.1 * 2.0 / 400.0])
+
+
+def test_where_a_spin_began_is_not_asked_of_a_fit_that_compares_no_positions():
+    spin = load_flight(ROOT / "reference_flights" / "yaw_spin_3rps.bag")
+    noise = {"attitude": 1e-3, "body_rate": 0.01}
+    blind = segments_of([spin], noise=noise, free_starts=True)
+    seeing = segments_of([spin], noise={"position": 5e-4, **noise}, free_starts=True)
+    assert blind.freed == seeing.freed
+    assert blind.freed[-1] == YAW
+    np.testing.assert_array_equal(blind.freedom[:-1], 0.0)
+    np.testing.assert_array_equal(blind.freedom[-1], seeing.freedom[-1])
+    assert (np.asarray(seeing.freedom) > 0.0).all()
 
 
 @pytest.mark.parametrize(
