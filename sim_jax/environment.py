@@ -29,6 +29,9 @@ class Environment(eqx.Module):
     """s since the battery began to decline at which the simulation begins; None for zero."""
     disturbance: Disturbance | None = None
     """Gusts, and whatever else pushes."""
+    draught: Scalar | None = None
+    """m/s, standard deviation along the rotors' axes of gusts of which no more is known: thrust is
+    what they leave of it in the mean. None for still air."""
 
     @property
     def at_first(self) -> tuple[Vec3 | Scalar | Disturbance | None, ...]:
@@ -36,7 +39,7 @@ class Environment(eqx.Module):
         series = self.log_voltage
         voltage = None if series is None else series[0]
         disturbance = None if self.disturbance is None else self.disturbance.at_first
-        return self.wind, self.battery_decline, self.begin, voltage, disturbance
+        return self.wind, self.battery_decline, self.begin, voltage, disturbance, self.draught
 
     def during(self, step: Int[Array, ""], schedule: Schedule) -> Environment:
         """Return what surrounds the flight in a physics step: its gust is part of the wind."""

@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from sim_jax.environment import NOTHING_AROUND, Environment
+from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
@@ -24,6 +25,8 @@ class Air(eqx.Module):
     """The world's z axis."""
     rotor_acceleration: PerRotor = ()
     """rad/s² of each rotor during the step; empty where no term asks for it."""
+    draught: Scalar | None = None
+    """As of `Environment`."""
 
     @staticmethod
     def around(
@@ -47,6 +50,7 @@ class Air(eqx.Module):
             at_rotors=tuple(velocity + motion.body_rate.cross(arm) for arm in arms),
             up=motion.attitude.world_up(),
             rotor_acceleration=rotor_acceleration,
+            draught=environment.draught,
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import jax.numpy as jnp
+from jax.scipy.stats import norm
 
 from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion, Wrench
@@ -24,12 +25,14 @@ def thrust(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) ->
     of the rotor's centre, where a vehicle has these effects. Source: thesis Eq. 6.5 and 6.6 (the
     equation is signed; the code that was flown, followed here, takes the length of v∥); Cheeseman
     and Bennett, "The effect of the ground on a helicopter rotor in forward flight", 1955.
+
+    In a draught |v∥| is its mean over the gusts, of which each rotor meets the same.
     """
     aerodynamics = vehicle.aerodynamics
     zero = jnp.zeros_like(motion.velocity.x)
     lifts = []
     for number, (speed, through) in enumerate(zip(rotor_speed, air.at_rotors, strict=True)):
-        square = speed * speed * _remaining_share(aerodynamics, through.z)
+        square = speed * speed * _remaining_share(aerodynamics, through.z, air.draught)
         scale = _thrust_scale(vehicle, number)
         if scale is not None:
             square = scale * square
@@ -88,10 +91,21 @@ def drag_torque(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Ai
     return Wrench(Vec3.zeros(zero), Vec3(zero, zero, torque))
 
 
-def _remaining_share(aerodynamics: Aerodynamics, axial: Scalar) -> Scalar:
+def _remaining_share(aerodynamics: Aerodynamics, axial: Scalar, draught: Scalar | None) -> Scalar:
     """Return the share of a rotor's static thrust that is left at an axial air speed in m/s."""
-    lost = jnp.abs(axial) * (1.0 / aerodynamics.max_relative_airspeed)
+    length = jnp.abs(axial) if draught is None else _mean_length(axial, draught)
+    lost = length * (1.0 / aerodynamics.max_relative_airspeed)
     return jnp.where(lost < 1.0, 1.0 - lost, 0.0)
+
+
+def _mean_length(mean: Scalar, sd: Scalar) -> Scalar:
+    """Return the mean length of a number that is normally distributed about a mean.
+
+    u (1 - 2 Q(u/σ)) + 2 σ φ(u/σ): it has a slope at zero, where the length has none. Source: Leone,
+    Nelson and Nottingham, "The folded normal distribution", 1961.
+    """
+    size = mean / sd
+    return mean * (1.0 - 2.0 * norm.sf(size)) + 2.0 * sd * norm.pdf(size)
 
 
 def _thrust_scale(vehicle: Vehicle, number: int) -> Scalar | None:

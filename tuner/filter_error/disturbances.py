@@ -19,29 +19,38 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.scipy.stats import norm
 from jaxtyping import Float
 
 from sim_jax.disturbance import Disturbance
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import PerRotor, Vehicle
+from sim_jax.vehicle import Vehicle
 
-STRENGTHS = ("gust", "lift", "roll", "turbulence", "gust_lasts", "turbulence_lasts")
+STRENGTHS = (
+    "gust",
+    "lift",
+    "roll",
+    "turbulence",
+    "gust_lasts",
+    "turbulence_lasts",
+    "command_noise",
+)
 """What is estimated of them: shares of the weight by which gusts push sideways and upwards, and
 which they would need at a rotor's arm to turn the vehicle as they do; the share of itself by which
-a rotor's thrust wanders; the s that both last."""
-USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03])
+a rotor's thrust wanders; the s that both last. And how noisy recorded commands are, as a factor:
+they answer to what pushes and hardly err, so that a filter leans on them, and inertias follow by
+4 % where they are taken for a quarter noisier than they are."""
+COMMAND_NOISE = STRENGTHS.index("command_noise")
+USUAL = np.log([0.003, 0.001, 0.001, 0.003, 1.0, 0.03, 1.0])
 """Logarithms of what they are before anything is known."""
-LEAST = np.log([3e-5, 3e-5, 3e-5, 3e-5, 0.2, 0.005])
-MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15])
+LEAST = np.log([3e-5, 3e-5, 3e-5, 3e-5, 0.2, 0.005, 0.02])
+MOST = np.log([0.1, 0.1, 0.1, 0.1, 5.0, 0.15, 10.0])
 """Logarithms between which they are looked for."""
 STRONGEST = 1.0
 """m/s, the strongest gusts along the rotors' axes by which a lift is explained."""
 SLOW = ("force_x", "force_y", "force_z", "moment_x", "moment_y")
 FAST = ("thrust", "moment_x", "moment_y", "moment_z")
 COUNT = len(SLOW) + len(FAST)
-THRUST = len(SLOW) + FAST.index("thrust")
 
 
 class Processes(eqx.Module):
@@ -70,7 +79,7 @@ class Processes(eqx.Module):
         return self.sd**2 * (1.0 - self.keeps**2)
 
 
-def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -> Processes:
+def processes_of(vehicle: Vehicle, strengths: Float[Array, " 7"], rate: float) -> Processes:
     """Return the processes of a vehicle.
 
     Parameters
@@ -82,7 +91,7 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -
     rate
         Hz of the ticks.
     """
-    gust, lift, roll, turbulence, gust_lasts, turbulence_lasts = jnp.exp(strengths)
+    gust, lift, roll, turbulence, gust_lasts, turbulence_lasts, _ = jnp.exp(strengths)
     body, count = vehicle.body, len(vehicle.rotors)
     weight, turns = body.mass * GRAVITY, (body.inertia_xx, body.inertia_yy, body.inertia_zz)
     own = turbulence * weight / count
@@ -99,19 +108,6 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 6"], rate: float) -
     return Processes(jnp.stack(sd) / acts, acts, keeps, draught)
 
 
-def thrust_lost(vehicle: Vehicle, axial: Scalar, rotor_speed: PerRotor, draught: Scalar) -> Scalar:
-    """Return the thrust in N that gusts take in the mean, whichever way they blow.
-
-    Thrust falls with the length of the axial airspeed: of a gust w about the vehicle's own u, with
-    standard deviation σ, E|u + w| - |u| = 2σ (φ(z) - |z| Q(|z|)), z = u/σ (the folded normal
-    distribution's mean; Leone, Nelson and Nottingham 1961).
-    """
-    size = jnp.abs(axial) / draught
-    further = 2.0 * draught * (norm.pdf(size) - size * norm.sf(size))
-    air, square = vehicle.aerodynamics, sum(speed * speed for speed in rotor_speed)
-    return air.motor_constant * square * further / air.max_relative_airspeed
-
-
 def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
     """Return the disturbance that values in N and N m are, the same throughout a tick."""
     rows: dict[str, Array] = {}
@@ -126,5 +122,5 @@ def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:
 
 
 def within(strengths: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return strengths (6,), logarithms, inside their limits."""
+    """Return strengths (7,), logarithms, inside their limits."""
     return np.clip(strengths, LEAST, MOST)

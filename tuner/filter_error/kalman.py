@@ -208,7 +208,9 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
 
             error, seen = _linearised(compare, zero)
             spread = covariance @ jnp.swapaxes(seen, 1, 2)
-            innovation = seen @ spread + jnp.diag(noise**2)
+            # what was not sampled is as likely with any noise
+            variance = jnp.where(observer.sampled(samples).T, noise**2, 1.0)
+            innovation = seen @ spread + variance[:, :, None] * jnp.eye(wide)
             factor = jnp.linalg.cholesky(innovation)
             whitens = solve_triangular(
                 factor, jnp.broadcast_to(jnp.eye(wide), factor.shape), lower=True

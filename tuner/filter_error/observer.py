@@ -21,15 +21,12 @@ from sim_jax.rollout import begun
 from sim_jax.rotation import Quaternion
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import State
-from sim_jax.terms.air import Air
 from sim_jax.trees import replaced
 from sim_jax.vector import Vec3
 from tuner.filter_error.disturbances import (
-    THRUST,
     Processes,
     disturbance_of,
     processes_of,
-    thrust_lost,
 )
 from tuner.filter_error.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
@@ -78,14 +75,14 @@ class Expected(eqx.Module):
     tunable, coefficients
         The model, and its search vector (K,).
     strengths
-        (6,) of the disturbances.
+        (7,) of the disturbances.
     noise
         (m,) factors on the standard deviations of the samples.
     """
 
     tunable: Tunable
     coefficients: Float[Array, " K"]
-    strengths: Float[Array, " 6"]
+    strengths: Float[Array, " 7"]
     noise: Float[Array, " m"]
 
 
@@ -166,14 +163,11 @@ class Observer(eqx.Module):
 
     def next(self, state: State, pushed: Array, tick: Array) -> State:
         """Return the state a tick later, pushed by the processes' values (D, F)."""
-        vehicle, around, processes = self.plant.vehicle, self.plant.environment, self.processes
-        axial = Air.around(vehicle, state.motion, around).velocity.z
-        lost = thrust_lost(vehicle, axial, state.rotor_speed, processes.draught)
-        acting = (processes.acts[:, None] * pushed).at[THRUST].add(-lost)
+        acting = disturbance_of(self.processes.acts[:, None] * pushed)
         environment = eqx.tree_at(
-            lambda e: e.disturbance,
-            around,
-            disturbance_of(acting),
+            lambda e: (e.disturbance, e.draught),
+            self.plant.environment,
+            (acting, self.processes.draught),
             is_leaf=lambda leaf: leaf is None,
         )
         plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)
@@ -202,6 +196,10 @@ class Observer(eqx.Module):
             name: jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in signals[name]])
             for name in self.channels
         }
+
+    def sampled(self, samples: dict[str, Sampled]) -> Array:
+        """Return which rows of `errors` (m, F) there are samples of."""
+        return jnp.concatenate([samples[name].weight > 0 for name in self.channels])
 
     def errors(
         self, now: dict[str, Array], before: dict[str, Array], samples: dict[str, Sampled]

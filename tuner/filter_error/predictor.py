@@ -13,10 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
-from tuner.filter_error.disturbances import USUAL
+from tuner.filter_error.disturbances import COMMAND_NOISE, USUAL
 from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations, stepped
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
-from tuner.filter_error.recorded import FLIGHT_CONTROLLER, gathered, sampled, setpoints_on_ticks
+from tuner.filter_error.recorded import (
+    FLIGHT_CONTROLLER,
+    each_reading,
+    gathered,
+    sampled,
+    setpoints_on_ticks,
+)
 from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of
 from tuner.flights.flight import Flight
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
@@ -33,7 +39,7 @@ AT_ONCE = 24
 LOST = 0.05
 """Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
 LEARNT_FROM = 18.0
-"""s of each flight from which strengths are learnt: each of the six takes a filter of its own."""
+"""s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
 NUMBERS = 57
 """Of a state and its disturbances that samples correct, with four commands on their way."""
 NOISIER = 1.05
@@ -53,7 +59,7 @@ class Predictor:
     rows
         Channel -> (n, F) the tick of each sample, -1 for one that is not used.
     strengths
-        (6,) of the disturbances.
+        (7,) of the disturbances, and of the noise of commands.
     noise
         Channel -> factor on the samples' standard deviations.
     found
@@ -91,10 +97,11 @@ class Predictor:
         channels = [name for name in CHANNELS if name in segments.measured]
         if inlet is None or not {"position", "attitude", "body_rate"} <= set(channels):
             return None
+        read = dict(segments.measured)
+        if "command" in read:
+            read["command"] = each_reading(read["command"])
         laid = {
-            name: sampled(
-                name, segments.measured[name], late, objective.samples, float(schedule.log_rate)
-            )
+            name: sampled(name, read[name], late, objective.samples, float(schedule.log_rate))
             for name in channels
         }
         return Predictor(
@@ -149,6 +156,8 @@ class Predictor:
         """Return the predictor whose samples are as noisy as the innovations, or itself."""
         noise = dict(self.noise)
         for name, white in self._sizes():
+            if name == "command":
+                continue  # how noisy it is is learnt
             spread = noise[name] * 1.4826 * float(np.median(white)) if len(white) else 1.0
             noise[name] = spread if spread > NOISIER else 1.0
         return self if noise == self.noise else replace(self, noise=noise).at(objective, point)
@@ -202,7 +211,8 @@ class Predictor:
 
     def _expected(self, objective: Objective, point: Point) -> Expected:
         widths = self.feed.widths
-        noise = np.repeat([self.noise[name] for name in widths], list(widths.values()))
+        factors = {**self.noise, "command": np.exp(self.strengths[COMMAND_NOISE])}
+        noise = np.repeat([factors[name] for name in widths], list(widths.values()))
         return Expected(
             objective.tunable,
             *map(jnp.asarray, (point.coefficients, self.strengths, noise)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from sim_jax.inlet import BodyRateInlet
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.flights.flight import Flight
+from tuner.objective.noise import repeats
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
 
 SETPOINTS = ("rate_setpoint", "thrust_setpoint")
@@ -85,6 +87,18 @@ def sampled(
         place[filled, segment] = 1.0 - filled + time[sample, segment] * rate
         rows[sample, segment] = filled
     return Sampled(*(jnp.asarray(part) for part in (*laid, place))), rows
+
+
+def each_reading(commands: Measured) -> Measured:
+    """Return commands each of which weighs as one reading, however long it rests.
+
+    Simulated flights take a value that rests for one reading (`repeats`). Whether it will rest
+    depends on what comes after it, and innovations that are weighed by that are no longer chance:
+    a filter takes all alike, and learns how noisy they are.
+    """
+    values = np.asarray(commands.values)
+    rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    return replace(commands, weight=commands.weight * jnp.asarray(np.sqrt(rests)))
 
 
 def setpoints_on_ticks(

@@ -50,11 +50,11 @@ class Slopes(NamedTuple):
     Attributes
     ----------
     slope
-        (6,) its derivatives.
+        (7,) its derivatives.
     information
-        (6, 6) Fisher's.
+        (7, 7) Fisher's.
     moved
-        (6, n, m) derivatives of the innovations, whitened by the covariance that they had.
+        (7, n, m) derivatives of the innovations, whitened by the covariance that they had.
     """
 
     slope: Array
@@ -70,7 +70,7 @@ def slopes_of(filtered: Callable[[Array], Likelihood], strengths: Array) -> Slop
     filtered
         Of strengths.
     strengths
-        (6,) logarithms, at which.
+        (7,) logarithms, at which.
     """
     here = filtered(strengths)
     slope, moves, rows = np.zeros(len(strengths)), [], []

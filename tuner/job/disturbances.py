@@ -187,7 +187,7 @@ def _said(before: Selected, after: Selected) -> str:
 
 def _finding(predictor: Predictor) -> Finding:
     """Return what is said of the disturbances."""
-    gust, _, _, thrust, gust_seconds, thrust_seconds = np.exp(predictor.strengths).tolist()
+    gust, _, _, thrust, gust_seconds, thrust_seconds, _ = np.exp(predictor.strengths).tolist()
     numbers = {
         "gust": gust,
         "gust_seconds": gust_seconds,

@@ -284,13 +284,7 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "",
     ),
-    Code.DISTURBANCES_FOLLOWED: (
-        composed.disturbances_followed,
-        (
-            "Take inertia_xx and inertia_yy for known to 6 % at best: in simulated gusts they come "
-            "out 3 % too small in the mean, and half of their intervals miss the truth."
-        ),
-    ),
+    Code.DISTURBANCES_FOLLOWED: (composed.disturbances_followed, ""),
     Code.INERTIA_BALANCED: (composed.inertia_balanced, ""),
     Code.INERTIA_NOT_BALANCED: (
         composed.inertia_balanced,

@@ -13,7 +13,13 @@ import pytest
 from sim_jax.crash import Limits
 from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
-from tuner.filter_error.disturbances import COUNT, USUAL, disturbance_of, processes_of
+from tuner.filter_error.disturbances import (
+    COMMAND_NOISE,
+    COUNT,
+    USUAL,
+    disturbance_of,
+    processes_of,
+)
 from tuner.filter_error.kalman import GATE
 from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, unscaled
@@ -29,7 +35,8 @@ from tuner.uncertainty.information import information_at, information_from_jacob
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
 FREE = ("inertia_xx", "inertia_yy", "time_constant_up", "motor_constant", "rotor_drag_coefficient")
-STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03])
+STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03, 1.0])
+NOISE = {**making.NOISE, "command": 3e-4}
 OFFSETS = np.zeros((5, 2), bool)
 
 
@@ -68,7 +75,7 @@ def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
     every, measured = making.SAMPLE_EVERY, {}
     for channel, old in exact.segments.measured.items():
         values = np.asarray(channels[channel])[every : exact.samples - 1 : every]
-        noise = rng.standard_normal(values.shape) * making.NOISE[channel]
+        noise = rng.standard_normal(values.shape) * NOISE[channel]
         if channel == "attitude":
             noise[:, 0] *= 0.0
             noise /= 2.0  # of small turns about nearly level axes
@@ -154,6 +161,44 @@ def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> Non
     problem, predictor, point = fitted
     noisy = replace(predictor, noise=dict.fromkeys(predictor.noise, 1.3)).at(problem, point)
     assert all(noise == 1.0 for noise in noisy.as_noisy(problem, point).noise.values())
+
+
+@pytest.mark.parametrize("claimed", [2.0, 0.7])
+def test_how_noisy_commands_are_is_learnt_whatever_is_claimed(exact, claimed) -> None:
+    """Taken for a quarter noisier than they are, commands bend inertias by their errors."""
+    others = exact.segments.measured["rotor_speed"]
+    commands = replace(others, weight=0.0 * others.weight + 1.0 / (claimed * NOISE["command"]))
+    measured = {**exact.segments.measured, "command": commands}
+    problem, flights = gusty(replace(exact, segments=replace(exact.segments, measured=measured)), 2)
+    truth = making.truth(exact)
+    criterion = making.fitted_of(problem, truth).criterion
+    predictor = Predictor.of(problem, truth, flights)
+    assert predictor is not None
+    moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
+    predictor, point = with_least_innovations(
+        predictor, flights, (problem, truth, criterion), moves
+    )
+    noise = claimed * np.exp(predictor.strengths[COMMAND_NOISE])
+    assert noise == pytest.approx(1.0, abs=0.1)
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    away = problem.space.scaled(point.coefficients) - problem.space.scaled(truth.coefficients)
+    assert np.abs(np.asarray(away) / error).max() < 3.0
+
+
+def test_what_was_not_sampled_is_as_likely_with_any_noise(fitted) -> None:
+    problem, predictor, point = fitted
+    sample = predictor.feed.samples["rotor_speed"]
+    without = eqx.tree_at(
+        lambda f: f.samples["rotor_speed"].weight, predictor.feed, jnp.zeros_like(sample.weight)
+    )
+    losses = [
+        float(replace(predictor, feed=without, noise=noise).at(problem, point).found.loss.sum())
+        for noise in (predictor.noise, {**predictor.noise, "rotor_speed": 3.0})
+    ]
+    assert losses[0] == pytest.approx(losses[1])
 
 
 def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:

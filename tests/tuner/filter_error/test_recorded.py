@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tuner.filter_error.recorded import gathered, sampled, setpoints_on_ticks
+from tuner.filter_error.recorded import each_reading, gathered, sampled, setpoints_on_ticks
 from tuner.flights.flight import Flight, InitialState, Series
+from tuner.objective.noise import repeats
 from tuner.objective.segments import Measured
 
 RATE = 400.0
@@ -44,6 +47,19 @@ def test_a_clock_that_is_late_moves_the_samples_and_a_command_holds() -> None:
     np.testing.assert_array_equal(rows[:, 0], np.ceil((time - 0.01) * RATE))
     _, rows = sampled("command", measured(time, 4), late, TICKS, RATE)
     np.testing.assert_array_equal(rows[:, 0], np.floor(time * RATE))
+
+
+def test_a_command_that_rests_weighs_in_a_filter_as_one_that_moves() -> None:
+    commands = measured(0.01 * np.arange(1, 50), 4)
+    values = np.round(10.0 * np.asarray(commands.values)) / 10.0  # some rest for ten samples
+    rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    assert rests.max() > 5
+    as_one = replace(
+        commands,
+        values=jnp.asarray(values),
+        weight=commands.weight / jnp.asarray(np.sqrt(rests)),
+    )
+    np.testing.assert_allclose(each_reading(as_one).weight, commands.weight)
 
 
 def test_what_is_gathered_is_what_was_laid_out() -> None:
