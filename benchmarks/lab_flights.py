@@ -81,6 +81,8 @@ class Lab:
         Ω of the battery, and V per A s by which it declines.
     gusts
         Whether the air moves.
+    sees_markers
+        Whether its position and attitude controllers see the motion capture's frame.
     """
 
     vehicle: VehicleFile
@@ -88,6 +90,7 @@ class Lab:
     resistance: float
     drain: float
     gusts: bool
+    sees_markers: bool = False
 
 
 def drawn(seed: int) -> Lab:
@@ -152,6 +155,7 @@ def drawn(seed: int) -> Lab:
         resistance=between(0.006, 0.012),
         drain=between(2e-4, 6e-4),
         gusts=bool(seed % 2),
+        sees_markers=has["marker_offset"] and bool(random.random() < 0.5),
     )
 
 
@@ -159,16 +163,17 @@ def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
     """Fly all trajectories, and write a recording of each beside the laboratory's job file."""
     random = np.random.default_rng([seed, 1])
     controller = ControllerFile()
-    fine = controller.replace(physics=controller.physics.replace(rate=float(PHYSICS)))
+    fine = controller.replace(
+        physics=controller.physics.replace(rate=float(PHYSICS)),
+        sensing=controller.sensing.replace(sees_markers=lab.sees_markers),
+    )
     schedule = schedule_of(fine, log_rate=RATE)
     sent = [
         published(settings, duration=SECONDS, control_rate=schedule.position_control_rate)
         for settings in TRAJECTORIES.values()
     ]
     air = _air(lab, random, schedule) if lab.gusts else None
-    own = {n: v for n, v in lab.vehicle.effects.items() if not n.startswith("marker")}
-    model = model_of(lab.vehicle.replace(effects=own), fine)
-    model = with_terms_computed(model, _all_terms())
+    model = with_terms_computed(model_of(lab.vehicle, fine), _all_terms())
     volts = np.full((round(SECONDS * schedule.position_control_rate) + 2, len(sent)), VOLTS)
     for _ in range(SAGS):
         during = 0.5 * (volts + np.roll(volts, -1, axis=0))  # a tick, which takes one value
@@ -188,9 +193,8 @@ def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
 
 
 def _all_terms() -> tuple[str, ...]:
-    """Return every term's coefficients but those of markers, through which `_measured` looks."""
-    names = (name for names in term_groups().values() for name in names)
-    return tuple(name for name in names if not name.startswith("marker"))
+    """Return every term's coefficients."""
+    return tuple(name for names in term_groups().values() for name in names)
 
 
 def _references(sent: list[Published]) -> ReferenceInlet:
@@ -299,10 +303,12 @@ def _measured(
         [effects.get(f"marker_{kind}_{axis}", 0.0) for axis in "xyz"] for kind in ("offset", "tilt")
     )
     true = Rotation.from_quat(signals["attitude"], scalar_first=True)
+    turning = true.apply(np.cross(signals["body_rate"], offset))
     noise = Rotation.from_rotvec(TURNED * random.normal(size=(len(signals["lap"]), 3)))
     measured = {
         **signals,
         "position": signals["position"] + true.apply(offset),
+        "velocity": signals["velocity"] + lab.sees_markers * turning,
         "attitude": (true * Rotation.from_rotvec(tilt) * noise).as_quat(scalar_first=True),
     }
     for name, deviation in NOISE.items():

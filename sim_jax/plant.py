@@ -21,6 +21,7 @@ from sim_jax.control.position import (
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.markers import estimated
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
 from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.rotation import Quaternion
@@ -107,7 +108,8 @@ class Plant(eqx.Module):
     def _estimate(self, state: State, step: Int[Array, ""]) -> tuple[Vec3, Vec3, Quaternion]:
         motion = state.motion
         if state.estimate_history is None:
-            return motion.position, motion.velocity, motion.attitude
+            seen = estimated(self.vehicle, self.controller, motion)
+            return seen.position, seen.velocity, seen.attitude
         age = self.vehicle.setup.estimate_latency * self.schedule.physics_rate
         if self.schedule.pose_rate is not None:
             poses = step * self.schedule.step * self.schedule.pose_rate
@@ -220,7 +222,8 @@ class Plant(eqx.Module):
             state = replaced(state, reference_history=history)
         state = self.physics(state, step)
         if state.estimate_history is not None:
-            history = push(state.estimate_history, packed(state.motion), step + 1)
+            seen = estimated(self.vehicle, self.controller, state.motion)
+            history = push(state.estimate_history, packed(seen), step + 1)
             state = replaced(state, estimate_history=history)
         return state
 

@@ -16,6 +16,7 @@ from sim_jax.control.gains import Controller
 from sim_jax.crash import Limits
 from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
+from sim_jax.markers import estimated
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.numeric import GRAVITY, Scalar
 from sim_jax.plant import Plant, Sample
@@ -117,7 +118,8 @@ def begun(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
     )
-    return plant, first_state(start, vehicle.motor, schedule, plant.gyro, shape)
+    seen = estimated(vehicle, controller, start.motion)
+    return plant, first_state(start, vehicle.motor, schedule, plant.gyro, shape, seen=seen)
 
 
 def rollout(

@@ -76,18 +76,29 @@ def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Star
 
 
 def first_state(
-    start: Start, motor: Motor, schedule: Schedule, gyro: GyroFilter, shape: tuple[int, ...]
+    start: Start,
+    motor: Motor,
+    schedule: Schedule,
+    gyro: GyroFilter,
+    shape: tuple[int, ...],
+    *,
+    seen: Motion,
 ) -> State:
-    """Return the state at time 0, every leaf in the full shape of the batch."""
+    """Return the state at time 0, every leaf in the full shape of the batch.
+
+    ``seen``: the start's motion as position and attitude control see it.
+    """
     dtype = jnp.result_type(*jax.tree.leaves(start))
-    start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), start)
+    start, seen = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), (start, seen)
+    )
     speeds = (reference_speed(motor, command) for command in start.command)
     references = tuple(jnp.broadcast_to(speed, shape).astype(dtype) for speed in speeds)
     estimate_history = reference_history = None
     if schedule.longest_estimate_latency > 0:
         hold = 0.0 if schedule.pose_rate is None else 1.0 / schedule.pose_rate
         length = history_length(schedule.longest_estimate_latency + hold, schedule.step)
-        estimate_history = past_of(start.motion, length, schedule.step)
+        estimate_history = past_of(seen, length, schedule.step)
     elif schedule.pose_rate is not None:
         raise ValueError("pose_rate needs a delay line: set longest_estimate_latency")
     if schedule.longest_actuator_latency > 0:

@@ -43,6 +43,7 @@ class Code(StrEnum):
     NO_EFFECT = "no_effect"
     SINGULAR_DIRECTION = "singular_direction"  # names: the coefficients
     SATURATION_FEEDBACK = "saturation_feedback"  # feedback: 1 if the integrator stops, else 0
+    SEES_MARKERS = "sees_markers"  # seen: 1 if position and attitude control see them, else 0
     CLOCK_OFFSET = "clock_offset"  # seconds; names: the clock
     TURNING_UNEXPLAINED = "turning_unexplained"  # explained (share)
     INERTIA_BALANCED = "inertia_balanced"  # error, NAME_fitted, NAME_balanced; names: NAMEs

@@ -165,6 +165,7 @@ def controller_of(file: ControllerFile) -> Controller:
             thrust_factor=float(file.mixer.thrust_factor),
             pwm_quantisation=file.mixer.pwm_quantisation,
         ),
+        sees_markers=jnp.asarray(1.0 if file.sensing.sees_markers else 0.0),
     )
 
 

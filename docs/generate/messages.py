@@ -62,6 +62,10 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "with a mixer that desaturates and a rate integrator that stops then, as PX4's do, or with "
     "neither, other than the controller file has it; it was simulated so. Set "
     "mixer.saturation_feedback in the controller file.",
+    Code.SEES_MARKERS: "The markers' frame is off the vehicle's, and the recordings agree with "
+    "position and attitude controllers that see that frame, or with controllers that see the "
+    "centre of mass and the body's axes, other than the controller file has it; it was simulated "
+    "so. Set sensing.sees_markers in the controller file.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
     "vehicle may differ.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
@@ -78,3 +79,5 @@ class Controller(eqx.Module):
     rate: RateGains
     filters: Filters
     mixer: MixerSettings
+    sees_markers: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
+    """1: position and attitude control see the motion capture's frame; 0: the centre of mass."""

@@ -153,9 +153,20 @@ class Physics(Section):
 
 
 class Sensing(Section):
-    """What the controllers see: poses at ``pose_rate`` Hz with a zero-order hold; None for all."""
+    """What position and attitude control see.
+
+    Attributes
+    ----------
+    pose_rate
+        Hz at which poses arrive, each held until the next; None for all.
+    sees_markers
+        The estimator takes the motion capture's point and axes for the centre of mass and the
+        body's axes, which matters where a vehicle has ``marker_offset`` and ``marker_tilt``; else
+        it knows where the markers sit. A fit that finds them elsewhere tries both.
+    """
 
     pose_rate: Positive | None = None
+    sees_markers: Flag = False
 
 
 class ControllerFile(Section):

@@ -15,6 +15,7 @@ from jax import Array
 from jaxtyping import Float
 
 from sim_jax.crash import AIRBORNE
+from sim_jax.markers import markers_of
 from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
@@ -30,7 +31,6 @@ from tuner.filter_error.disturbances import (
 )
 from tuner.filter_error.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
-from tuner.objective.markers import markers_of
 from tuner.objective.residuals import beginning_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulator import Simulator

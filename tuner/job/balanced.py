@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_jax.markers import markers_of
 from tuner.examination.examination import Examination, examine
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
@@ -27,7 +28,6 @@ from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.many_points import sums_at
-from tuner.objective.markers import markers_of
 from tuner.objective.tunable import Tunable
 from tuner.search.fitted import Fitted
 from tuner.search.least_squares import LeastSquares

@@ -12,14 +12,17 @@ from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.recordings import with_conditions, with_offsets
 from tuner.search.fitted import Fitted
+from tuner.search.loop import loop_of
 from tuner.search.point_estimate import PointEstimate
 
 
 def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
-    """Return the controller file with the saturation feedback that the search ended with."""
-    controller = job.settings.controller
-    feedback = bool(fitted.objective.model.controller.rate.saturation_feedback > 0.5)
-    return controller.replace(mixer=controller.mixer.replace(saturation_feedback=feedback))
+    """Return the controller file with the choices of the loop that the search ended with."""
+    controller, loop = job.settings.controller, loop_of(fitted.objective)
+    return controller.replace(
+        mixer=controller.mixer.replace(saturation_feedback=loop.saturation_feedback > 0.5),
+        sensing=controller.sensing.replace(sees_markers=loop.sees_markers > 0.5),
+    )
 
 
 def vehicle_fitted(job: Job, fitted: Fitted) -> VehicleFile:

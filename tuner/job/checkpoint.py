@@ -16,6 +16,7 @@ from tuner.files import read_arrays
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Point
 from tuner.search.iteration import Iteration
+from tuner.search.loop import Loop
 from tuner.search.progress import Progress
 
 
@@ -40,7 +41,7 @@ def save(path: Path, key: str, progress: Progress, seconds: float) -> None:
         "key": key,
         "stage": progress.stage,
         "evaluations": progress.evaluations - progress.steps,
-        "feedback": progress.feedback,
+        "loop": progress.loop._asdict(),
         "seconds": seconds,
         "iterations": [iteration.model_dump() for iteration in progress.iterations[:done]],
         "channels": list(progress.scales),
@@ -83,7 +84,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
             states=data["states"] if data["states"].size else None,
             iterations=tuple(Iteration(**iteration) for iteration in head["iterations"]),
             evaluations=head["evaluations"],
-            feedback=head["feedback"],
+            loop=Loop(**head["loop"]),
         )
         return progress, float(head["seconds"])
     except (ValueError, KeyError, TypeError) as error:

@@ -15,7 +15,7 @@ from tuner.job.selected import offsets_of
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
 from tuner.search.fitted import Fitted
-from tuner.search.progress import feedback_of, with_feedback
+from tuner.search.loop import loop_of, with_loop
 from tuner.selection.candidates import Groups, coefficients_in, conditions_in, with_terms
 
 
@@ -73,7 +73,7 @@ def with_groups(
     job, grown = extended(*base, coefficients_in(groups), around=conditions_in(groups))
     there = replace(
         fitted,
-        objective=with_feedback(grown.objective, feedback_of(fitted.objective)),
+        objective=with_loop(grown.objective, loop_of(fitted.objective)),
         outcomes=grown.outcomes,
         point=Point(
             jnp.asarray([vector[name] for name in job.space.names]),

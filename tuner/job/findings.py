@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.fitted import Fitted
-from tuner.search.progress import feedback_of
+from tuner.search.loop import Loop, loop_of
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import CONFLICT, Sources
 
@@ -79,26 +79,24 @@ def findings_at(job: Job, fitted: Fitted) -> tuple[Finding, ...]:
     """Return what a fit shows about the set-up, the flights and their clocks."""
     offsets = np.asarray(fitted.point.offsets)[: len(OFFSETS)] * OFFSET_UNIT
     return (
-        *end_findings(job, feedback_of(fitted.objective), fitted.scales),
+        *end_findings(job, loop_of(fitted.objective), fitted.scales),
         *offset_findings(job, offsets),
     )
 
 
-def end_findings(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ...]:
+def end_findings(job: Job, loop: Loop, scales: Scales) -> tuple[Finding, ...]:
     """Return what the end of a search shows about the set-up and the flights.
 
     Parameters
     ----------
     job
         What was searched.
-    feedback
-        The mixer's saturation feedback with which the search ended, 0 or 1.
+    loop
+        How the loop flies with which the search ended.
     scales
         As of `unmatched`.
     """
-    findings = []
-    if feedback != float(job.settings.controller.mixer.saturation_feedback):
-        findings.append(saturation_feedback("warning", feedback))
+    findings = list(loop_findings(job, loop, "warning"))
     lost = unmatched(scales)
     typical = float(np.median([_size(channels) for channels in scales.values()]))
     alone = {name for name in lost if len(scales) == 1 or _size(scales[name]) > ODD * typical}
@@ -112,10 +110,14 @@ def end_findings(job: Job, feedback: float, scales: Scales) -> tuple[Finding, ..
     return tuple(findings)
 
 
-def saturation_feedback(level: Level, feedback: float) -> Finding:
-    """Return that the recordings contradict the controller file; ``feedback`` is 0 or 1."""
-    numbers = {"feedback": feedback}
-    return Finding(Code.SATURATION_FEEDBACK, level, "saturation_feedback", numbers)
+def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
+    """Return in what the recordings contradict the controller file."""
+    controller = job.settings.controller
+    if loop.saturation_feedback != float(controller.mixer.saturation_feedback):
+        numbers = {"feedback": loop.saturation_feedback}
+        yield Finding(Code.SATURATION_FEEDBACK, level, "saturation_feedback", numbers)
+    if loop.sees_markers != float(controller.sensing.sees_markers):
+        yield Finding(Code.SEES_MARKERS, level, "sees_markers", {"seen": loop.sees_markers})
 
 
 def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:

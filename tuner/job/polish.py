@@ -14,15 +14,9 @@ from tuner.job.search import stages_of
 from tuner.objective.criterion import Point
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted, by_flight
+from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
-from tuner.search.progress import (
-    Progress,
-    beginning,
-    criterion_of,
-    feedback_of,
-    point_of,
-    with_feedback,
-)
+from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage
 
 
@@ -67,7 +61,7 @@ def polished(
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
         damping=np.ones(1),
-        feedback=feedback_of(fitted.objective),
+        loop=loop_of(fitted.objective),
     )
     return _grown(
         job,
@@ -75,7 +69,7 @@ def polished(
         progress,
         stages_of(job, fitted.objective)[-stages:],
         free=free,
-        clipped=False,
+        undecided=(),
         title=title,
         on_progress=on_progress,
     )
@@ -93,14 +87,14 @@ def searched_again(
     """Return a fit searched for again by all stages from a start vector (K,).
 
     The other arguments are those of `polished`. What terms that were missing did to a fit, a
-    coefficient at its bound say, is forgotten that way; the mixer's saturation feedback, too, is
+    coefficient at its bound say, is forgotten that way; what is undecided of the loop, too, is
     tried both ways again. The last polish is left to a fit of what proves to be needed.
     """
     progress = replace(
         beginning(fitted.objective, vector[None]),
         iterations=fitted.iterations,
         evaluations=fitted.evaluations,
-        feedback=feedback_of(job.objective),
+        loop=loop_of(job.objective),
     )
     stages = stages_of(job, fitted.objective)[:-1]
     return _grown(
@@ -109,7 +103,7 @@ def searched_again(
         progress,
         stages,
         free=free,
-        clipped=job.clipped,
+        undecided=job.undecided(fitted.objective),
         title=title,
         on_progress=on_progress,
     )
@@ -122,7 +116,7 @@ def _grown(
     stages: Sequence[Stage],
     *,
     free: Free,
-    clipped: bool,
+    undecided: Sequence[str],
     title: str,
     on_progress: Callable[[Progress], None],
 ) -> Fitted:
@@ -130,12 +124,12 @@ def _grown(
     stages = tuple(replace(stage, name=f"{title}, {stage.name}") for stage in stages)
     objective, last = fitted.objective, stages[-1]
     progress = grow(
-        objective, stages, progress, free=free, clipped=clipped, on_progress=on_progress
+        objective, stages, progress, free=free, undecided=undecided, on_progress=on_progress
     )
     point = point_of(progress.points, 0)
     return replace(
         fitted,
-        objective=with_feedback(objective, progress.feedback),
+        objective=with_loop(objective, progress.loop),
         point=point,
         criterion=criterion_of(last, progress.scales, np.asarray(point.offsets), progress.states),
         scales=by_flight(progress.scales, job.fitted),

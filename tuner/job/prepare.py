@@ -104,6 +104,22 @@ class Job:
             if flight.has("command")
         )
 
+    def undecided(self, objective: Objective) -> tuple[str, ...]:
+        """Return the choices of a `Loop` that matter to a problem of this job.
+
+        Where no rotor was clipped nothing saturates, and where the markers sit at the centre of
+        mass and along the body's axes it is the same who sees them.
+        """
+        matters = {
+            "saturation_feedback": self.clipped,
+            "sees_markers": any(INLETS[inlet].closed_loop for inlet in self.inlets)
+            and any(
+                name.startswith("marker_")
+                for name in (*objective.model.vehicle.effects, *objective.space.names)
+            ),
+        }
+        return tuple(choice for choice, flown in matters.items() if flown)
+
 
 def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
     """Build the problem of some recordings.

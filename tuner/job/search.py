@@ -20,14 +20,9 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.continuation import grow
 from tuner.search.fitted import Fitted, Outcome, by_flight
+from tuner.search.loop import with_loop
 from tuner.search.optimiser import Free
-from tuner.search.progress import (
-    Progress,
-    beginning,
-    criterion_of,
-    point_of,
-    with_feedback,
-)
+from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage, left, plan
 
 CHECKPOINT = "checkpoint.npz"
@@ -160,7 +155,7 @@ class _Attempt:
             stages,
             progress,
             free=free,
-            clipped=job.clipped,
+            undecided=job.undecided(job.objective),
             on_progress=on_progress,
             seed=job.settings.job.search.seed,
             worth_polishing=lambda progress: not (self.provisional and _is_far_off(progress)),
@@ -182,7 +177,7 @@ class _Attempt:
     ) -> Fitted:
         job, best = self.job, int(np.argmin(progress.losses))
         point = point_of(progress.points, best)
-        objective = with_feedback(job.objective, progress.feedback)
+        objective = with_loop(job.objective, progress.loop)
         criterion = criterion_of(stage, progress.scales, np.asarray(point.offsets), progress.states)
         vectors = np.asarray(progress.points.coefficients)
         outcomes = tuple(
@@ -227,7 +222,7 @@ def _through_windows(job: Job, starts: NDArray[np.float64], free: Free) -> NDArr
         stages_of(job, job.windows)[:-1],
         beginning(job.windows, starts),
         free=free,
-        clipped=False,
+        undecided=(),
         on_progress=lambda _: None,
     )
     return np.asarray(progress.points.coefficients)

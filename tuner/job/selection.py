@@ -31,8 +31,9 @@ from tuner.model import with_coefficients
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import Objective, with_conditions
 from tuner.search.fitted import Fitted
+from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
-from tuner.search.progress import Progress, feedback_of, with_feedback
+from tuner.search.progress import Progress
 from tuner.selection.candidates import (
     Groups,
     coefficients_in,
@@ -283,7 +284,7 @@ class Selection:
 
     def _objective_of(self, fitted: Fitted) -> Objective:
         """Return a fit's base problem with all candidates in the model, at their neutral values."""
-        objective = with_feedback(self.fitted.objective, feedback_of(fitted.objective))
+        objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
         neutral = start_of(coefficients_in(self.candidates))
         values = {name: jnp.asarray(value) for name, value in neutral.items()}
         return replace(objective, model=with_coefficients(objective.model, values))

@@ -10,32 +10,29 @@ from numpy.typing import NDArray
 
 from tuner.config import initial_values
 from tuner.findings import Code, Finding
-from tuner.job.findings import UNMATCHED, saturation_feedback
+from tuner.job.findings import UNMATCHED, loop_findings
 from tuner.job.prepare import Job
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.search.continuation import FEEDBACK_GAIN
 from tuner.search.fitted import Fitted, by_flight
-from tuner.search.progress import beginning, plain_criterion, with_feedback
+from tuner.search.loop import GAIN, loop_of, with_loop
+from tuner.search.progress import beginning, plain_criterion
 from tuner.search.weights import misfit, root_mean_squares
 
 
 def unfitted(job: Job) -> Fitted:
     """Return the vehicle that a job would start from, as a fit that moved nothing.
 
-    Where rotors were clipped low, whether the rate integrator then stops is tried both ways.
+    What is undecided of the loop is tried both ways.
     """
-    space, configured = job.space, job.settings.controller.mixer.saturation_feedback
+    space, configured = job.space, loop_of(job.objective)
     start = initial_values(job.settings.vehicle, job.settings.controller, space.free)
     vector = space.vector_of(start)
-    matches = {
-        feedback: _match(with_feedback(job.objective, float(feedback)), vector)
-        for feedback in ((configured, not configured) if job.clipped else (configured,))
-    }
-    best = min(matches, key=lambda feedback: matches[feedback].loss)
-    if matches[configured].loss <= FEEDBACK_GAIN * matches[best].loss:
-        best = configured
-    match = matches[best]
+    loops = [configured, *map(configured.switched, job.undecided(job.objective))]
+    matches = [_match(with_loop(job.objective, loop), vector) for loop in loops]
+    match = min(matches, key=lambda match: match.loss)
+    if matches[0].loss <= GAIN * match.loss:
+        match = matches[0]
     names = [flight.name for flight in job.fitted]
     return Fitted(
         objective=match.objective,
@@ -50,8 +47,9 @@ def unfitted(job: Job) -> Fitted:
         wall_time=0.0,
         loss_best=match.loss,
         converged=True,
-        findings=tuple(
-            _findings(match.scale, names, feedback=None if best == configured else best)
+        findings=(
+            *loop_findings(job, loop_of(match.objective), "info"),
+            *_findings(match.scale, names),
         ),
     )
 
@@ -77,11 +75,7 @@ def _match(objective: Objective, vector: NDArray[np.float64]) -> _Match:
     return _Match(objective, point, criterion, scale, float(np.sum(np.asarray(sums.loss))))
 
 
-def _findings(
-    scale: Mapping[str, NDArray[np.float64]], names: Sequence[str], *, feedback: bool | None
-) -> Iterator[Finding]:
-    if feedback is not None:
-        yield saturation_feedback("info", float(feedback))
+def _findings(scale: Mapping[str, NDArray[np.float64]], names: Sequence[str]) -> Iterator[Finding]:
     for index, name in enumerate(names):
         worst = max(scale, key=lambda channel: scale[channel][index])
         multiple = float(scale[worst][index])

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet
+from sim_jax.markers import markers_of
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.rotation import Quaternion
@@ -26,7 +27,6 @@ from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole
-from tuner.objective.markers import markers_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
 
 RAMP = 0.25
@@ -129,7 +129,7 @@ def beginning_of(
     start, inlet = segments.start, segments.inlet
     markers = markers_of(model.vehicle)
     if markers is not None:
-        start = markers.start(start, segments.resting)
+        start = markers.start(start, segments.resting, model.controller.sees_markers)
     environment = environment_of(model, segments, conditions)
     if segments.resting is not None:
         exponent = model.vehicle.effects.get("battery_exponent")

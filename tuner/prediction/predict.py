@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.crash import AIRBORNE
+from sim_jax.markers import markers_of
 from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from tuner.config import ControllerFile, VehicleFile
@@ -25,7 +26,6 @@ from tuner.flights.states import States, states_at
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.inlets import INLETS
-from tuner.objective.markers import markers_of
 from tuner.objective.residuals import simulate_segments
 from tuner.objective.segments import Segments, window_segments
 from tuner.parallel import padded_size

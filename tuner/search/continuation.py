@@ -7,7 +7,7 @@ minimum. Noise is inflated at first, since the model is still wrong by more than
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import jax.numpy as jnp
@@ -22,15 +22,14 @@ from tuner.search.evolution import CmaEs
 from tuner.search.free_starts import starts_asked_for
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares
+from tuner.search.loop import GAIN, with_loop
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
-from tuner.search.progress import Progress, criterion_of, with_feedback
+from tuner.search.progress import Progress, criterion_of
 from tuner.search.stages import Stage
 from tuner.search.weights import misfit, root_mean_squares, strays
 
 __all__ = ["CmaEs", "LeastSquares", "grow"]  # the optimisers of every schedule
 
-FEEDBACK_GAIN = 1.2
-"""The set-up's own choice is given up only for one that lowers the loss by this factor."""
 NO_OFFSET = np.array([0.0005, 0.0005, 0.002, 0.002, 0.002])
 """s: clocks that differ by less are taken to agree. A recording's clocks either share a source or
 differ by much more, and a tenth of a millisecond of freedom costs a percent of inertia. rad/s: a
@@ -45,7 +44,7 @@ def grow(
     progress: Progress,
     *,
     free: Free,
-    clipped: bool,
+    undecided: Sequence[str],
     on_progress: OnProgress,
     seed: int = 0,
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
@@ -62,9 +61,8 @@ def grow(
         Where to begin: `beginning`, or a checkpoint.
     free
         What may move.
-    clipped
-        Whether rotors were clipped low in a recording: whether the rate integrator then stops is
-        tried both ways, for set-ups differ in it and a saturated yaw step shows it.
+    undecided
+        The choices of a `Loop` that are tried both ways.
     on_progress
         Called after every iteration with where the search then stands.
     seed
@@ -78,9 +76,8 @@ def grow(
         polished = progress.stage > 0 and stages[progress.stage - 1].prunes
         if stage.prunes and not polished and not worth_polishing(progress):
             break
-        tries_feedback = stage.tries_feedback and clipped
-        run = search.run_with_and_without_feedback if tries_feedback else search.run
-        progress = run(stage, progress, last=progress.stage + 1 == len(stages))
+        choices = undecided if stage.decides else ()
+        progress = search.decided(stage, progress, choices, last=progress.stage + 1 == len(stages))
     return progress
 
 
@@ -106,21 +103,23 @@ class _Search:
             converged = optimiser.terminate(problem, state)
         return replace(_finished(problem, progress), converged=converged)
 
-    def run_with_and_without_feedback(
-        self, stage: Stage, progress: Progress, *, last: bool
+    def decided(
+        self, stage: Stage, progress: Progress, choices: Sequence[str], *, last: bool
     ) -> Progress:
-        """Run one stage with and without the mixer's saturation feedback, and keep the better."""
-        switched = replace(progress, feedback=1.0 - progress.feedback)
+        """Run one stage as the loop flies and with each choice the other way; keep the best."""
 
         def on_progress_of_rival(rival: Progress) -> None:
-            # a checkpoint begins with both again
-            self.on_progress(replace(rival, feedback=progress.feedback))
+            # a checkpoint begins with all of them again
+            self.on_progress(replace(rival, loop=progress.loop))
 
-        after = self.run(stage, progress, last=last)
-        rival = replace(self, on_progress=on_progress_of_rival).run(stage, switched, last=last)
-        evaluations = after.evaluations + rival.evaluations - progress.evaluations
-        better = after if after.losses.min() <= FEEDBACK_GAIN * rival.losses.min() else rival
-        return replace(better, evaluations=evaluations)
+        best = self.run(stage, progress, last=last)
+        for choice in choices:
+            switched = replace(progress, loop=best.loop.switched(choice))
+            rival = replace(self, on_progress=on_progress_of_rival).run(stage, switched, last=last)
+            evaluations = best.evaluations + rival.evaluations - progress.evaluations
+            better = best if best.losses.min() <= GAIN * rival.losses.min() else rival
+            best = replace(better, evaluations=evaluations)
+        return best
 
 
 def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -> StageProblem:
@@ -128,7 +127,7 @@ def _problem(search: _Search, stage: Stage, progress: Progress, *, last: bool) -
     (points, kept), free = _offsets_that_matter(stage, progress), search.free
     best = int(np.argmin(progress.losses))
     problem = StageProblem(
-        objective=with_feedback(search.objective, progress.feedback),
+        objective=with_loop(search.objective, progress.loop),
         criterion=criterion_of(
             stage, progress.scales, np.asarray(points.offsets[best]), progress.states
         ),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.iteration import Iteration
 from tuner.search.levenberg_marquardt import on_host
+from tuner.search.loop import USUAL, Loop, loop_of
 from tuner.search.optimiser import Iterate
 from tuner.search.stages import Stage
 
@@ -45,8 +45,8 @@ class Progress:
         Jacobians, or populations, so far.
     converged
         Whether the last stage ended by itself.
-    feedback
-        The mixer's saturation feedback that is flown: 1 as in PX4.
+    loop
+        How the loop flies where the controller file may be wrong.
     left
         s that the search may still take; NaN where that is unknown.
     damping
@@ -64,7 +64,7 @@ class Progress:
     evaluations: int
     damping: NDArray[np.float64]
     converged: bool = False
-    feedback: float = 1.0
+    loop: Loop = USUAL
     left: float = float("nan")
     steps: int = 0
     iterate: Iterate | None = None
@@ -90,7 +90,7 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
         iterations=(),
         evaluations=0,
         damping=np.ones(len(vectors)),
-        feedback=feedback_of(objective),
+        loop=loop_of(objective),
     )
 
 
@@ -140,16 +140,3 @@ def point_of(points: Point, start: int) -> Point:
     """Return one of S points."""
     picked: Point = jax.tree.map(lambda leaf: leaf[start], points)
     return picked
-
-
-def feedback_of(objective: Objective) -> float:
-    """Return the mixer's saturation feedback of an objective: 1 as in PX4, 0 without."""
-    return float(objective.model.controller.rate.saturation_feedback)
-
-
-def with_feedback(objective: Objective, feedback: float) -> Objective:
-    """Return the objective with the mixer's saturation feedback set: 1 as in PX4, 0 without."""
-    changed: Objective = eqx.tree_at(
-        lambda o: o.model.controller.rate.saturation_feedback, objective, jnp.asarray(feedback)
-    )
-    return changed

@@ -22,8 +22,8 @@ EVOLVED = (0.8, 3.0)
 """s of horizon at which CMA-ES looks for where to begin."""
 GENERATIONS = 60
 """Generations of CMA-ES in one stage, at most."""
-FEEDBACK_AT = 3.0
-"""s of horizon at which the mixer's saturation feedback is tried both ways."""
+DECIDES_AT = 3.0
+"""s of horizon at which what is undecided of the loop is tried both ways."""
 WEIGHED = 1e-3
 """Tolerance of windows' first polish, which is there for the residuals that it leaves: these are
 the last one's weights. Open loops meet no recording so well that less would change them."""
@@ -68,8 +68,8 @@ class Stage:
         Whether the coefficients are free.
     enough
         Loss, in inflated standard deviations, below which the next stage may as well begin.
-    tries_feedback
-        Whether the mixer's saturation feedback is tried both ways where rotors were clipped.
+    decides
+        Whether what is undecided of the loop is tried both ways.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Stage:
     optimiser: str = "gradient"
     coefficients: bool = True
     enough: float = 0.0
-    tries_feedback: bool = False
+    decides: bool = False
 
 
 def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple[Stage, ...]:
@@ -105,7 +105,7 @@ def schedule_of(samples: int, rate: float, *, robust: bool, steps: int) -> tuple
                     weighs=False,
                     prunes=False,
                     enough=ENOUGH if seconds < GENTLE else 0.0,
-                    tries_feedback=seconds == FEEDBACK_AT,
+                    decides=seconds == DECIDES_AT,
                 )
             )
     return (*stages, *_whole_stages(samples, robust=robust, steps=steps))
@@ -218,5 +218,5 @@ def _by_cma(stage: Stage, name: str, steps: int) -> Stage:
         steps=min(GENERATIONS, steps),
         offsets=False,
         prunes=False,
-        tries_feedback=False,
+        decides=False,
     )

@@ -272,6 +272,14 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "Set mixer.saturation_feedback: {flag} in the controller file.",
     ),
+    Code.SEES_MARKERS: (
+        (
+            "The markers' frame is off the vehicle's, and the recordings agree with position and "
+            "attitude controllers that see {frame}, other than the controller file has it; it was "
+            "simulated so."
+        ),
+        "Set sensing.sees_markers: {seen_flag} in the controller file.",
+    ),
     Code.FLIGHT_UNMATCHED: (
         composed.flight_unmatched,
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
@@ -333,5 +341,8 @@ def _values(finding: Finding) -> dict[str, object]:
         else "clips each rotor by itself and a rate integrator that does not stop"
     )
     values |= {"mixer": mixer, "flag": str(feedback).lower()}
+    seen = bool(numbers.get("seen"))
+    frame = "that frame" if seen else "the centre of mass and the body's axes"
+    values |= {"frame": frame, "seen_flag": str(seen).lower()}
     lower = "ended lower, and its result was kept" if numbers.get("changed") else "ended no lower"
     return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}

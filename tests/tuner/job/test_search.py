@@ -15,6 +15,7 @@ from tuner.job import search as module
 from tuner.job.findings import end_findings, finer_than_steps, unmatched, voltage_taken
 from tuner.job.search import starting_vectors
 from tuner.search.fitted import Outcome
+from tuner.search.loop import USUAL
 from tuner.search.stages import left, plan
 from tuner.wording.findings import sentence
 
@@ -79,15 +80,18 @@ def ends(*losses):
 def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
     job = SimpleNamespace(
         settings=SimpleNamespace(
-            controller=SimpleNamespace(mixer=SimpleNamespace(saturation_feedback=True))
+            controller=SimpleNamespace(
+                mixer=SimpleNamespace(saturation_feedback=True),
+                sensing=SimpleNamespace(sees_markers=False),
+            )
         )
     )
     one_stray = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
     assert set(unmatched(one_stray)) == {"c"}
-    (finding,) = end_findings(job, 1.0, one_stray)
+    (finding,) = end_findings(job, USUAL, one_stray)
     assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
     all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
-    (finding,) = end_findings(job, 1.0, all_far)
+    (finding,) = end_findings(job, USUAL, all_far)
     assert finding.code is Code.MODEL_UNMATCHED
     assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
 

@@ -36,7 +36,7 @@ def evolved(fit, *, seed, free=None):
         (stage,),
         beginning(fit, start[None]),
         free=free,
-        clipped=False,
+        undecided=(),
         on_progress=reports.append,
         seed=seed,
     )

@@ -80,7 +80,7 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
         tuple(stages),
         beginning(fit, start[None]),
         free=Free(np.array([True, True, False]), np.zeros((len(OFFSETS), 2), bool)),
-        clipped=False,
+        undecided=(),
         on_progress=reports.append,
     )
     assert {report.iterations[-1].stage for report in reports} == {"first 3 s", WHOLE}
@@ -108,7 +108,7 @@ def test_least_squares_reports_its_damping_and_computes_what_was_made_ready(monk
         (stage,),
         start,
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
-        clipped=False,
+        undecided=(),
         on_progress=lambda _: None,
     )
     first, second, *_ = (iteration.damping for iteration in progress.iterations)

@@ -6,8 +6,10 @@ its axes a degree off. What is simulated is the centre of mass in body axes; wha
     p_recorded = p + R(q)·marker_offset,    q_recorded = q ⊗ exp(marker_tilt / 2).
 
 Both numbers belong to the set-up and act where a simulation is compared with a recording: at its
-start, which comes from the recorded pose, and on what it gives. The controllers see the centre of
-mass; velocity and body rate are the estimator's, which are the vehicle's own.
+start, which comes from the recorded pose, and on what it gives. Position and attitude control see
+the same pose where the estimator is fed by motion capture and knows of no offset, and the velocity
+of that point; else the centre of mass in body axes (`Controller.sees_markers`). The gyro, and what
+follows it, is the vehicle's own.
 """
 
 from __future__ import annotations
@@ -17,10 +19,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool
 
+from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar, safe_sqrt
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
+from sim_jax.trees import where
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 
@@ -49,7 +53,21 @@ class Markers(eqx.Module):
             position = position + attitude.to_world(self.offset)
         return position, attitude if self.turn is None else attitude.product(self.turn)
 
-    def start(self, recorded: Start, resting: Bool[Array, "*batch"] | None) -> Start:
+    def seen(self, motion: Motion) -> Motion:
+        """Return the motion that an estimator fed by motion capture makes of a motion.
+
+        The point moves with p' = v + R(q)·(ω × marker_offset).
+        """
+        position, attitude = self.recorded(motion)
+        velocity = motion.velocity
+        if self.offset is not None:
+            turning = motion.body_rate.cross(self.offset)
+            velocity = velocity + motion.attitude.to_world(turning)
+        return Motion(position, velocity, attitude, motion.body_rate)
+
+    def start(
+        self, recorded: Start, resting: Bool[Array, "*batch"] | None, sees_markers: Scalar
+    ) -> Start:
         """Return the start whose pose motion capture recorded.
 
         Parameters
@@ -58,9 +76,11 @@ class Markers(eqx.Module):
             With the recorded pose; level where the vehicle rests.
         resting
             Where the vehicle itself is level, however its markers are tilted.
+        sees_markers
+            As of `Controller`: the recorded velocity is the estimator's.
         """
         motion = recorded.motion
-        position, attitude = motion.position, motion.attitude
+        position, velocity, attitude = motion.position, motion.velocity, motion.attitude
         if self.turn is not None:
             attitude = attitude.product(self.turn.conjugate())
             if resting is not None:
@@ -68,7 +88,9 @@ class Markers(eqx.Module):
                 attitude = _of_each(resting, level.normalized(), attitude)
         if self.offset is not None:
             position = position - attitude.to_world(self.offset)
-        moved = Motion(position, motion.velocity, attitude, motion.body_rate)
+            turning = attitude.to_world(motion.body_rate.cross(self.offset))
+            velocity = velocity - turning * sees_markers
+        moved = Motion(position, velocity, attitude, motion.body_rate)
         return Start(moved, recorded.rotor_speed, recorded.command, recorded.rate_integral)
 
 
@@ -78,6 +100,14 @@ def markers_of(vehicle: Vehicle) -> Markers | None:
     if offset is None and tilt is None:
         return None
     return Markers(offset, None if tilt is None else rotation(tilt))
+
+
+def estimated(vehicle: Vehicle, controller: Controller, motion: Motion) -> Motion:
+    """Return the motion that position and attitude control see of a motion, were it not old."""
+    markers = markers_of(vehicle)
+    if markers is None:
+        return motion
+    return where(controller.sees_markers > 0.5, markers.seen(motion), motion)
 
 
 def rotation(vector: Vec3) -> Quaternion:

@@ -1,0 +1,39 @@
+"""What is undecided of the loop is decided by the recordings."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import problem, with_data
+from tuner.objective.criterion import Point
+from tuner.objective.segments import OFFSETS
+from tuner.search.continuation import grow
+from tuner.search.loop import Loop, loop_of, with_loop
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning
+from tuner.search.stages import schedule_of
+
+FRAME = {"marker_tilt_x": 0.0105, "marker_tilt_y": -0.0157, "motor_constant": 1.5e-5}
+
+
+@pytest.mark.parametrize("flown", [0.0, 1.0])
+@pytest.mark.parametrize("written", [0.0, 1.0])
+def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, written):
+    free = problem(tuple(FRAME))
+    truth = Point(jnp.asarray(free.space.vector_of(FRAME)), free.start(free.space.initial).offsets)
+    noise = np.random.default_rng(3)
+    recorded = with_data(with_loop(free, Loop(sees_markers=flown)), truth, noise=noise)
+    fit = with_loop(recorded, Loop(sees_markers=written))
+    progress = grow(
+        fit,
+        schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=10),
+        beginning(fit, np.asarray(fit.space.initial)[None]),
+        free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided=("sees_markers",),
+        on_progress=lambda _: None,
+    )
+    assert progress.loop == Loop(sees_markers=flown)
+    assert loop_of(with_loop(fit, progress.loop)).sees_markers == flown
+    found = fit.space.values(progress.points.coefficients[0])
+    for name, value in FRAME.items():
+        assert float(found[name]) == pytest.approx(value, rel=0.05)
