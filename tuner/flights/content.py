@@ -23,7 +23,8 @@ from tuner.flights.sidecar import Sidecar, sidecar_path
 from tuner.flights.stale import without_stale
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
-from tuner.flights.units import LENGTHS, are_millimetres, to_si
+from tuner.flights.units import to_si
+from tuner.flights.yardstick import Stamped, scales_of, unit_of
 
 
 @dataclass(frozen=True)
@@ -210,15 +211,18 @@ def _clean(
     epoch = min((int(data.time.min()) for data in first), default=0)
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
+    recorded = {
+        signal: Stamped(np.asarray((data.time - epoch) * 1e-9, dtype=np.float64), data.values)
+        for signal, data in raw.items()
+    }
+    scales = scales_of(recorded)
     for signal, data in raw.items():
-        seconds = np.asarray((data.time - epoch) * 1e-9, dtype=np.float64)
-        recorded = data.values
-        if signal in LENGTHS and are_millimetres(signal, seconds, recorded):
-            recorded, names = to_si(recorded, "mm"), (signal, "in millimetres")
-            units.append(
-                Note(NoteCode.UNIT_READ, "warning", data.topic, len(recorded), names=names)
-            )
-        time, values, dropped = clean(signal, data.topic, seconds, recorded)
+        seconds, measured = recorded[signal].time, recorded[signal].values
+        if signal in scales:
+            unit, read_so = unit_of(signal, data.topic, scales[signal])
+            measured = to_si(measured, unit)
+            units += [] if read_so is None else [replace(read_so, count=len(seconds))]
+        time, values, dropped = clean(signal, data.topic, seconds, measured)
         for note in dropped:  # signals of one message lack the same samples
             alike = (note.code, note.topic, note.count, tuple(note.numbers.items()))
             before = notes[alike].names if alike in notes else ()

@@ -34,14 +34,14 @@ UNLIKELY = 0.05
 
 
 @dataclass(frozen=True)
-class _Reading:
+class Reading:
     """Another way to read recorded numbers, and its name in a sentence."""
 
     name: str
     read: Callable[[Array], Array]
 
 
-_Judgement = tuple[_Reading | None, Note | None]
+_Judgement = tuple[Reading | None, Note | None]
 """How else to read what was recorded, or else what is doubted."""
 
 
@@ -53,17 +53,18 @@ def _inverse(q: Array) -> Array:
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
 
 
-_ATTITUDES = (
-    _Reading("scalar-last", _scalar_last),
-    _Reading("world to body", _inverse),
-    _Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
-    _Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+#: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
+ATTITUDE_READINGS = (
+    Reading("scalar-last", _scalar_last),
+    Reading("world to body", _inverse),
+    Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
+    Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
 )
 _DEGREES = np.pi / 180
 _RATES = (
-    _Reading("in FRD axes", lambda w: to_enu_flu(w, "body_rate")),
-    _Reading("in degrees per second", lambda w: w * _DEGREES),
-    _Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
+    Reading("in FRD axes", lambda w: to_enu_flu(w, "body_rate")),
+    Reading("in degrees per second", lambda w: w * _DEGREES),
+    Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
 )
 
 
@@ -85,7 +86,7 @@ def correct_frames(
     if len(clock) < 200:
         return fixed, ()
 
-    def apply(signal: str, reading: _Reading | None, doubt: Note | None) -> None:
+    def apply(signal: str, reading: Reading | None, doubt: Note | None) -> None:
         topic = topics.get(signal, signal)
         if reading is not None:
             measured = fixed[signal]
@@ -132,9 +133,8 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     fit, upright = agreement(lambda values: values)
     if fit > GOOD and upright > 0.5:
         return None, None
-    # The likelier misreading comes first in the list.
-    worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(_ATTITUDES)]
-    best = _ATTITUDES[int(np.argmax(worth))]
+    worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(ATTITUDE_READINGS)]
+    best = ATTITUDE_READINGS[int(np.argmax(worth))]
     best_fit, best_upright = agreement(best.read)
     better = _worth(best_fit, best_upright) > _worth(fit, upright) + BETTER
     if better and best_fit > GOOD and best_upright > 0.5:
@@ -181,8 +181,8 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     measured = series["velocity"]
     at_samples = on_clock(series, "attitude", measured.time)
 
-    in_body = _Reading("in body axes", lambda _: rotate(at_samples, measured.values))
-    ned = _Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
+    in_body = Reading("in body axes", lambda _: rotate(at_samples, measured.values))
+    ned = Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
     fits = {
         in_body: alike(moving, rotate(on_clock(series, "attitude", clock), velocity)),
         ned: alike(moving, to_enu_flu(velocity, "velocity")),

@@ -36,43 +36,12 @@ WORLD = {
 BODY = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
 #: Signals that are quaternions.
 ATTITUDES = {"attitude", "attitude_setpoint"}
-#: Signals of lengths that motion capture may send in millimetres; whether they are speeds.
-LENGTHS = {"position": False, "velocity": True}
-#: m/s that no multirotor flies: a tenth of it is flown soon, were it a tenth of a metre.
-FASTEST = 100.0
-#: s between samples of which a speed is made: stamps of a burst of messages are microseconds apart.
-APART = 0.1
 
 
 def to_si(values: Array, unit: str) -> Array:
     """Convert recorded numbers of any shape to SI."""
     factor, offset = UNITS[unit]
     return factor * values + offset
-
-
-def are_millimetres(signal: str, time: Array, values: Array) -> bool:
-    """Return whether (n, 3) values of a signal of lengths are too fast for metres.
-
-    Of a flight that a tenth of its time moves by more than 0.1 m/s.
-
-    Parameters
-    ----------
-    signal
-        In `LENGTHS`.
-    time
-        (n,) s, in any order.
-    values
-        As recorded; NaN where not measured.
-    """
-    if not LENGTHS[signal]:
-        order = np.argsort(time, kind="stable")
-        order = order[np.unique(np.floor(time[order] / APART), return_index=True)[1]]
-        span, moved = np.diff(time[order]), np.diff(values[order], axis=0)
-        values = moved[span > 0.5 * APART] / span[span > 0.5 * APART, None]
-    speed = np.linalg.norm(values, axis=1)
-    speed = speed[np.isfinite(speed)]
-    factor, _ = UNITS["mm"]
-    return len(speed) > 0 and FASTEST < np.quantile(speed, 0.9) < FASTEST / factor
 
 
 def to_enu_flu(values: Array, signal: str) -> Array:

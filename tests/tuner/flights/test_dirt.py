@@ -17,7 +17,6 @@ from tuner.flights.damage import Cause
 from tuner.flights.flight import Series
 from tuner.flights.frames import correct_frames
 from tuner.flights.notes import Note, NoteCode
-from tuner.flights.units import are_millimetres
 from tuner.trajectory_settings import TrajectorySettings
 from tuner.wording.notes import damage_sentence
 from tuner.yaml_files.section import build
@@ -172,50 +171,23 @@ def test_wrong_frame_and_order_are_turned(clean: Flight, dirty: Any) -> None:
     assert noted(got, NoteCode.FRAME_TURNED, "body_rate", "in FRD axes").count > 1000
 
 
-def test_a_position_in_millimetres_is_read_so(clean: Flight, dirty: Any) -> None:
+@pytest.mark.parametrize(("per_metre", "name"), [(1e2, "in centimetres"), (1e3, "in millimetres")])
+def test_a_position_in_another_unit_is_read_so(
+    per_metre: float, name: str, clean: Flight, dirty: Any
+) -> None:
     """As motion capture has it; nothing of it is taken for outliers or for a leap."""
 
     def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
         if topic == POSE:
             p = message.pose.position
-            p.x, p.y, p.z = 1e3 * p.x, 1e3 * p.y, 1e3 * p.z
+            p.x, p.y, p.z = per_metre * p.x, per_metre * p.y, per_metre * p.z
         return [(time, message)]
 
     got = dirty(change)
     near(got, clean, position=1e-9)
-    note = noted(got, NoteCode.UNIT_READ, "position", "in millimetres", topic=POSE)
+    note = noted(got, NoteCode.UNIT_READ, "position", name, topic=POSE)
     assert note.kind == "warning"
     assert [n for n in got.notes if n.topic == POSE and n.kind == "warning"] == [note]
-
-
-@pytest.mark.parametrize(
-    ("signal", "factor", "times", "is_so"),
-    [
-        ("position", 1e3, 1.0, True),
-        ("position", 1.0, 1.0, False),
-        ("position", 1.0, 30.0, False),
-        ("position", 1e3, 0.01, False),
-        ("velocity", 1e3, 1.0, True),
-        ("velocity", 1.0, 30.0, False),
-    ],
-)
-def test_millimetres_are_told_by_their_speed(signal, factor, times, is_so) -> None:
-    """Of a flight of 1 m/s, of a race, and of a hover; stamps out of order, gaps of NaN."""
-    time = np.random.default_rng(2).permutation(np.arange(0.0, 20.0, 0.01))
-    turned = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
-    values = factor * times * turned
-    values[5:50] = np.nan
-    assert are_millimetres(signal, time, values) == is_so
-    assert not are_millimetres(signal, time[:1], values[:1] * np.nan)
-
-
-def test_a_burst_of_messages_is_no_speed() -> None:
-    """A queue that is emptied ten at a time stamps a millimetre within microseconds."""
-    sent = np.arange(0.0, 20.0, 0.01)
-    time = np.floor(sent / 0.1) * 0.1 + 2e-6 * np.arange(len(sent))
-    turned = np.column_stack([np.sin(sent), np.cos(sent), 0.0 * sent])
-    assert not are_millimetres("position", time, turned)
-    assert are_millimetres("position", time, 1e3 * turned)
 
 
 def test_markers_lost_for_a_while(clean: Flight, dirty: Any) -> None:
