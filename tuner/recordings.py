@@ -14,6 +14,7 @@ from tuner.config.job import InletName
 from tuner.disk import exists
 from tuner.errors import InputError, RecordingError, did_you_mean
 from tuner.findings import Code, Finding
+from tuner.flights.contradiction import noted_contradiction
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.flights.stale import is_stale
@@ -96,8 +97,8 @@ def read_usable(
     -------
     tuple
         The recordings, and a finding for each that is left out because it cannot be read, because
-        nothing flies in it, or because it does not hold what its inlet needs, and for each that
-        enters further down than its signals would let it.
+        nothing flies in it, because it contradicts itself, or because it does not hold what its
+        inlet needs, and for each that enters further down than its signals would let it.
 
     Raises
     ------
@@ -160,7 +161,8 @@ def recordings_of(
     Raises
     ------
     RecordingError
-        A flight does not hold what its inlet needs, or hardly ever all of it together.
+        A flight contradicts itself, or does not hold what its inlet needs, or hardly ever all of it
+        together.
     ConfigError
         The vehicle has rotors that the mixer above an inlet cannot fly.
     """
@@ -200,6 +202,14 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
             flight.path,
             "its attitude stops changing while the vehicle moves on, too soon for a flight",
             "look at what stopped: the controller, or the logger",
+        )
+    denied = noted_contradiction(flight.notes)
+    if denied is not None:
+        raise RecordingError(
+            flight.path,
+            f"its {denied.names[0]} and its {denied.names[1]} contradict each other (agreement "
+            f"{denied.numbers['agreement']:.2f} of 1)",
+            "look for a time that runs backwards, and at frame and quaternion in the topic map",
         )
     flight = with_commands(flight, settings.vehicle)
     choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)

@@ -54,8 +54,8 @@ message appears, see [Troubleshooting](../how-to/troubleshooting.md).
 #: Findings whose sentences have parts that come and go.
 IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.RECORDING: "Reading the recording raised a doubt, which the line states.",
-    Code.LEFT_OUT: "The recording cannot be read, nothing flies in it, or the flight lacks what "
-    "its inlet needs: it is left out; the line says why and what to do.",
+    Code.LEFT_OUT: "The recording cannot be read, nothing flies in it, it contradicts itself, or "
+    "the flight lacks what its inlet needs: it is left out; the line says why and what to do.",
     Code.SALVAGED: "The recording is broken, and the flight is what was salvaged of it; the line "
     "states what was lost. Record the flight again if that matters.",
     Code.SATURATION_FEEDBACK: "Rotors were clipped at their lower limit, and the recordings agree "

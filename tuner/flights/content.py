@@ -10,11 +10,12 @@ import numpy as np
 
 from tuner.errors import RecordingError
 from tuner.flights.clean import clean
+from tuner.flights.contradiction import contradiction
 from tuner.flights.damage import Damage
 from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Series
 from tuner.flights.formats import open_recording
-from tuner.flights.frames import correct_frames
+from tuner.flights.frames import DOUBTS, correct_frames
 from tuner.flights.locate import Place, choose_map, locate, require_pose, unread
 from tuner.flights.mission import Mission, find_missions
 from tuner.flights.notes import Note, NoteCode
@@ -184,6 +185,9 @@ def read_content(
         missions = _missions(series, sidecar)
     else:
         series = cut
+    denied = contradiction(series, missions)
+    if denied is not None:  # which says what the doubts of frames are about
+        turned = (*(note for note in turned if note.code not in DOUBTS), denied)
     notes = (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics))
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)

@@ -21,6 +21,7 @@ from tuner.flights.content import (
     read_content,
     read_signals,
 )
+from tuner.flights.contradiction import noted_contradiction
 from tuner.flights.flight import SIGNALS, Array, Series
 from tuner.flights.formats import open_recording
 from tuner.flights.inertial import flying, is_inertial
@@ -106,15 +107,16 @@ def _without_flight(recording: Recording, problem: RecordingError) -> Inspection
 
 def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
-    measured, stale = _columns(content.series), is_stale(content.series, content.notes)
-    if stale:
+    measured = _columns(content.series)
+    unusable = is_stale(content.series, content.notes) or noted_contradiction(content.notes)
+    if unusable:  # a fit leaves it out
         del measured["attitude"]
     return replace(
         _with_signals(content),
         problem=None if missions else "nothing flies in it: no mission was found",
         missions=missions,
         inlets=inlets(measured, trajectory=sidecar.trajectory is not None),
-        coefficients=() if stale else informed(content.series, measured, missions),
+        coefficients=() if unusable else informed(content.series, measured, missions),
         clock=_clock(content),
         notes=content.notes,
     )

@@ -51,6 +51,7 @@ class NoteCode(StrEnum):
     ATTITUDE_DOUBTED = "attitude_doubted"  # agreement, upright
     BODY_RATE_DOUBTED = "body_rate_doubted"  # left (share)
     VELOCITY_DOUBTED = "velocity_doubted"  # agreement
+    CONTRADICTED = "contradicted"  # agreement; names: the signal, the signal that denies it
     COMMAND_DERIVED = "command_derived"
     ONE_OF_SEVERAL = "one_of_several"  # number of the mission
 

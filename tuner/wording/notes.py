@@ -73,6 +73,10 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.VELOCITY_DOUBTED: (
         "the velocity is not the position's change (agreement {agreement:.2f})"
     ),
+    NoteCode.CONTRADICTED: (
+        "{first} and {second} contradict each other (agreement {agreement:.2f} of 1), so that no "
+        "fit can use the recording: is it reversed in time, or one of them in another frame?"
+    ),
     NoteCode.COMMAND_DERIVED: (
         "its motor commands are those that, by the vehicle file's arms and curve, give the "
         "commanded thrust and torque: what was found of thrust and inertia is relative to that"
