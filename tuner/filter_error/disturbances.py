@@ -59,27 +59,27 @@ class Processes(eqx.Module):
     Attributes
     ----------
     sd
-        (D,) in m/s² and rad/s².
+        (D, F) in m/s² and rad/s², each segment's own.
     acts
         (D,) kg and kg m²: what a unit of each process acts by, in N and N m.
     keeps
-        (D,) share that a process keeps from one tick to the next.
+        (D, F) share that a process keeps from one tick to the next.
     draught
-        m/s, standard deviation of the gusts along the rotors' axes.
+        (F,) m/s, standard deviation of the gusts along the rotors' axes.
     """
 
-    sd: Float[Array, " D"]
+    sd: Float[Array, "D *F"]
     acts: Float[Array, " D"]
-    keeps: Float[Array, " D"]
+    keeps: Float[Array, "D *F"]
     draught: Scalar
 
     @property
-    def added(self) -> Float[Array, " D"]:
-        """The variances (D,) that come anew with every tick."""
+    def added(self) -> Float[Array, "D *F"]:
+        """The variances (D, F) that come anew with every tick."""
         return self.sd**2 * (1.0 - self.keeps**2)
 
 
-def processes_of(vehicle: Vehicle, strengths: Float[Array, " 7"], rate: float) -> Processes:
+def processes_of(vehicle: Vehicle, strengths: Float[Array, "7 *F"], rate: float) -> Processes:
     """Return the processes of a vehicle.
 
     Parameters
@@ -87,7 +87,7 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 7"], rate: float) -
     vehicle
         Whose weight, arms and moment constant say what a share of a thrust is.
     strengths
-        Logarithms of `STRENGTHS`.
+        (7, F) logarithms of `STRENGTHS`, each segment's own; (7,) where all share them.
     rate
         Hz of the ticks.
     """
@@ -102,10 +102,11 @@ def processes_of(vehicle: Vehicle, strengths: Float[Array, " 7"], rate: float) -
     sd = [gust * weight, gust * weight, lift * weight, roll * weight * arm, roll * weight * arm]
     sd += [own * count**0.5, own * width, own * length, own * turning * count**0.5]
     lasts = [gust_lasts] * len(SLOW) + [turbulence_lasts] * len(FAST)
-    acts = jnp.stack([body.mass, body.mass, body.mass, *turns[:2], body.mass, *turns])
+    acts = [body.mass, body.mass, body.mass, *turns[:2], body.mass, *turns]
+    accelerations = [each / act for each, act in zip(sd, acts, strict=True)]
     draught = jnp.minimum(lift * vehicle.aerodynamics.max_relative_airspeed, STRONGEST)
     keeps = jnp.exp(-1.0 / rate / jnp.stack(lasts))
-    return Processes(jnp.stack(sd) / acts, acts, keeps, draught)
+    return Processes(jnp.stack(accelerations), jnp.stack(acts), keeps, draught)
 
 
 def disturbance_of(values: Float[Array, "D F"]) -> Disturbance:

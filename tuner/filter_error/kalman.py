@@ -37,6 +37,7 @@ from tuner.filter_error.observer import (
     first_errors,
 )
 from tuner.objective.simulator import Simulator
+from tuner.objective.tunable import Tunable
 from tuner.parallel import over_devices
 
 T = TypeVar("T")
@@ -96,17 +97,26 @@ class Filtered(eqx.Module):
 
     Attributes
     ----------
-    gains
-        On every tick.
     white
         (T, m, F) whitened innovations.
     loss
-        (F,) negative log-likelihood of each segment, but for a constant.
+        (T, F) negative log-likelihood of each tick's samples, but for a constant.
+    whitens
+        (T, m, m, F) see `Gains`.
+    gain
+        (T, n, m, F) see `Gains`; None where it was not asked for.
     """
 
-    gains: Gains
     white: Float[Array, "T m F"]
-    loss: Float[Array, " F"]
+    loss: Float[Array, "T F"]
+    whitens: Float[Array, "T m m F"]
+    gain: Float[Array, "T n m F"] | None
+
+    @property
+    def gains(self) -> Gains:
+        """Of the observer that the filter is."""
+        assert self.gain is not None
+        return Gains(self.gain, self.whitens)
 
 
 def _linearised(function: Callable[[Array], tuple[Array, T]], at: Array) -> tuple[T, Array]:
@@ -168,49 +178,56 @@ def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) 
     return replace(gains, gain=gains.gain[:, rows])
 
 
-def filtered(simulator: Simulator, feed: Feed, expected: Expected, ticks: int) -> Filtered:
+def filtered(
+    simulator: Simulator, feed: Feed, expected: Expected, *, gains: bool = True
+) -> Filtered:
     """Return the Kalman gains, the innovations, and how likely they are.
 
     Parameters
     ----------
     simulator, feed, expected
         What flies, the recordings, and what is taken for true.
-    ticks
-        Up to which is filtered; gains and innovations are zero beyond.
+    gains
+        Whether gains are kept, which take most of the memory.
     """
     short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
-    return _filter(short, in_flight)(feed, expected, np.asarray(ticks))
+    return _filter(short, in_flight, gains)(
+        (feed, expected.strengths, expected.noise), expected.tunable, expected.coefficients
+    )
 
 
 @lru_cache(maxsize=4)
-def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
-    def segmentwise(feed: Feed, expected: Expected, ticks: Array) -> Filtered:
+def _filter(simulator: Simulator, in_flight: int, gains: bool) -> Callable[..., Filtered]:
+    def segmentwise(
+        batch: tuple[Feed, Array, Array], tunable: Tunable, coefficients: Array
+    ) -> Filtered:
+        feed, strengths, noise = batch
+        expected = Expected(tunable, coefficients, strengths, noise)
         observer, first = Observer.of(simulator, feed, expected)
-        noise, first_sd = expected.noise, first_errors(first, in_flight)
-        processes = observer.processes
+        first_sd, processes = first_errors(first, in_flight), observer.processes
         segments, size = feed.segments.flight.shape[0], len(first_sd) + COUNT
         total, wide = next(iter(feed.samples.values())).values.shape[0], len(noise)
+        shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
         zero = jnp.zeros((size, segments))
-        unrest = jnp.diag(jnp.concatenate([jnp.zeros(size - COUNT), processes.added]))
-        sd = jnp.concatenate([jnp.asarray(first_sd), processes.sd])
+        unrest = jnp.concatenate([jnp.zeros((size - COUNT, segments)), processes.added])
+        sd = jnp.concatenate([jnp.tile(first_sd[:, None], segments), processes.sd])
 
         def tick(number: Array, carried: Any) -> Any:
-            state, pushed, covariance, before, beyond, loss, kept = carried
+            state, pushed, covariance, before, beyond, kept = carried
             samples = row_of(feed.samples, number)
 
             def compare(change: Array) -> tuple[Array, Array]:
-                moved = observer.corrected(state, change[:-COUNT], number, in_flight)
-                now = observer.seen(moved, number)
+                now = observer.seen(observer.corrected(state, change, number, 0), number)
                 # a sample between two ticks tells of the state, however near the first it was taken
                 along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
                 errors = observer.errors(now, along, samples)
                 return errors, errors
 
-            error, seen = _linearised(compare, zero)
-            spread = covariance @ jnp.swapaxes(seen, 1, 2)
+            error, seen = _linearised(compare, zero[:shown])
+            spread = covariance[:, :, :shown] @ jnp.swapaxes(seen, 1, 2)
             # what was not sampled is as likely with any noise
-            variance = jnp.where(observer.sampled(samples).T, noise**2, 1.0)
-            innovation = seen @ spread + variance[:, :, None] * jnp.eye(wide)
+            variance = jnp.where(observer.sampled(samples), noise**2, 1.0).T
+            innovation = seen @ spread[:, :shown] + variance[:, :, None] * jnp.eye(wide)
             factor = jnp.linalg.cholesky(innovation)
             whitens = solve_triangular(
                 factor, jnp.broadcast_to(jnp.eye(wide), factor.shape), lower=True
@@ -224,7 +241,12 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
                     rows, row.astype(rows.dtype), number, 0
                 ),
                 kept,
-                (jnp.moveaxis(gain, 0, -1), jnp.moveaxis(whitens, 0, -1), white),
+                (
+                    white,
+                    0.5 * deviance(white).sum(axis=0) + scatter,
+                    jnp.moveaxis(whitens, 0, -1),
+                    jnp.moveaxis(gain, 0, -1) if gains else None,
+                ),
             )
             corrects, beyond = gated(white, beyond)
             change = -jnp.einsum("fik,kf->if", gain, corrects)
@@ -237,40 +259,37 @@ def _filter(simulator: Simulator, in_flight: int) -> Callable[..., Filtered]:
             def advance(change: Array) -> tuple[Array, State]:
                 moved = observer.corrected(state, change[:-COUNT], number, in_flight)
                 after = observer.next(moved, pushed + change[-COUNT:], number)
-                kept = processes.keeps[:, None] * change[-COUNT:]
+                kept = processes.keeps * change[-COUNT:]
                 numbers = observer.numbers(after, number + 1, in_flight)
                 return jnp.concatenate([numbers, kept]), after
 
             state, follows = _linearised(advance, zero)
-            covariance = follows @ covariance @ jnp.swapaxes(follows, 1, 2) + unrest
+            covariance = follows @ covariance @ jnp.swapaxes(follows, 1, 2) + _diagonal(unrest)
             covariance = 0.5 * (covariance + jnp.swapaxes(covariance, 1, 2))
-            return (
-                state,
-                pushed * processes.keeps[:, None],
-                covariance,
-                before,
-                beyond,
-                loss + 0.5 * deviance(white).sum(axis=0) + scatter,
-                kept,
-            )
+            return state, pushed * processes.keeps, covariance, before, beyond, kept
 
-        empty = tuple(
-            jnp.zeros((total, *shape, segments), jnp.float32)
-            for shape in ((size, wide), (wide, wide), (wide,))
+        empty = (
+            jnp.zeros((total, wide, segments), jnp.float32),
+            jnp.zeros((total, segments)),
+            jnp.zeros((total, wide, wide, segments), jnp.float32),
+            jnp.zeros((total, size, wide, segments), jnp.float32) if gains else None,
         )
         begin = (
             first,
             jnp.zeros((COUNT, segments)),
-            jnp.broadcast_to(jnp.diag(sd**2), (segments, size, size)),
+            _diagonal(sd**2),
             observer.seen(first, jnp.asarray(0)),
             jnp.zeros((wide, segments), int),
-            jnp.zeros(segments),
             empty,
         )
-        *_, loss, (gain, whitens, white) = lax.fori_loop(0, ticks, tick, begin)
-        return Filtered(Gains(gain, whitens), white, loss)
+        return Filtered(*lax.fori_loop(0, total, tick, begin)[-1])
 
-    return over_devices(segmentwise, name=("filter", simulator, in_flight))
+    return over_devices(segmentwise, name=("filter", simulator, in_flight, gains))
+
+
+def _diagonal(values: Array) -> Array:
+    """Return matrices (F, n, n) with values (n, F) on their diagonals."""
+    return values.T[:, :, None] * jnp.eye(len(values))
 
 
 def innovations(
@@ -288,7 +307,10 @@ def innovations(
         (N, K + offsets): along which is differentiated.
     """
     return _innovations(_undelayed(simulator))(
-        (feed, gains), expected, np.asarray(directions, float)
+        (feed, gains, expected.strengths, expected.noise),
+        expected.tunable,
+        expected.coefficients,
+        np.asarray(directions, float),
     )
 
 
@@ -297,15 +319,17 @@ def _innovations(
     simulator: Simulator,
 ) -> Callable[..., tuple[NDArray[np.float64], NDArray[np.float64]]]:
     def segmentwise(
-        batch: tuple[Feed, Gains], expected: Expected, directions: Array
+        batch: tuple[Feed, Gains, Array, Array],
+        tunable: Tunable,
+        coefficients: Array,
+        directions: Array,
     ) -> tuple[Array, Array]:
-        feed, gains = batch
-        vector = expected.coefficients
+        feed, gains, strengths, noise = batch
 
         def flown(vector: Array, offsets: Array) -> Array:
             moved = eqx.tree_at(lambda f: f.offsets, feed, offsets)
-            at = eqx.tree_at(lambda e: e.coefficients, expected, vector)
-            observer, state = Observer.of(simulator, moved, at)
+            expected = Expected(tunable, vector, strengths, noise)
+            observer, state = Observer.of(simulator, moved, expected)
             in_flight = commands_in_flight(state, gains.gain.shape[1] - COUNT)
 
             def tick(carried: Any, given: Any) -> tuple[Any, Array]:
@@ -321,7 +345,7 @@ def _innovations(
                 )
                 before = observer.seen(state, number)
                 after = observer.next(state, pushed, number)
-                pushed = pushed * observer.processes.keeps[:, None]
+                pushed = pushed * observer.processes.keeps
                 return (after, pushed, before, beyond), white
 
             segments, wide = offsets.shape[-1], gains.whitens.shape[1]
@@ -336,8 +360,9 @@ def _innovations(
             return white
 
         def push(direction: Array) -> tuple[Array, Array]:
-            along = direction[len(vector) :, None] * jnp.ones_like(feed.offsets)
-            return jax.jvp(flown, (vector, feed.offsets), (direction[: len(vector)], along))
+            count = len(coefficients)
+            along = direction[count:, None] * jnp.ones_like(feed.offsets)
+            return jax.jvp(flown, (coefficients, feed.offsets), (direction[:count], along))
 
         pushed: tuple[Array, Array] = jax.vmap(push, out_axes=(None, 0))(directions)
         return pushed

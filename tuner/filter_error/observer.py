@@ -75,15 +75,15 @@ class Expected(eqx.Module):
     tunable, coefficients
         The model, and its search vector (K,).
     strengths
-        (7,) of the disturbances.
+        (7, F) of the disturbances, each segment's own.
     noise
-        (m,) factors on the standard deviations of the samples.
+        (m, F) factors on the standard deviations of the samples.
     """
 
     tunable: Tunable
     coefficients: Float[Array, " K"]
-    strengths: Float[Array, " 7"]
-    noise: Float[Array, " m"]
+    strengths: Float[Array, "7 F"]
+    noise: Float[Array, "m F"]
 
 
 class Observer(eqx.Module):

@@ -23,7 +23,7 @@ from tuner.filter_error.recorded import (
     sampled,
     setpoints_on_ticks,
 )
-from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of
+from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.flights.flight import Flight
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.inlets import INLETS
@@ -134,23 +134,32 @@ class Predictor:
         some = min(round(LEARNT_FROM * float(objective.schedule.log_rate)), self.ticks)
         whole = np.asarray(self.found.white)
         share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
-
-        def likelihood(strengths: Array) -> Likelihood:
-            found = self._filtered(objective, point, strengths, some)
-            white, whitens = (
-                np.moveaxis(np.asarray(rows[:some]), -1, 1)
-                for rows in (found.white, found.gains.whitens)
-            )
-            wide = white.shape[-1]
-            return Likelihood(
-                float(np.sum(found.loss)), white.reshape(-1, wide), whitens.reshape(-1, wide, wide)
-            )
-
-        slope, information, moved = slopes_of(likelihood, self.strengths)
+        steps = steps_from(self.strengths)
+        here = likelihood_of(self.found, some)
+        beside = self._beside(objective, point, steps, some)
+        slope, information, moved = slopes_of(here, beside, steps)
         ticks = np.zeros((len(moved), *whole.shape))
         on_ticks = moved.reshape(len(moved), some, whole.shape[-1], -1)
         ticks[:, :some] = np.moveaxis(on_ticks, -1, 2)
         return Slopes(slope / share, information / share, ticks / share)
+
+    def _beside(
+        self, objective: Objective, point: Point, steps: Array, ticks: int
+    ) -> Iterator[Likelihood]:
+        """Return how likely the first ticks are with each of the strengths a step away, in turn.
+
+        All are filtered side by side: of few flights alone most operations take as long to begin as
+        to compute.
+        """
+        count = self.feed.offsets.shape[-1]
+        feed = self._fed(point)
+        samples = jax.tree.map(lambda rows: rows[:ticks], feed.samples)
+        feed = jax.tree.map(lambda rows: np.tile(rows, len(steps)), replace(feed, samples=samples))
+        strengths = np.repeat(self.strengths[:, None] + np.diag(steps), count, axis=-1)
+        expected = self._expected(objective, point, strengths)
+        found = filtered(self.simulator, feed, expected, gains=False)
+        for first in range(0, len(steps) * count, count):
+            yield likelihood_of(found, ticks, slice(first, first + count))
 
     def as_noisy(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor whose samples are as noisy as the innovations, or itself."""
@@ -186,8 +195,9 @@ class Predictor:
 
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
-        found = self._filtered(objective, point, self.strengths, self.ticks)
-        return replace(self, feed=self._fed(point), found=found)
+        feed = self._fed(point)
+        found = filtered(self.simulator, feed, self._expected(objective, point))
+        return replace(self, feed=feed, found=found)
 
     @property
     def ticks(self) -> int:
@@ -200,22 +210,21 @@ class Predictor:
         flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
         return self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize
 
-    def _filtered(
-        self, objective: Objective, point: Point, strengths: Array, ticks: int
-    ) -> Filtered:
-        noisy = replace(self, strengths=strengths)
-        return filtered(self.simulator, self._fed(point), noisy._expected(objective, point), ticks)
-
     def _fed(self, point: Point) -> Feed:
         return replace(self.feed, offsets=jnp.asarray(point.offsets))
 
-    def _expected(self, objective: Objective, point: Point) -> Expected:
-        widths = self.feed.widths
-        factors = {**self.noise, "command": np.exp(self.strengths[COMMAND_NOISE])}
-        noise = np.repeat([factors[name] for name in widths], list(widths.values()))
+    def _expected(
+        self, objective: Objective, point: Point, strengths: Array | None = None
+    ) -> Expected:
+        """Return what is expected with strengths (7, segments), or the flights' own."""
+        if strengths is None:
+            strengths = np.tile(self.strengths[:, None], self.feed.offsets.shape[-1])
+        widths, shape = self.feed.widths, strengths.shape[1:]
+        factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
+        noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
+        noise = noise.repeat(list(widths.values()), axis=0)
         return Expected(
-            objective.tunable,
-            *map(jnp.asarray, (point.coefficients, self.strengths, noise)),
+            objective.tunable, *map(jnp.asarray, (point.coefficients, strengths, noise))
         )
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:
@@ -263,7 +272,7 @@ class Predictor:
             self,
             simulator=other.simulator,
             feed=replace(self.feed, segments=replace(segments, inlet=inlet)),
-            found=Filtered(gains, found.white, found.loss),
+            found=replace(found, gain=gains.gain),
         )
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
@@ -288,6 +297,19 @@ class Predictor:
             for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():
                 columns.setdefault(name, np.zeros((size, *part.shape[1:])))[some] = part
         return Jacobian(residuals, columns, jnp.full(self.feed.segments.count, jnp.inf))
+
+
+def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:
+    """Return what a filter makes of some segments' first ticks, row by row in each tick."""
+    loss, white, whitens = (
+        np.asarray(rows[:ticks, ..., segments]) for rows in (found.loss, found.white, found.whitens)
+    )
+    wide = white.shape[1]
+    return Likelihood(
+        float(np.sum(loss)),
+        np.moveaxis(white, -1, 1).reshape(-1, wide),
+        np.moveaxis(whitens, -1, 1).reshape(-1, wide, wide),
+    )
 
 
 def hidden(names: Sequence[str]) -> NDArray[np.bool_]:

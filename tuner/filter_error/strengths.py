@@ -11,7 +11,7 @@ models and the Kalman filter", 1989, 3.4.5).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -62,27 +62,31 @@ class Slopes(NamedTuple):
     moved: Array
 
 
-def slopes_of(filtered: Callable[[Array], Likelihood], strengths: Array) -> Slopes:
+def steps_from(strengths: Array) -> Array:
+    """Return the steps (7,) over which is differentiated by each of the strengths, logarithms."""
+    return np.where(strengths + STEP <= MOST, STEP, -STEP)
+
+
+def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> Slopes:
     """Return how the likelihood changes with the strengths, by differences.
 
     Parameters
     ----------
-    filtered
-        Of strengths.
-    strengths
-        (7,) logarithms, at which.
+    here
+        At the strengths.
+    beside
+        Where one of them is a step away, each in turn.
+    steps
+        (7,) see `steps_from`.
     """
-    here = filtered(strengths)
-    slope, moves, rows = np.zeros(len(strengths)), [], []
-    for number, axis in enumerate(np.eye(len(strengths))):
-        step = STEP if strengths[number] + STEP <= MOST[number] else -STEP
-        beside = filtered(strengths + step * axis)
-        turn = here.whitens @ np.linalg.inv(beside.whitens)
-        moved = (np.einsum("nij,nj->ni", turn, beside.white) - here.white) / step
+    slope, moves, rows = np.zeros(len(steps)), [], []
+    for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
+        turn = here.whitens @ np.linalg.inv(there.whitens)
+        moved = (np.einsum("nij,nj->ni", turn, there.white) - here.white) / step
         spread = (turn @ np.swapaxes(turn, 1, 2) - np.eye(turn.shape[1])) / step
         moves.append(moved)
         rows.append(np.concatenate([moved.ravel(), np.sqrt(0.5) * spread.ravel()]))
-        ahead = (beside.loss - here.loss) / step
+        ahead = (there.loss - here.loss) / step
         slope[number] = ahead - 0.5 * step * (rows[-1] @ rows[-1])  # of a parabola where it begins
     information = np.array([[row @ other for other in rows] for row in rows], float)
     return Slopes(slope, information, np.array(moves, float))

@@ -22,8 +22,9 @@ from tuner.filter_error.disturbances import (
 )
 from tuner.filter_error.kalman import GATE
 from tuner.filter_error.observer import Observer
-from tuner.filter_error.predictor import Predictor, unscaled
+from tuner.filter_error.predictor import Predictor, likelihood_of, unscaled
 from tuner.filter_error.refit import with_least_innovations
+from tuner.filter_error.strengths import Likelihood, slopes_of, steps_from
 from tuner.flights.flight import Flight, InitialState, Series
 from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
@@ -155,6 +156,26 @@ def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
     moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
     assert (np.abs(moved) < 0.5 * error).all()
     assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=0.5)
+
+
+def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitted) -> None:
+    problem, predictor, point = fitted
+    ticks = predictor.ticks
+
+    def alone(strengths: np.ndarray) -> Likelihood:
+        return likelihood_of(
+            replace(predictor, strengths=strengths).at(problem, point).found, ticks
+        )
+
+    steps = steps_from(predictor.strengths)
+    beside = [alone(predictor.strengths + step) for step in np.diag(steps)]
+    slope, information, moved = slopes_of(alone(predictor.strengths), beside, steps)
+    found = predictor.slopes(problem, point)
+    error = 1.0 / np.sqrt(np.diag(information))
+    np.testing.assert_allclose(found.slope * error, slope * error, atol=1e-6)
+    np.testing.assert_allclose(found.information, information, rtol=1e-5)
+    moved = np.moveaxis(moved.reshape(7, ticks, -1, moved.shape[-1]), -1, 2)
+    np.testing.assert_allclose(found.moved, moved, atol=1e-5 * np.abs(moved).max())
 
 
 def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:

@@ -12,12 +12,15 @@ from sim_jax.numeric import GRAVITY
 from tests.sim_jax.support import vehicle
 from tuner.filter_error.disturbances import (
     FAST,
+    LEAST,
+    MOST,
     SLOW,
     USUAL,
     disturbance_of,
     processes_of,
+    within,
 )
-from tuner.filter_error.strengths import Likelihood, slopes_of
+from tuner.filter_error.strengths import STEP, Likelihood, Slopes, slopes_of, steps_from
 
 ORDER = (*SLOW, *FAST)
 
@@ -46,6 +49,12 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
     return filtered
 
 
+def differenced(filtered: Callable[[np.ndarray], Likelihood], strengths: np.ndarray) -> Slopes:
+    steps = steps_from(strengths)
+    beside = (filtered(strengths + step) for step in np.diag(steps))
+    return slopes_of(filtered(strengths), beside, steps)
+
+
 def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
     at = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
     filtered = drawn(at, seed=2)
@@ -53,18 +62,25 @@ def test_the_likelihoods_slope_is_that_of_its_differences() -> None:
         (filtered(at + 1e-4 * axis).loss - filtered(at - 1e-4 * axis).loss) / 2e-4
         for axis in np.eye(7)
     ]
-    slope, information, _ = slopes_of(filtered, at)
+    slope, information, _ = differenced(filtered, at)
     error = 1.0 / np.sqrt(np.diag(information))  # of a strength by itself
     np.testing.assert_allclose(slope * error, differences * error, atol=0.1)
 
 
 def test_slopes_scatter_about_none_as_fishers_information_says() -> None:
     at = USUAL + np.log([3.0, 0.3, 4.0, 0.5, 0.6, 2.0, 0.7])
-    drawn_many = [slopes_of(drawn(at, seed=seed), at) for seed in range(100)]
+    drawn_many = [differenced(drawn(at, seed=seed), at) for seed in range(100)]
     told = np.sqrt(np.diag(drawn_many[0].information))
     slopes = np.array([found.slope for found in drawn_many]) / told
     np.testing.assert_allclose(slopes.mean(axis=0), 0.0, atol=0.35)
     np.testing.assert_allclose(slopes.std(axis=0), 1.0, atol=0.25)
+
+
+def test_no_strength_is_displaced_beyond_its_limits() -> None:
+    at = np.where(np.arange(7) % 2, MOST, LEAST)
+    steps = steps_from(at)
+    np.testing.assert_allclose(within(at + steps), at + steps)
+    np.testing.assert_allclose(np.abs(steps), STEP)
 
 
 def test_a_process_keeps_its_variance_and_forgets_within_its_time_constant() -> None:
