@@ -196,7 +196,7 @@ def filtered(
     )
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=8)
 def _filter(simulator: Simulator, in_flight: int, gains: bool) -> Callable[..., Filtered]:
     def segmentwise(
         batch: tuple[Feed, Array, Array], tunable: Tunable, coefficients: Array
