@@ -145,7 +145,7 @@ def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
     wrong = {"inertia_xx": 1.15, "inertia_yy": 1.2, "time_constant_up": 1.8}
     for name, factor in wrong.items():
         vector[exact.space.names.index(name)] *= factor
-    begin = replace(predictor, strengths=USUAL + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0]))
+    begin = replace(predictor, strengths=USUAL + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0, 1.0]))
     where = Point(jnp.asarray(vector), point.offsets)
     again, there = with_least_innovations(begin, flights, (problem, where, criterion), free)
     told = predictor.jacobian(problem, point, range(len(FREE)))
@@ -171,9 +171,9 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
     beside = [alone(predictor.strengths + step) for step in np.diag(steps)]
     slope, information, moved = slopes_of(alone(predictor.strengths), beside, steps)
     found = predictor.slopes(problem, point)
-    error = 1.0 / np.sqrt(np.diag(information))
-    np.testing.assert_allclose(found.slope * error, slope * error, atol=1e-6)
-    np.testing.assert_allclose(found.information, information, rtol=1e-5)
+    most = information.max()  # of commands, of which none were recorded, there is none
+    np.testing.assert_allclose(found.slope, slope, atol=1e-6 * np.sqrt(most))
+    np.testing.assert_allclose(found.information, information, atol=1e-6 * most)
     moved = np.moveaxis(moved.reshape(7, ticks, -1, moved.shape[-1]), -1, 2)
     np.testing.assert_allclose(found.moved, moved, atol=1e-5 * np.abs(moved).max())
 
