@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from benchmarks.lab_flights import METER, VOLTS, Lab, drawn, write
@@ -142,9 +143,15 @@ def _held_of_all(trials: Sequence[Trial]) -> str:
 
 
 def _task(seed: int, report: Report) -> Trial:
-    """Return the trial of a seed, as a task of an engine."""
+    """Return the trial of a seed, as a task of an engine.
+
+    Its programs are given up: a process may map only so many pieces of memory, and three
+    laboratories take two thirds of them.
+    """
     del report
-    return trial_of(seed)
+    trial = trial_of(seed)
+    jax.clear_caches()
+    return trial
 
 
 def job_at(lab: Lab, folder: Path, *, seed: int) -> Job:

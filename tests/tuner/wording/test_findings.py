@@ -126,6 +126,7 @@ MADE = {
     Code.SATURATION_FEEDBACK: Finding(
         Code.SATURATION_FEEDBACK, "warning", "saturation_feedback", {"feedback": 0.0}
     ),
+    Code.SEES_MARKERS: Finding(Code.SEES_MARKERS, "warning", "sees_markers", {"seen": 1.0}),
     Code.CLOCK_OFFSET: Finding(
         Code.CLOCK_OFFSET, "info", "a", {"seconds": -0.012}, ("flight_controller",)
     ),
