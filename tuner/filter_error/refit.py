@@ -136,8 +136,7 @@ def _equations(
     owner = flight[:, None] == np.arange(flights)
     of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
     across = np.concatenate([across[:count].sum(axis=-1), of_flights])
-    # the loss of a strength that vanishes goes with its square, of which Fisher knows nothing
-    bend = slopes.information + np.diag(2.0 * np.maximum(slopes.slope, 0.0) + 1e-9)
+    bend = slopes.information + 1e-9 * np.eye(len(slopes.slope))
     return _Equations(
         np.concatenate([own, slopes.slope]), np.block([[among, across], [across.T, bend]])
     )

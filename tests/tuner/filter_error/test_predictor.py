@@ -19,6 +19,7 @@ from tuner.filter_error.disturbances import (
     USUAL,
     disturbance_of,
     processes_of,
+    within,
 )
 from tuner.filter_error.kalman import GATE
 from tuner.filter_error.observer import Observer
@@ -156,6 +157,21 @@ def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
     moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
     assert (np.abs(moved) < 0.5 * error).all()
     assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=0.5)
+
+
+def test_disturbances_that_are_taken_for_five_times_too_strong_are_given_up_in_four_steps(
+    fitted, exact
+) -> None:
+    """Fisher's information alone says how far: with the slope added to it eight were needed."""
+    problem, predictor, point = fitted
+    criterion = making.fitted_of(problem, point).criterion
+    stronger = np.log([5.0, 5.0, 5.0, 5.0, 1.0, 1.0, 1.0])
+    begin = replace(predictor, strengths=within(predictor.strengths + stronger))
+    free = np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
+    again, _ = with_least_innovations(
+        begin, gusty(exact, 1)[1], (problem, point, criterion), free, steps=4
+    )
+    assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=2.0)
 
 
 def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitted) -> None:
