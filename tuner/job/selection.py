@@ -101,8 +101,7 @@ class Selection:
             base, state.added, state.fitted, state.vector, said=findings_at(*base)
         )
         rows = self._rows(state, dropped)
-        fitted = fitted if state.added else self.fitted
-        selected = Selected(job, fitted, rows, base=base)
+        selected = Selected(job, fitted if state.added else self.fitted, rows, base=base)
         return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
 
     def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:
@@ -201,8 +200,7 @@ class Selection:
         away = np.zeros(len(linear.scaled))
         away[gone] = (self._neutral - linear.scaled)[gone]
         free = self._columns([*self.job.space.names, *names_in(kept)])
-        everything = np.ones(len(linear.flight), bool)
-        change = linear.step(free, inside=everything, from_=away)
+        change = linear.step(free, inside=np.ones(len(linear.flight), bool), from_=away)
         of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
         for name, unit in zip(of_flight, units_of(of_flight), strict=True):
             if name in conditions_in(kept):
