@@ -9,8 +9,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.filter_error.predictor import Predictor, with_hidden
+from tuner.filter_error.information import with_hidden, with_strengths
+from tuner.filter_error.predictor import Predictor
 from tuner.objective.alternatives import residuals_at
+from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
@@ -95,6 +97,9 @@ def examine(
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
     reference = references(objective.space, np.asarray(point.coefficients))
     informations, sensitivities, predicted = [], [], []
+    slopes = None
+    if predictor is not None:
+        slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
     residuals: list[Residual] = []
     for flights in portions(objective, point, criterion):
         batch = portion(objective, point, criterion, flights)
@@ -105,8 +110,10 @@ def examine(
             for name, other in otherwise.items()
         }
         moved = {name: residuals_at(other, *batch[1:]) for name, other in others.items()}
-        if predictor is not None:
-            predicted.append(predictor.among(flights).information(*batch, others))
+        if predictor is not None and slopes is not None:
+            of_flights = predictor.among(flights)
+            by_strengths = slopes.moved[..., flights]
+            predicted.append(of_flights.information(*batch, others, by_strengths))
         compared = jacobian if predictor is None else jacobian.of(predictor.rows)
         informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
         sensitivities.append(
@@ -114,9 +121,11 @@ def examine(
         )
         residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
     information = FisherInformation.joined(informations)
-    if predicted:
+    if predictor is not None and slopes is not None:
         information = with_hidden(
-            FisherInformation.joined(predicted),
+            with_strengths(
+                FisherInformation.joined(predicted), slopes.information, predictor.strengths
+            ),
             information,
             objective.space.names,
             len(full_problem.fitted),

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
-from tuner.filter_error.disturbances import COMMAND_NOISE, USUAL
+from tuner.filter_error.disturbances import COMMAND_NOISE, STRENGTHS, USUAL
+from tuner.filter_error.information import hidden
 from tuner.filter_error.kalman import GATE, Filtered, filtered, innovations, stepped
 from tuner.filter_error.observer import CHANNELS, Expected, Feed
 from tuner.filter_error.recorded import (
@@ -26,7 +27,6 @@ from tuner.filter_error.recorded import (
 from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.flights.flight import Flight
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
-from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.objective.simulator import Simulator
@@ -241,24 +241,31 @@ class Predictor:
         point: Point,
         criterion: Criterion,
         otherwise: Mapping[str, Objective] = MappingProxyType({}),
+        by_strengths: Array | None = None,
     ) -> FisherInformation:
         """Return what the innovations of these flights say at a point, see `with_hidden`.
 
         Its criterion gives no scales: innovations are whitened. ``otherwise``: what might be
-        simulated differently -> the problem so simulated; gains stay.
+        simulated differently -> the problem so simulated; gains stay. With derivatives by the
+        strengths (`Slopes.moved`) those are changes, too: see `with_strengths`.
         """
         moved = np.flatnonzero(~hidden(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.feed.offsets)
+        jacobian = self.jacobian(objective, own, [*moved, *offsets])
+        changed = {
+            name: dict[str, Any](self._stepped(other, own).jacobian(other, own, []).residuals)
+            for name, other in otherwise.items()
+        }
+        if by_strengths is not None:
+            by_strengths = gathered(by_strengths, self.feed.widths, self.rows)
+            for number, name in enumerate(STRENGTHS):
+                changed[name] = {
+                    channel: residuals + by_strengths[channel][number]
+                    for channel, residuals in jacobian.residuals.items()
+                }
         return information_from_jacobian(
-            objective,
-            own,
-            unscaled(criterion),
-            self.jacobian(objective, own, [*moved, *offsets]),
-            otherwise={
-                name: dict[str, Any](self._stepped(other, own).jacobian(other, own, []).residuals)
-                for name, other in otherwise.items()
-            },
+            objective, own, unscaled(criterion), jacobian, otherwise=changed
         )
 
     def _stepped(self, other: Objective, point: Point) -> Predictor:
@@ -309,49 +316,6 @@ def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) ->
         float(np.sum(loss)),
         np.moveaxis(white, -1, 1).reshape(-1, wide),
         np.moveaxis(whitens, -1, 1).reshape(-1, wide, wide),
-    )
-
-
-def hidden(names: Sequence[str]) -> NDArray[np.bool_]:
-    """Return (K,) which coefficients recorded set-points hide: what lies upstream of them.
-
-    And how high the markers sit: a loop holds its height to the millimetre, whereas a filter
-    begins at the height of the first sample.
-    """
-    return np.isin(names, (*INLETS["body_rate"].bypasses, "marker_offset_z"))
-
-
-def with_hidden(
-    predicted: FisherInformation, looped: FisherInformation, names: Sequence[str], fitted: int
-) -> FisherInformation:
-    """Return what innovations say, and of what set-points hide what least squares said of it.
-
-    That is what it said while all others were estimated too: given what the filter says of these,
-    gusts would scatter it more (no noise model knows them there).
-
-    Parameters
-    ----------
-    predicted, looped
-        Of innovations, and of the closed loop's simulation, in the same channels.
-    names, fitted
-        Of the K coefficients, of which the first were fitted.
-    """
-    upstream = hidden(names)
-    others = np.flatnonzero(~upstream[:fitted])
-    upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
-    clear = np.eye(len(names))
-    clear[np.ix_(np.flatnonzero(upstream), others)] = -np.linalg.solve(
-        looped.total[np.ix_(others, others)], upper
-    ).T
-    blocks = clear @ looped.blocks @ clear.T
-    return replace(
-        predicted,
-        blocks=predicted.blocks + np.where(np.outer(upstream, upstream), blocks, 0.0),
-        score=predicted.score + np.where(upstream, looped.score @ clear.T, 0.0),
-        changes={
-            name: change + np.where(upstream, looped.changes[name] @ clear.T, 0.0)
-            for name, change in predicted.changes.items()
-        },
     )
 
 

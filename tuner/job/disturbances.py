@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.examination.examination import Examination, examine
-from tuner.filter_error.predictor import Predictor, hidden
+from tuner.filter_error.information import hidden
+from tuner.filter_error.predictor import Predictor
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
 from tuner.filter_error.refit import STEPS, with_least_innovations
 from tuner.findings import Code, Finding

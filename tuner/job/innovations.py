@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import conditions
 from tuner.coefficients.space import Space
-from tuner.filter_error.predictor import Predictor, hidden
+from tuner.filter_error.information import hidden
+from tuner.filter_error.predictor import Predictor
 from tuner.job.extension import extended, with_groups
 from tuner.job.findings import findings_at
 from tuner.job.prepare import Job

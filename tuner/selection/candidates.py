@@ -16,9 +16,10 @@ from tuner.objective.normal import Objective
 Groups = Mapping[str, tuple[str, ...]]
 """Group -> its coefficients."""
 
+PRESENT = 0.5
+"""Probability a priori that a vehicle has an effect in a size that flights could tell."""
 STANDS_IN = 0.1
-"""Probability a priori that a vehicle has what one group describes as a whole and others, which are
-candidates beside it, do one by one."""
+"""That it has what one group describes as a whole and others, candidates beside it, one by one."""
 
 
 def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups:
@@ -101,10 +102,10 @@ def is_stand_in(group: str) -> bool:
 def presence_of(names: Collection[str]) -> float:
     """Return the probability a priori that a vehicle has a group of these coefficients.
 
-    What is an effect of its own every vehicle has, however small.
+    In a size that flights could tell: from what is as good as absent on.
     """
     stands_in = any(name in COEFFICIENTS and COEFFICIENTS[name].stands_in for name in names)
-    return STANDS_IN if stands_in else 1.0
+    return STANDS_IN if stands_in else PRESENT
 
 
 def reads_recording(group: str) -> bool:

@@ -41,7 +41,8 @@ class FisherInformation:
     spread
         (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
     nuisance_prior
-        (K, K): what the priors of offsets and starts contribute.
+        (K, K): what the priors of offsets and starts contribute, less what is lost to nuisances
+        that all flights share.
     prior
         (K, K): what the priors of the coefficients contribute.
     crashed

@@ -19,7 +19,8 @@ Array = NDArray[np.float64]
 
 SIMULATORS_STEP = 1.0 / 4000.0
 """s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
-step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order."""
+step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order. Not by more:
+the standard error of what is only known to lie within limits is their half-width over √3."""
 WIDER = float(stdtrit(DRAWS, 0.975) / ndtri(0.975))
 """Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
 FEWEST = 3
@@ -87,7 +88,7 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
         for name, change in information.changes.items()
     }
     if STEP in moved:
-        moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0)
+        moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0 / np.sqrt(3.0))
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
     return Spread(
         noise=noise_alone(information),

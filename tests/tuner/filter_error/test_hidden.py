@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.filter_error.predictor import hidden, with_hidden
+from tuner.filter_error.information import hidden, with_hidden
 from tuner.uncertainty.information import FisherInformation
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")

@@ -16,15 +16,19 @@ from tests.tuner.uncertainty import making
 from tuner.filter_error.disturbances import (
     COMMAND_NOISE,
     COUNT,
+    LEAST,
+    MOST,
     USUAL,
     disturbance_of,
     processes_of,
     within,
 )
+from tuner.filter_error.disturbances import STRENGTHS as NAMED
+from tuner.filter_error.information import USUALLY, with_strengths
 from tuner.filter_error.kalman import GATE
 from tuner.filter_error.observer import Observer
 from tuner.filter_error.predictor import Predictor, likelihood_of, unscaled
-from tuner.filter_error.refit import with_least_innovations
+from tuner.filter_error.refit import _equations, with_least_innovations
 from tuner.filter_error.strengths import Likelihood, slopes_of, steps_from
 from tuner.flights.flight import Flight, InitialState, Series
 from tuner.objective.alternatives import STEP, alternatives_of
@@ -135,6 +139,37 @@ def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fit
     space = exact.space
     missed = (np.asarray(point.coefficients) - space.initial) * space.slope(space.initial)
     assert (np.abs(missed) < 3.5 * error).all()
+
+
+def test_errors_are_those_of_coefficients_and_strengths_that_are_learnt_together(fitted) -> None:
+    problem, predictor, point = fitted
+    slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
+    fixed = predictor.information(problem, point, criterion)
+    moving = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
+    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    assert learnt.changes.keys() == fixed.changes.keys()
+    alone, together = (np.linalg.inv(found.total) for found in (fixed, learnt))
+    free = np.flatnonzero((predictor.strengths > LEAST) & (predictor.strengths < MOST))
+    across = np.array([moving.changes[name].sum(axis=0) for name in NAMED])[free]
+    own = slopes.information[np.ix_(free, free)] + np.eye(len(free)) / USUALLY**2
+    both = np.linalg.inv(np.block([[fixed.total, across.T], [across, own]]))
+    np.testing.assert_allclose(together, both[: len(FREE), : len(FREE)], rtol=1e-6)
+    wider = np.sqrt(np.diag(together) / np.diag(alone))
+    assert (wider >= 1.0).all()
+    assert wider.max() > 1.001  # 1.2 of inertias where commands were recorded, too
+
+
+def test_a_strength_is_taken_for_what_moves_innovations(fitted) -> None:
+    """What innovations say of a coefficient and a strength together is what the fit steps by."""
+    problem, predictor, point = fitted
+    slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
+    information = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
+    across = np.array([information.changes[name].sum(axis=0) for name in NAMED])
+    hessian = _equations(predictor, problem, point, unscaled(criterion), range(len(FREE))).hessian[
+        -len(NAMED) :, : len(FREE)
+    ]
+    expected = hessian / problem.space.slope(np.asarray(point.coefficients))
+    np.testing.assert_allclose(across, expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:

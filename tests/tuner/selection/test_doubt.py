@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tuner.selection.candidates import presence_of
 from tuner.selection.doubt import Evidence, in_doubt
 from tuner.selection.linear import Linear
 
@@ -79,6 +80,24 @@ def test_a_term_too_small_to_be_added_is_covered_whatever_its_size(fits, size):
     assert share(fits, size, with_part=True) > 0.8
     if size >= 2.0:
         assert share(fits, size, with_part=False) < 0.2
+
+
+def test_over_vehicles_of_which_half_have_the_term_in_some_size_intervals_hold(fits):
+    """As a priori: absent or, as likely small as large, from what is as good as absent on."""
+    random, presence = np.random.default_rng(6), presence_of(["flapping_moment_coefficient"])
+    held, parts = [], []
+    for linear, alone in fits:
+        there = random.random() < presence
+        size = np.exp(random.uniform(np.log(0.4), np.log(USUAL))) if there else 0.0
+        fit = with_term(linear, size)
+        off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
+        part = in_doubt(fit, MODEL, [(TERM, presence)])[0]
+        held.append([abs(off) < 1.96 * error for error in (alone, max(alone, part))])
+        parts.append(part / in_doubt(fit, MODEL, [PRESENT])[0])
+    without, with_part = np.mean(held, axis=0)
+    assert without < 0.75
+    assert with_part > 0.85
+    assert np.median(parts) < 0.9
 
 
 def test_where_flights_say_little_of_a_term_chance_counts_for_less_than_a_refit_would_move():

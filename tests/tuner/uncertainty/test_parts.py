@@ -140,7 +140,7 @@ def test_the_quoted_error_holds_every_part():
 
 
 def test_a_lag_is_known_no_better_than_half_a_simulators_step():
-    """Stepped by Euler's rule, a lag acts as if it were shorter by that much."""
+    """Stepped by Euler's rule, a lag acts as if it were shorter by that much, and never by more."""
     information, _ = regression(np.random.default_rng(5), apart=0.0)
     spread = spread_of(
         replace(information, changes={"step": np.zeros((1, COUNT))}),
@@ -150,7 +150,7 @@ def test_a_lag_is_known_no_better_than_half_a_simulators_step():
     steps, time_constant = 4000.0, 0.02
     as_if = -1.0 / steps / np.log(1.0 - 1.0 / steps / time_constant)
     assert spread.step is not None
-    assert spread.step[0] == pytest.approx(time_constant - as_if, rel=0.01)
+    assert spread.step[0] == pytest.approx((time_constant - as_if) / np.sqrt(3.0), rel=0.01)
     assert spread.step[1:] == pytest.approx(0.0)
 
 
