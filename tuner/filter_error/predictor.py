@@ -258,10 +258,10 @@ class Predictor:
             for name, other in otherwise.items()
         }
         if by_strengths is not None:
-            by_strengths = gathered(by_strengths, self.feed.widths, self.rows)
+            moves = gathered(by_strengths, self.feed.widths, self.rows)
             for number, name in enumerate(STRENGTHS):
                 changed[name] = {
-                    channel: residuals + by_strengths[channel][number]
+                    channel: residuals + moves[channel][number]
                     for channel, residuals in jacobian.residuals.items()
                 }
         return information_from_jacobian(
