@@ -91,8 +91,9 @@ def with_disturbances(
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
     there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
     seen = Innovations.of(selected, there, predictor)
+    had = [row.group for row in selected.rows if row.kept]
     for number in range(SELECTIONS):
-        chosen = seen.selection()
+        chosen = seen.selection(had, first=number == 0)
         if chosen is None and number > 0:
             break
         if chosen is not None:

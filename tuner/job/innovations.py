@@ -101,19 +101,26 @@ class Innovations:
             **{self.space.names[i]: float(moves[i]) for i in model},
         }
 
-    def selection(self) -> Selected | None:
+    def selection(self, had: Collection[str], *, first: bool = False) -> Selected | None:
         """Return the terms that innovations call for and their fit, one linear step on.
 
         From all that describe one thing, and those that are in already, backwards: what chance
         explains goes first. What is left has to be as large as a term that is not as good as
         absent. None if no other terms are called for, or none was tried.
+
+        What stands in for other terms least squares may have taken for gusts, and from there
+        the others look as if they were not needed: ``first`` it goes. Of what is left it is judged
+        again, as far as least squares ``had`` it.
         """
         base, tried = self.selected.base, self._tried()
         within = {name: names for name, names in tried.items() if self._is_in(name)}
+        without = {name: names for name, names in within.items() if first and is_stand_in(name)}
         begin = {
-            name: names for name, names in tried.items() if name in within or not is_stand_in(name)
+            name: names
+            for name, names in tried.items()
+            if name not in without and (name in within or name in had or not is_stand_in(name))
         }
-        if base is None or not begin:
+        if base is None or not (begin or without):
             return None
         judged = names_in(tried)
         model = self._model([n for n in self.fitted.objective.space.names if n not in judged])
@@ -123,6 +130,7 @@ class Innovations:
             {name: self._columns(names) for name, names in begin.items()},
             candidates=len(tried),
             neutral=self._neutral(tried),
+            without=self._columns(names_in(without)),
             stand_ins=[name for name in begin if is_stand_in(name)],
             no_gusts=list(begin),  # they are followed
             material=0.0,

@@ -29,6 +29,8 @@ EARNING = (
     SelectionCode.SIGNIFICANT,
     SelectionCode.PREDICTS_SAMPLES,
 )
+NOTHING = np.empty(0, np.intp)
+"""No columns."""
 DETERMINED = 1e-8
 """Share of a group's information that must be left once the model's coefficients follow it."""
 
@@ -162,6 +164,7 @@ def surviving(
     *,
     candidates: int,
     neutral: NDArray[np.float64],
+    without: Columns = NOTHING,
     stand_ins: Collection[str] = (),
     no_gusts: Collection[str] = (),
     material: float = MATERIAL,
@@ -182,6 +185,8 @@ def surviving(
         Columns of the coefficients that stay.
     groups
         Group -> columns.
+    without
+        Columns of what the point holds and is given up beforehand.
     stand_ins
         Names of groups that describe as a whole what others do one by one.
     no_gusts
@@ -189,7 +194,7 @@ def surviving(
     """
     left, taken = dict(groups), dict[str, Score]()
     while True:
-        gone = _joined([groups[name] for name in taken])
+        gone = _joined([without, *(groups[name] for name in taken)])
         scores = {}
         for name, columns in left.items():
             others = _joined([model, *(c for other, c in left.items() if other != name)])
@@ -215,7 +220,7 @@ def surviving(
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    return np.concatenate([np.empty(0, np.intp), *parts])
+    return np.concatenate([NOTHING, *parts])
 
 
 @dataclass(frozen=True)

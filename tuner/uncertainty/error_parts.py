@@ -24,8 +24,8 @@ class ErrorParts(Part):
         As it would move with terms that were tried and not kept, and where errors of measured
         rotor speeds pass for inertia; None where neither was tried.
     step
-        Its move when the physics step is halved, and for a rotor's lag that it may be off by half of
-        the finest step in which simulators take it; None where that was not asked.
+        Its move when the physics step is halved, and for a rotor's lag that it may be off by half
+        of the finest step in which simulators take it; None where that was not asked.
     readings
         How it scatters when the battery's voltmeter is read again, with errors like those that it
         made; None where the fit has no battery, or follows what pushed the flights.

@@ -13,6 +13,7 @@ import pytest
 from sim_jax.crash import Limits
 from sim_jax.rollout import rollout
 from tests.tuner.uncertainty import making
+from tuner.examination.examination import examine
 from tuner.filter_error.disturbances import (
     COMMAND_NOISE,
     COUNT,
@@ -170,6 +171,24 @@ def test_a_strength_is_taken_for_what_moves_innovations(fitted) -> None:
     ]
     expected = hessian / problem.space.slope(np.asarray(point.coefficients))
     np.testing.assert_allclose(across, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_an_examination_counts_that_strengths_are_learnt_of_all_flights_together(fitted) -> None:
+    problem, predictor, point = fitted
+    fit = making.fitted_of(problem, point)
+    in_turns = examine(
+        making.fitted_of(replace(problem, memory=1), point), predictor=predictor
+    ).information
+    at_once = examine(fit, predictor=predictor).information
+    slopes = predictor.slopes(problem, point)
+    moving = predictor.information(problem, point, fit.criterion, by_strengths=slopes.moved)
+    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    lost = (learnt.nuisance_prior - moving.nuisance_prior)[: len(FREE), : len(FREE)]
+    for found in (at_once, in_turns):
+        known = found.nuisance_prior[: len(FREE), : len(FREE)]
+        # differences of what filters of other programs made, in single precision
+        np.testing.assert_allclose(known, lost, atol=5e-3 * np.abs(lost).max())
+    assert np.linalg.eigvalsh(lost).min() < 0.0
 
 
 def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:

@@ -119,7 +119,9 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
         return there, own
 
     def seen(selected: Selected, *_: Any) -> Any:
-        def selection() -> Selected | None:
+        def selection(had: Any, *, first: bool) -> Selected | None:
+            assert first == (len(taken) == 1)
+            assert not had
             group = next(asked)
             row = SimpleNamespace(group=group, kept=True)
             return replace(selected, rows=(*selected.rows, row)) if group else None

@@ -114,8 +114,10 @@ def chosen(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(innovations, "with_groups", with_groups)
     monkeypatch.setattr(innovations, "findings_at", lambda *_: ())
 
-    def choose(innovation: Innovations) -> tuple[Selected, dict[str, Any]] | None:
-        selected = innovation.selection()
+    def choose(
+        innovation: Innovations, had: Sequence[str] = (), *, first: bool = False
+    ) -> tuple[Selected, dict[str, Any]] | None:
+        selected = innovation.selection(had, first=first)
         return None if selected is None else (selected, found)
 
     return choose
@@ -162,6 +164,39 @@ def test_a_term_that_stood_in_for_another_goes_as_that_one_comes(chosen) -> None
         ("thrust_inflow", SelectionCode.PREDICTS_SAMPLES),
         ("angular_drag", SelectionCode.NOT_SIGNIFICANT),
     ]
+
+
+def test_what_least_squares_let_stand_in_goes_first_and_comes_back_where_nothing_else_does(
+    chosen,
+) -> None:
+    """Gusts pass for it, and from there what it stands in for looks as if it were not there."""
+    truth, had = {"angular_drag_x": 0.5}, ["angular_drag"]
+    there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
+    assert chosen(seen([there, INFLOW], truth), had) is None  # it stays where it was judged before
+    selected, found = chosen(seen([there, INFLOW], truth), had, first=True)
+    assert not found["groups"]
+    assert not any(r.kept for r in selected.rows)
+    gone = row("angular_drag", SelectionCode.NOT_SIGNIFICANT)
+    _, found = chosen(seen([gone, INFLOW], truth), had)
+    assert set(found["groups"]) == {"angular_drag"}
+    assert chosen(seen([gone, INFLOW], truth), ()) is None
+
+
+def test_others_are_judged_as_if_what_stood_in_were_not_there(chosen) -> None:
+    """A fit with it leaves nothing for another to do that does the same."""
+    there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
+    innovation = seen(
+        [there, INFLOW],
+        {},
+        {"angular_drag_x": "thrust_inflow_coefficient"},
+    )
+    moved = innovation.linear.scaled.copy()
+    moved[list(innovation.space.names).index("angular_drag_x")] = (
+        2.0 * COEFFICIENTS["angular_drag_x"].prior_sd
+    )
+    stood_in = replace(innovation, linear=replace(innovation.linear, scaled=moved))
+    _, found = chosen(stood_in, first=True)
+    assert set(found["groups"]) == {"thrust_inflow"}
 
 
 @pytest.mark.parametrize(
