@@ -26,6 +26,7 @@ from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
+from tuner.selection.candidates import is_stand_in
 from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
@@ -91,7 +92,7 @@ def with_disturbances(
     on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
     there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
     seen = Innovations.of(selected, there, predictor)
-    had = [row.group for row in selected.rows if row.kept]
+    had = _kept(selected)
     for number in range(SELECTIONS):
         chosen = seen.selection(had, first=number == 0)
         if chosen is None and number > 0:
@@ -121,6 +122,15 @@ def with_disturbances(
     )
     otherwise = alternatives_of(again.objective, again.point)
     examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt())
+    if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
+        # what stood in for other terms made another model of it, which says nothing of this one
+        fitted = polished(
+            job,
+            again,
+            free=Free(np.ones(len(job.space), bool), offsets),
+            title="simulated",
+            on_progress=lambda progress: on_progress(job, progress),
+        )
     otherwise = alternatives_of(fitted.objective, fitted.point)
     before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
     if not _agree(examination.uncertainty, before.uncertainty):
@@ -128,6 +138,11 @@ def with_disturbances(
         return None
     sharper = _is_sharper(examination.uncertainty, before.uncertainty)
     return (seen.selected, again, examination) if sharper else None
+
+
+def _kept(selected: Selected) -> list[str]:
+    """Return the groups of terms in a fit."""
+    return [row.group for row in selected.rows if row.kept]
 
 
 def _descended(

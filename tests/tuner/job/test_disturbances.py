@@ -7,9 +7,11 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
 from tuner.config import JobFile
+from tuner.filter_error.disturbances import USUAL
 from tuner.filter_error.refit import STEPS
 from tuner.job import disturbances
 from tuner.job.disturbances import ROUGHLY, with_disturbances
@@ -133,3 +135,42 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     assert with_disturbances(begin, lambda *_: None, lambda _: None) is None  # keeps no track
     assert taken == descents
     assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
+
+
+@pytest.mark.parametrize(("group", "titles"), [("angular_drag", 2), ("fuselage_drag", 1)])
+def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles):
+    """What stood in for other terms made another model of it: it cannot contradict this one."""
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    predictor = SimpleNamespace(memory=0, keeps_track=True, strengths=USUAL)
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
+    row = SimpleNamespace(group=group, kept=True)
+    begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
+    polished, examined, chosen = [], [], iter([replace(begin, rows=()), None])
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        return SimpleNamespace(
+            selected=selected, selection=lambda *_, **__: next(chosen), in_doubt=dict
+        )
+
+    def polish(_: Job, fit: Fitted, *, title: str, **__: Any) -> Fitted:
+        polished.append(title)
+        return replace(fit, wall_time=float(len(polished)))
+
+    def examine(fit: Fitted, **_: Any) -> Any:
+        examined.append(fit)
+        return SimpleNamespace(uncertainty=NOBODY)
+
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    monkeypatch.setattr(disturbances, "_descended", lambda _, there, own, **__: (there, own))
+    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
+    monkeypatch.setattr(disturbances, "polished", polish)
+    monkeypatch.setattr(disturbances, "alternatives_of", lambda *_: {})
+    monkeypatch.setattr(disturbances, "examine", examine)
+    monkeypatch.setattr(disturbances, "_agree", lambda *_: True)
+    monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)
+    assert with_disturbances(begin, lambda *_: None, lambda _: None) is not None
+    assert polished == ["clocks", "simulated"][:titles]
+    assert (examined[-1] is begin.fitted) == (titles == 1)
