@@ -30,6 +30,7 @@ from benchmarks.oracle import oracle_error
 from benchmarks.simulated_recordings import recorded
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
+from sim_jax.inlet import ReferenceInlet
 from tuner.coefficients.space import Space
 from tuner.config import Options, settle
 from tuner.engine import Report, engine_for
@@ -209,6 +210,7 @@ def problem(*, terms: bool, more: tuple[str, ...] = (), narrowed: float = NARROW
         objective, _ = with_terms(objective, start, names, job.settings.job)
     parameters = [replace(p, prior_sd=narrowed * p.prior_sd) for p in objective.space.parameters]
     inlet = objective.segments.inlet
+    assert isinstance(inlet, ReferenceInlet), "the reference flights are flown in closed loop"
     held = replace(inlet, level_held=inlet.spins)
     return replace(
         objective,
@@ -243,7 +245,7 @@ def fitted(objective: Objective) -> Fitted:
         stages,
         beginning(objective, begin[None]),
         free=Free(np.ones(len(space), bool), free_offsets(reference_job())),
-        clipped=False,
+        undecided=(),
         on_progress=lambda _: None,
     )
     point = point_of(progress.points, 0)

@@ -100,7 +100,7 @@ def drawn(seed: int) -> Draw:
     clock.append(time.process_time())
     return Draw(
         simulated=flown.objective.space.numbers(found.point.coefficients),
-        followed=None if again is None else again[1].uncertainty.estimates,
+        followed=None if again is None else again[2].uncertainty.estimates,
         seconds=(clock[1] - clock[0], clock[2] - clock[1]),
     )
 

@@ -116,13 +116,13 @@ def compete(contestants: Sequence[Contestant], rounds: int) -> list[Measured]:
             if started[-1].wait_until_ready():
                 ready.append(started[-1])
         for _ in range(rounds):
-            for contestant in ready:
-                contestant.run()
-        return [contestant.measured() for contestant in started]
+            for running in ready:
+                running.run()
+        return [running.measured() for running in started]
     finally:
-        for contestant in started:
-            contestant.process.terminate()
-            contestant.process.communicate()
+        for running in started:
+            running.process.terminate()
+            running.process.communicate()
 
 
 def answer(run: Callable[[], object], amount: float, remark: str = "") -> None:
