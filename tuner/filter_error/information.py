@@ -85,5 +85,4 @@ def with_strengths(
     changes = dict(information.changes)
     across = np.array([changes.pop(name).sum(axis=0) for name in STRENGTHS])[learnt]
     own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / USUALLY**2
-    taken = across.T @ np.linalg.solve(own, across)
-    return replace(information, nuisance_prior=information.nuisance_prior - taken, changes=changes)
+    return replace(information, lost=across.T @ np.linalg.solve(own, across), changes=changes)

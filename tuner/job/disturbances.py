@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -112,7 +113,7 @@ def with_disturbances(
         there,
         free=Free(np.zeros(len(job.space), bool), offsets),
         title="clocks",
-        on_progress=lambda progress: on_progress(job, progress),
+        on_progress=partial(on_progress, job),
         stages=1,
     )
     again = replace(
@@ -129,7 +130,7 @@ def with_disturbances(
             again,
             free=Free(np.ones(len(job.space), bool), offsets),
             title="simulated",
-            on_progress=lambda progress: on_progress(job, progress),
+            on_progress=partial(on_progress, job),
         )
     otherwise = alternatives_of(fitted.objective, fitted.point)
     before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)

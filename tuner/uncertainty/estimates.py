@@ -245,11 +245,14 @@ def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]
     """Return the shares (C, F, K) of channels and flights in the information, and of priors (K,).
 
     The inverse of a parameter's variance is dᵀHd, d its change with all others following along;
-    H is a sum over channels, flights and priors, and so is the inverse of the variance.
+    H is a sum over channels, flights and priors, and so is the inverse of the variance, but for
+    what nuisances that all flights share take from all alike.
     """
     inverse = np.linalg.inv(information.total)
     along = inverse / np.diag(inverse)
     precision = 1.0 / np.diag(inverse)
+    if information.lost is not None:
+        precision = precision + np.einsum("pk,pq,qk->k", along, information.lost, along)
     by_segment = information.blocks.sum(axis=2)
     parts = np.einsum("pk,clpq,qk->clk", along, by_segment, along, optimize=True) / precision
     shares = np.zeros((parts.shape[0], flights, parts.shape[2]))

@@ -41,8 +41,7 @@ class FisherInformation:
     spread
         (C, F) mean square of the weighted residuals: 1 where they are as large as assumed.
     nuisance_prior
-        (K, K): what the priors of offsets and starts contribute, less what is lost to nuisances
-        that all flights share.
+        (K, K): what the priors of offsets and starts contribute.
     prior
         (K, K): what the priors of the coefficients contribute.
     crashed
@@ -53,6 +52,8 @@ class FisherInformation:
         (C, F) factors on the standard deviations of the measurement noise that residuals have.
     ground
         (K, K): what ground measurements contribute, as data of their own; None without.
+    lost
+        (K, K): what flights tell less for nuisances that all of them share; None without.
     changes
         What might be simulated differently -> (F, K) JᵀW times the change of the residuals.
     in_doubt
@@ -73,6 +74,7 @@ class FisherInformation:
     begins: Array
     scale: Array
     ground: Array | None = None
+    lost: Array | None = None
     changes: Mapping[str, Array] = field(default_factory=dict)
     in_doubt: Array | None = None
     pull: Array | None = None
@@ -125,6 +127,7 @@ class FisherInformation:
             nuisance_prior=self.nuisance_prior[square],
             prior=self.prior[square],
             ground=None if self.ground is None else self.ground[square],
+            lost=None if self.lost is None else self.lost[square],
             changes={name: change[:, indices] for name, change in self.changes.items()},
             in_doubt=some(self.in_doubt),
             pull=some(self.pull),
@@ -141,8 +144,7 @@ class FisherInformation:
     @property
     def data(self) -> Array:
         """The information (K, K) of all flights and ground measurements."""
-        flights = self.blocks.sum(axis=(0, 1, 2)) + self.nuisance_prior
-        return np.asarray(flights if self.ground is None else flights + self.ground)
+        return np.asarray(self.blocks.sum(axis=(0, 1, 2)) + self._beside_flights)
 
     @property
     def total(self) -> Array:
@@ -152,8 +154,15 @@ class FisherInformation:
     @property
     def given(self) -> Array:
         """The part (K, K) of the total that is no sum over flights: its noise is as it says."""
-        priors = self.prior + self.nuisance_prior
-        return np.asarray(priors if self.ground is None else priors + self.ground)
+        return np.asarray(self.prior + self._beside_flights)
+
+    @property
+    def _beside_flights(self) -> Array:
+        """What adds to the flights' own, and to the priors of the coefficients."""
+        beside = self.nuisance_prior
+        if self.ground is not None:
+            beside = beside + self.ground
+        return beside if self.lost is None else beside - self.lost
 
 
 def _summed(parts: Sequence[Array | None]) -> Array | None:

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.filter_error.information import hidden, with_hidden
+from tuner.filter_error.disturbances import LEAST, MOST, STRENGTHS
+from tuner.filter_error.information import hidden, with_hidden, with_strengths
+from tuner.uncertainty.estimates import _shares
 from tuner.uncertainty.information import FisherInformation
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
@@ -60,3 +62,19 @@ def test_what_innovations_say_of_the_others_stays():
 def test_how_high_markers_sit_is_told_by_the_loop_alone():
     names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z")
     assert hidden(names).tolist() == [False, True, False, True]
+
+
+def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
+    """Nothing of it counts as the priors'."""
+    random, said = np.random.default_rng(1), looped()
+    across = {name: 5.0 * random.standard_normal((3, len(NAMES))) for name in STRENGTHS}
+    learnt = with_strengths(
+        replace(said, changes=across), 100.0 * np.eye(len(STRENGTHS)), 0.5 * (LEAST + MOST)
+    )
+    assert not learnt.changes
+    error, wider = (np.sqrt(np.diag(np.linalg.inv(i.total))) for i in (said, learnt))
+    assert (wider > error).all()
+    assert (np.linalg.eigvalsh(learnt.prior + learnt.nuisance_prior) > 0.0).all()
+    flights, priors = _shares(learnt, 3)
+    np.testing.assert_allclose(flights.sum(axis=(0, 1)) + priors, 1.0)
+    assert (priors > 0.0).all()
