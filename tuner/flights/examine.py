@@ -24,7 +24,7 @@ from tuner.flights.content import (
 from tuner.flights.contradiction import noted_contradiction
 from tuner.flights.flight import SIGNALS, Array, Series
 from tuner.flights.formats import open_recording
-from tuner.flights.inertial import flying, is_inertial
+from tuner.flights.inertial import flying, is_inertial, obstacle
 from tuner.flights.informs import informed, inlets
 from tuner.flights.inspection import (
     Inspection,
@@ -78,13 +78,15 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
 
 def _without_pose(signals: Signals) -> Inspection:
     """Return what a recording of gyro, accelerometer and motor commands alone holds."""
-    flown = sum(end - begin for begin, end in flying(signals))
-    note = Note(NoteCode.WITHOUT_POSE, "info", numbers={"seconds": float(flown)})
+    flown = flying(signals)
+    error = obstacle(signals.recording.path, signals.series, flown)
+    seconds = {"seconds": float(sum(end - begin for begin, end in flown))}
+    fitted = () if error else (Note(NoteCode.WITHOUT_POSE, "info", numbers=seconds),)
     return replace(
         _with_signals(signals),
-        problem=None if flown else "nothing flies in it: the motors only idle",
+        problem=f"{error.what}; {error.remedy}" if error else None,
         inlets=inlets(_columns(signals.series), trajectory=False),
-        notes=(note, *signals.notes),
+        notes=(*fitted, *signals.notes),
     )
 
 

@@ -17,12 +17,16 @@ from tuner.errors import RecordingError
 from tuner.flights.content import Settings, Signals, given_map, read_signals
 from tuner.flights.flight import Series
 from tuner.flights.locate import require_pose
-from tuner.flights.mission import IDLE, SHORTEST, stretches
+from tuner.flights.mission import IDLE, stretches
 from tuner.flights.notes import Note
 from tuner.flights.sidecar import read_sidecar
 
 #: What a recording must hold.
 NEEDS = ("body_rate", "acceleration", "command")
+#: Hz below which a log does not show how a vehicle turns.
+SLOWEST = 120.0
+#: s below which a stretch in the air shows nothing.
+SHORTEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,33 @@ def flying(signals: Signals) -> tuple[tuple[float, float], ...]:
     return tuple((begin, end) for begin, end in runs if end - begin >= SHORTEST)
 
 
+def obstacle(
+    path: str | Path, series: Mapping[str, Series], flown: tuple[tuple[float, float], ...]
+) -> RecordingError | None:
+    """Return why nothing can be fitted to a recording without a pose; None if it can.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    series, flown
+        As of `InertialFlight`.
+    """
+    slow = {name: series[name].rate for name in NEEDS if series[name].rate < SLOWEST}
+    if slow:
+        rates = ", ".join(f"{name} at {rate:.0f} Hz" for name, rate in slow.items())
+        return RecordingError(
+            path,
+            f"holds no pose, and is too slow to be fitted without one: {rates}",
+            f"log {', '.join(NEEDS)} at {SLOWEST:.0f} Hz or more",
+        )
+    if not flown:
+        return RecordingError(
+            path, "nothing flies in it: the motors only idle", "check what was recorded of them"
+        )
+    return None
+
+
 def read_inertial(
     path: Path, *, topics: str | Path | None = None, namespace: str = ""
 ) -> InertialFlight | None:
@@ -70,7 +101,8 @@ def read_inertial(
     Raises
     ------
     RecordingError
-        The file cannot be read, nothing flies in it, or it holds neither a pose nor `NEEDS`.
+        The file cannot be read, holds neither a pose nor `NEEDS`, or is too slow, or nothing flies
+        in it.
     ConfigError
         The topic map or the side-car is wrong.
     """
@@ -82,8 +114,8 @@ def read_inertial(
         require_pose(signals.recording, signals.topic_map, signals.places)
         return None
     runs = flying(signals)
-    if not runs:
-        raise RecordingError(path, "nothing flies in it: the motors only idle", "inspect it")
+    if (error := obstacle(path, signals.series, runs)) is not None:
+        raise error
     kept = {
         name: signals.series[name] for name in (*NEEDS, "battery_voltage") if name in signals.series
     }

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from tuner.flights.flight import Array, Series
 
@@ -18,11 +19,19 @@ PAUSE = 1.0
 MOMENT = 0.2
 #: A shorter stretch, in s, is no mission.
 SHORTEST = 2.0
-#: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s.
+#: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
+#: not above `CARRIES` of what carries the vehicle in the air, nor below what is off.
 IDLE = 0.12
 IDLE_SPEED = 80.0
+CARRIES = 0.5
+OFF = 0.02
+OFF_SPEED = 20.0
 #: Higher above the ground than this, in m, the vehicle flies.
 CLEAR = 0.12
+#: What stays within this, in m, for a second rests.
+RESTS = 0.01
+#: s of which one mean position is taken.
+BIN = 0.1
 #: Set-points that begin this soon after the pose, in s, ran all the time.
 FROM_THE_START = 0.5
 
@@ -113,26 +122,68 @@ def _first_motion(series: Mapping[str, Series], start: float, end: float) -> flo
 
 
 def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
-    """Return the stretches in the air.
+    """Return the stretches in which the rotors carry the vehicle.
 
     The ground is known where motors were seen idle, or where the recording begins or ends at rest
-    and the vehicle climbs away from there; a recording that shows no ground is all in the air.
+    and the vehicle climbs away from there; a recording that shows no ground is all in the air. One
+    that comes as low in flight as where it only seemed to stand, or whose motors stop for a moment,
+    flies on.
     """
     position = series["position"]
     time, height = position.time, position.values[:, 2]
-    idle, observed = _idle(series, time)
-    grounded = idle | (_resting(time, height) & ~observed)
+    rests = _rests(time, position.values)
+    idle, observed = _idle(series, time, height)
+    stands = _lasting(time, idle, rests)
+    grounded = stands | (_resting(time, height) & rests & ~observed)
     if not grounded.any():
         return [(float(time[0]), float(time[-1]))]
-    ground = _ground(time, height, grounded)
-    return stretches(time, ~grounded & (height > ground + CLEAR))
+    low = grounded | ~(height > _ground(time, height, grounded) + CLEAR)
+    if not stands.any():  # the ground is a guess, and what passes it without a rest flies
+        for first, last in _runs(low):
+            low[first:last] = (grounded | rests)[first:last].any()
+    return stretches(time, ~low)
 
 
-def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return where each run of true flags begins, and behind its end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+
+
+def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
+    """Return at which of n times the (n, 3) positions of a second around stay where they are."""
+    bins = ((time - time[0]) / BIN).astype(np.int64)
+    held, place = np.unique(bins, return_inverse=True)
+    counts = np.bincount(place)
+    spread = np.zeros(len(held))
+    window = round(1.0 / BIN)
+    for column in positions.T:
+        means = np.bincount(place, column) / counts
+        reach = maximum_filter1d(means, window) - minimum_filter1d(means, window)
+        spread = np.maximum(spread, reach)
+    return np.asarray((spread < RESTS)[place], dtype=np.bool_)
+
+
+def _lasting(time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where motors idle, but for moments inside a flight in which the vehicle moves on."""
+    lasting = idle.copy()
+    for first, last in _runs(idle):
+        inside = first > 0 and last < len(time)
+        if inside and time[last - 1] - time[first] < PAUSE and not rests[first:last].any():
+            lasting[first:last] = False
+    return lasting
+
+
+def _idle(
+    series: Mapping[str, Series], time: Array, height: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return at which times the motors idle, and at which times that was recorded."""
-    for name, limit in (
-        ("command", IDLE), ("rotor_speed", IDLE_SPEED), ("thrust_setpoint", IDLE),
-    ):  # fmt: skip
+    clear = height > float(np.quantile(height, 0.02)) + 3 * CLEAR
+    for name, limit, off in (
+        ("command", IDLE, OFF),
+        ("rotor_speed", IDLE_SPEED, OFF_SPEED),
+        ("thrust_setpoint", IDLE, OFF),
+    ):
         if name in series and len(series[name].time) > 1:
             samples = series[name]
             known = np.isfinite(samples.values).any(axis=1)
@@ -140,7 +191,10 @@ def _idle(series: Mapping[str, Series], time: Array) -> tuple[NDArray[np.bool_],
                 continue
             at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
             observed = (time >= samples.time[0] - MOMENT) & (time <= samples.time[-1] + MOMENT)
-            return observed & np.asarray(at < limit, dtype=np.bool_), observed
+            flown = at[clear & observed]
+            carries = CARRIES * float(np.median(flown)) if len(flown) else limit
+            idle: NDArray[np.bool_] = np.asarray(at < max(off, min(limit, carries)))
+            return observed & idle, observed
     nothing = np.zeros(len(time), dtype=np.bool_)
     return nothing, nothing
 

@@ -20,7 +20,7 @@ from tuner.config import ControllerFile, VehicleFile
 from tuner.errors import RecordingError
 from tuner.flights.inertial import InertialFlight
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
-from tuner.inertial.signals import SLOWEST, stretches_of
+from tuner.inertial.signals import stretches_of
 from tuner.model import model_of
 from tuner.objective.explained import levers
 from tuner.objective.motor_order import order_findings
@@ -60,16 +60,9 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     Raises
     ------
     RecordingError
-        It was logged too slowly or flown too short, or its commands turn the vehicle the other way.
+        Its commands turn the vehicle the other way.
     """
     stretches = stretches_of(flight.series, flight.flying)
-    if not stretches:
-        raise RecordingError(
-            flight.path,
-            "holds no pose, and its gyro, accelerometer and commands are too slow or too short to "
-            "be fitted without one",
-            f"log them at {SLOWEST:.0f} Hz or more for some seconds of flight",
-        )
     longest = max(flight.flying, key=lambda span: span[1] - span[0])
     for finding in order_findings(flight.name, flight.series, vehicle, longest):
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))

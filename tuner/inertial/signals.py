@@ -16,8 +16,6 @@ CUTOFF = 30.0
 frames' vibrations, below it what motors of tens of ms can follow."""
 FASTEST = 1000.0
 """Hz of the common clock, at most."""
-SLOWEST = 4.0 * CUTOFF
-"""Hz below which a log does not show the band."""
 TRIMMED = 0.5
 """s at both ends of a stretch that are left out: take-off, landing and the filters' ends."""
 BLOCK = 1.0
@@ -63,12 +61,10 @@ def stretches_of(
     """Return the stretches in the air on the clock of the slowest of the three signals."""
     names = ("body_rate", "acceleration", "command")
     rate = min(FASTEST, *(series[name].rate for name in names))
-    if rate < SLOWEST:
-        return ()
     stretches = []
     for begin, end in flying:
         count = int((end - begin) * rate)
-        if count > 4 * TRIMMED * rate:
+        if count >= 4 * TRIMMED * rate - 1:
             time = begin + np.arange(count) / rate
             stretches.append(Stretch(time, *(_on(time, series[name]) for name in names)))
     return tuple(stretches)

@@ -102,3 +102,49 @@ def test_what_never_flies_has_no_mission() -> None:
 )
 def test_yaw_spin(rates: np.ndarray, expected: YawSpin | None) -> None:
     assert yaw_spin(series(rates), 0.0, 40.0) == expected
+
+
+def low_passes(*, still: bool = False) -> dict[str, Series]:
+    """Fly in the air from the first sample to the last, and come as low as there at every turn."""
+    turning = np.clip(TIME - 3, 0, 34)
+    height = 0.55 + 0.725 * (1 - np.cos(2 * np.pi * turning / 2.0))
+    across = 0 * TIME if still else np.sin(1.5 * TIME)
+    noise = np.random.default_rng(0).normal(0, 3e-4, (len(TIME), 3))
+    return {
+        "position": series(np.column_stack([across, 0 * TIME, height]) + noise),
+        "attitude": series(np.tile([1.0, 0, 0, 0], (len(TIME), 1))),
+    }
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [
+        {},
+        {"rotor_speed": series(np.full((len(TIME), 4), 900.0))},
+        {"rotor_speed": series(np.full((len(TIME), 4), 60.0))},
+        {"command": series(np.full((len(TIME), 4), 0.1))},
+        {"command": series(np.where(np.abs(TIME - 20) < 0.3, 0.0, 0.5)[:, None] * np.ones(4))},
+    ],
+    ids=["none", "speed", "slow rotors", "little throttle", "a moment without"],
+)
+def test_what_the_rotors_carry_is_one_mission_however_low_it_comes(
+    drive: dict[str, Series],
+) -> None:
+    (mission,) = find_missions(low_passes() | drive)
+    assert (mission.start, mission.end) == (TIME[0], TIME[-1])
+
+
+def test_only_what_stands_still_at_the_lowest_height_may_be_ground() -> None:
+    (mission,) = find_missions(low_passes(still=True))
+    assert (mission.start, mission.end) == pytest.approx((3.2, 36.8), abs=0.2)
+
+
+def test_what_stands_with_turning_motors_between_two_flights_is_cut() -> None:
+    up = np.clip(TIME - 2, 0, 1) - np.clip(TIME - 15, 0, 1)
+    up += np.clip(TIME - 20, 0, 1) - np.clip(TIME - 36, 0, 1)
+    command = np.where((TIME > 1) & (TIME < 38), 0.3, 0.0)
+    signals = flight() | {
+        "position": series(np.column_stack([0 * TIME, 0 * TIME, up])),
+        "command": series(np.tile(command[:, None], 4)),
+    }
+    assert len(find_missions(signals)) == 2

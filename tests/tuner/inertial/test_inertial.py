@@ -18,7 +18,9 @@ from tuner.config import (
 )
 from tuner.errors import InputError, RecordingError
 from tuner.findings import Code
+from tuner.flights import inspect_recordings
 from tuner.flights.inertial import read_inertial
+from tuner.flights.notes import NoteCode
 from tuner.inertial.ahead import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.bench import least_noticed
@@ -176,6 +178,27 @@ def test_a_log_on_the_ground_is_refused(tmp_path):
     columns |= {f"motor.m{i}": ("I", nothing) for i in range(1, 5)}
     with pytest.raises(RecordingError, match="the motors only idle"):
         read_inertial(log_of(time, columns, tmp_path / "log00"))
+
+
+@pytest.mark.parametrize(("rate", "seconds", "refusal"), [
+    (400.0, 10.0, None), (119.0, 10.0, "command at 119 Hz"), (400.0, 1.5, "the motors only idle"),
+])  # fmt: skip
+def test_inspect_and_tune_agree_on_what_can_be_fitted(rate, seconds, refusal, tmp_path):
+    time = np.arange(int(seconds * rate)) / rate
+    columns = {f"{kind}.{axis}": ("f", time) for kind in ("gyro", "acc") for axis in "xyz"}
+    columns |= {f"motor.m{i}": ("I", 30000 + 0 * time) for i in range(1, 5)}
+    path = log_of(time, columns, tmp_path / "log00")
+    (seen,), _ = inspect_recordings([path])
+    fitted = [note for note in seen.notes if note.code is NoteCode.WITHOUT_POSE]
+    if refusal is None:
+        assert read_inertial(path) is not None
+        assert seen.problem is None
+        assert fitted
+        return
+    with pytest.raises(RecordingError, match=refusal) as caught:
+        read_inertial(path)
+    assert seen.problem == f"{caught.value.what}; {caught.value.remedy}"
+    assert not fitted
 
 
 def test_what_cannot_be_used_is_left_out_and_what_is_held_out_is_predicted(
