@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import re
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -15,6 +16,42 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tuner.errors import InputError, OutputError, RecordingError
+
+LONGEST_NAME = 100
+"""Letters of a file's name that is made of another name, its suffix included."""
+_PLAIN = re.compile(r"\w(?:[\w.-]*[\w-])?", re.ASCII)
+
+
+def file_name(name: str, suffix: str = "") -> str:
+    """Return a file's name for what a recording, a file or a request calls something.
+
+    It has ASCII letters, digits, ``_``, ``-`` and dots inside it, and begins with no dot or dash. A
+    plain name is kept. Another is made plain and gets some digits of its digest, so that two names
+    do not come to one file.
+    """
+    most = LONGEST_NAME - len(suffix)
+    if len(name) <= most and _PLAIN.fullmatch(name):
+        return name + suffix
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    plain = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).lstrip(".-")[: most - 1 - len(digest)]
+    return f"{plain or 'unnamed'}-{digest}{suffix}"
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a name below a folder, once it is sure that it lies there.
+
+    Raises
+    ------
+    OutputError
+        The name, or a link that stands there, leads elsewhere.
+    """
+    path = folder / name
+    with _refusals(path):
+        if "\0" not in name and "\\" not in name:
+            place, whole = path.resolve(), folder.resolve()
+            if whole in place.parents:
+                return path
+    raise OutputError(repr(name), f"leads out of {folder}", "name a file inside it")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -12,7 +12,7 @@ from tuner.client.connection import Connection
 from tuner.client.job_request import request_of
 from tuner.config import ControllerFile, Options, VehicleFile
 from tuner.config.job import Method
-from tuner.disk import make_folder, whole_file
+from tuner.disk import inside, make_folder, whole_file
 from tuner.errors import InputError, ServerFaultError
 from tuner.flights.cache import digest
 from tuner.job.folder import folder_for
@@ -212,7 +212,7 @@ class Client:
             raise InputError(f"job {job}", f"is {found['state']}", f"tune watch {job}")
         folder = folder_for(None if out is None else Path(out))
         for name in found["files"]:
-            target = folder / _inside(name)
+            target = inside(folder, name)
             make_folder(target.parent)
             with whole_file(target) as unfinished:
                 self._connection.download(f"{_at(job)}/files/{quote(name)}", unfinished)
@@ -259,11 +259,3 @@ class JobRefusedError(InputError):
 
 def _at(job: str) -> str:
     return f"/jobs/{quote(job, safe='')}"
-
-
-def _inside(name: str) -> Path:
-    """Return the path of a server's file inside a folder, and nowhere else."""
-    path = PurePosixPath(name)
-    if path.is_absolute() or ".." in path.parts or "\\" in name or ":" in name or not path.parts:
-        raise InputError("--server", f"names a file '{name}'", "is it a tuning service?")
-    return Path(*path.parts)

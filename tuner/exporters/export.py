@@ -8,7 +8,7 @@ from datetime import date
 from pathlib import Path
 
 from tuner.config.job import ExportSettings
-from tuner.disk import check_file
+from tuner.disk import check_file, file_name, inside
 from tuner.errors import ExportError, InputError
 from tuner.exporters.draft import write
 from tuner.exporters.gates import Gate, Refly, check
@@ -87,7 +87,8 @@ def export(
         The file cannot be written.
     """
     target = target_of(kind)
-    path = out or into or run.folder / FOLDER / f"{run.vehicle.name}{target.suffix}"
+    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
+    path = out or into or inside(run.folder, own)
     check_file(path, folder_is_made=True)
     if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
@@ -135,8 +136,8 @@ def exports_of_job(
     run = read_run(folder)
     for kind in wanted.formats:
         into = wanted.into if target_of(kind).patches else None
-        out = folder / FOLDER / into.name if into else None
         try:
+            out = inside(folder / FOLDER, into.name) if into else None
             yield kind, export(run, kind, refly=refly, today=today, into=into, out=out).path
         except InputError as error:
             yield kind, error

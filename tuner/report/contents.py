@@ -9,7 +9,7 @@ from pathlib import Path
 from tuner.bench.bench_json import BenchRecord
 from tuner.comparison.table import Table
 from tuner.design.next_flight_json import Proposals
-from tuner.disk import exists
+from tuner.disk import exists, file_name
 from tuner.errors import InputError
 from tuner.examination.sensitivity_json import Knowledge
 from tuner.flights.flight import Array
@@ -73,6 +73,7 @@ def read_contents(folder: str | Path) -> Contents:
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)
         about = _about_run(run)
+    names = {file_name(flight.name): flight.name for flight in about.flights}
     return Contents(
         folder=folder,
         about=about,
@@ -84,7 +85,7 @@ def read_contents(folder: str | Path) -> Contents:
         bench=BenchRecord.read_if_any(folder),
         search=SearchRecord.read_if_any(folder),
         laps=Table.read_if_any(folder),
-        traces=read_traces(folder),
+        traces={names.get(key, key): arrays for key, arrays in read_traces(folder).items()},
     )
 
 

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from tuner.disk import make_folder, write_text
+from tuner.disk import file_name, inside, make_folder, write_text
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
     import matplotlib as mpl  # noqa: PLC0415 (a second to import)
 
     mpl.use("Agg", force=False)
-    make_folder(folder / PLOTS)
+    make_folder(inside(folder, PLOTS))
     written = []
     with mpl.rc_context(SETTINGS):
         for chart in charts:
@@ -57,7 +57,7 @@ def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
 
 def plot_file(folder: Path, chart: Chart) -> Path:
     """Return where a chart's SVG file lies in a result folder."""
-    return folder / PLOTS / f"{chart.key}.svg"
+    return inside(folder, f"{PLOTS}/{file_name(chart.key, '.svg')}")
 
 
 def _svg(chart: Chart) -> str:

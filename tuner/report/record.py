@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from tuner.disk import whole_file
+from tuner.disk import file_name, whole_file
 from tuner.files import FiniteOrNone, Part, ResultFile, read_arrays
 from tuner.findings import Finding
 from tuner.search.iteration import Iteration
@@ -95,12 +95,14 @@ def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErro
     last: Mapping[str, FlightErrors] = {}
     for suffix, flights in simulations.items():
         last = flights
-        for flight, errors in flights.items():
+        for name, errors in flights.items():
+            flight = file_name(name)
             for signal, of_signal in (("position", errors.position), ("attitude", errors.attitude)):
                 arrays[f"{flight}/{signal}_time"] = _thinned(of_signal.time)
                 arrays[f"{flight}/{signal}"] = _thinned(of_signal.recorded)
                 arrays[f"{flight}/{signal}_{suffix}"] = _thinned(of_signal.simulated)
-    for flight, errors in last.items():
+    for name, errors in last.items():
+        flight = file_name(name)
         if errors.forces is not None:
             arrays[f"{flight}/acting_time"] = _thinned(errors.forces.time, FORCE_POINTS)
             for term, acted in errors.forces.of_term.items():
@@ -110,7 +112,7 @@ def write_traces(folder: Path, simulations: Mapping[str, Mapping[str, FlightErro
 
 
 def read_traces(folder: Path) -> dict[str, dict[str, Array]]:
-    """Return flight -> name -> array of what `write_traces` wrote; empty if there is none."""
+    """Return flight, by its file's name, -> name -> array; empty if there is none."""
     path = folder / TRACES_FILE
     if not path.exists():
         return {}

@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from tuner.disk import digest_of
+from tuner.disk import digest_of, inside
 from tuner.result import RunResult
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, Asked
@@ -59,7 +59,7 @@ def prepare(folder: Path, claim: Claim, store: Store) -> Asked:
         shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
         (folder / FLIGHTS).mkdir(parents=True)
         for name, digest in claim.flights.items():
-            store.fetch(digest, folder / FLIGHTS / name)
+            store.fetch(digest, inside(folder / FLIGHTS, name))
         asked.lay_out(folder)
     return asked
 

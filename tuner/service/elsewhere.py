@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from tuner.disk import inside
 from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
 from tuner.errors import EngineError
@@ -58,7 +59,7 @@ def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
         folder = Path(name)
         (folder / RESULT).mkdir()
         for file, digest in kept.items():
-            store.fetch(digest, folder / RESULT / file)
+            store.fetch(digest, inside(folder / RESULT, file))
         asked = prepare(folder, claim, store)
 
         def relay(events: Events, standing: Mapping[str, Any]) -> bool:

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.requests import ClientDisconnect
 
+from tuner.disk import file_name
 from tuner.errors import InputError
 from tuner.service import jobs, recordings
 from tuner.service.errors import NotKnownError, TooManyError, UnavailableError
@@ -269,8 +270,7 @@ def file_response(service: Service, row: FileRow) -> StreamingResponse:
         kind = "text/html; charset=utf-8"
     else:
         kind = _KINDS.get(suffix, "application/octet-stream")
-        plain = "".join(c if c.isalnum() or c in "._-" else "_" for c in base)
-        headers["content-disposition"] = f'attachment; filename="{plain}"'
+        headers["content-disposition"] = f'attachment; filename="{file_name(base)}"'
     if not service.store.has(row.sha256):
         raise NotKnownError(row.name, "is gone from the store", "submit the job again")
 

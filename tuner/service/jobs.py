@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, selectinload, undefer
 
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
-from tuner.service.naming import file_name
+from tuner.service.naming import recording_name
 from tuner.service.queue import add_event
 from tuner.service.request import JobRequest, checked
 from tuner.service.settings import Limits
@@ -66,7 +66,7 @@ def submit(
         earlier = _earlier_vehicle(session, request)
     if unfinished is not None and unfinished >= limits.unfinished_jobs:
         raise TooManyError("the service", f"has {unfinished} unfinished jobs", "try again later")
-    flights = [file_name(recording.name) for recording in recordings]
+    flights = [recording_name(recording.name) for recording in recordings]
     asked, vehicle, holdout = checked(request, flights, earlier)
     flown = [t for r in recordings if (t := _seconds(r.inspection.get("started"))) is not None]
     row = JobRow(

@@ -1,4 +1,4 @@
-"""What users call their files, made fit to be a file's name here: never a path."""
+"""What users call their recordings, made fit to be a file's name here: never a path."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import re
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-LONGEST = 100
+from tuner.disk import file_name
+
 _SIDE_CARS = (".yaml", ".yml")
 
 
@@ -15,17 +16,16 @@ def last_part(name: str) -> str:
     return re.split(r"[/\\]", name)[-1]
 
 
-def file_name(name: str) -> str:
-    """Return a file's name that only has letters, digits, ``_``, ``-`` and dots inside it.
+def recording_name(name: str) -> str:
+    """Return a recording's file name; what would be read as a file beside it gets another suffix.
 
     The stem, by which a flight goes, is kept where it is plain, and so is the suffix.
     """
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", last_part(name)).strip(".-") or "recording"
-    path = PurePosixPath(plain)
-    suffix = path.suffix[:10]
-    if suffix.lower() in _SIDE_CARS:
-        suffix += "_"
-    return path.stem[: LONGEST - len(suffix)] + suffix
+    stem, _, ending = last_part(name).rpartition(".")
+    if not stem or not re.fullmatch(r"\w{1,9}", ending, re.ASCII):
+        stem, ending = last_part(name), ""
+    suffix = f".{ending}" if ending else ""
+    return file_name(stem, f"{suffix}_" if suffix.lower() in _SIDE_CARS else suffix)
 
 
 def stems(names: Iterable[str]) -> list[str]:

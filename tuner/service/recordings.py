@@ -12,12 +12,13 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 
+from tuner.disk import inside
 from tuner.errors import InputError
 from tuner.service.database import Database
 from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, shown
 from tuner.service.incoming import Upload
 from tuner.service.inspecting import inspect
-from tuner.service.naming import file_name, stems
+from tuner.service.naming import recording_name, stems
 from tuner.service.settings import ServiceSettings
 from tuner.service.store import Store
 from tuner.service.tables import RecordingRow
@@ -66,7 +67,7 @@ def take(
 def _inspected(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
     """Return what an upload holds, read under a name of our own."""
     with tempfile.TemporaryDirectory(dir=settings.incoming) as folder:
-        file = Path(folder) / file_name(upload.name)
+        file = inside(Path(folder), recording_name(upload.name))
         os.link(upload.path, file)
         try:
             return inspect(file, settings.limits)
@@ -94,7 +95,7 @@ def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> Re
 
 def flight_name(name: str) -> str:
     """Return what the flight of a recording is called in a job."""
-    return stems([file_name(name)])[0]
+    return stems([recording_name(name)])[0]
 
 
 def latest(database: Database, most: int) -> Sequence[RecordingRow]:

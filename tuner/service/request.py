@@ -13,9 +13,10 @@ from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 from tuner.config import ControllerFile, Options, VehicleFile, settle
 from tuner.config.job import JobFile, Method
 from tuner.config.settings import is_among
+from tuner.disk import inside
 from tuner.errors import ConfigError, InputError, did_you_mean
 from tuner.flights.topics import TopicMap
-from tuner.service.naming import last_part, stems
+from tuner.service.naming import last_part, recording_name, stems
 from tuner.yaml_files.document import dump_yaml
 from tuner.yaml_files.section import Flag, Number, Section, Whole, build, refuse
 from tuner.yaml_files.shipped import Kind, configs_folder
@@ -195,11 +196,12 @@ def checked(
         folder = Path(name)
         (folder / FLIGHTS).mkdir()
         for flight in flights:
-            if (folder / FLIGHTS / flight).exists():
+            place = inside(folder / FLIGHTS, flight)
+            if place.exists():
                 raise InputError(
                     flight, "is the name of two recordings", "rename one and upload it again"
                 )
-            (folder / FLIGHTS / flight).touch()
+            place.touch()
         asked.lay_out(folder)
         try:
             settled = settle(asked.options(folder, flights))
@@ -220,7 +222,8 @@ def _holdout(names: Sequence[str] | None, flights: Sequence[str]) -> tuple[str, 
     known = stems(flights)
     chosen = []
     for name in names:
-        stem = next((s for s in (name, *stems([last_part(name)])) if is_among(s, known)), None)
+        meant = (name, *stems([last_part(name), recording_name(name)]))
+        stem = next((s for s in meant if is_among(s, known)), None)
         if stem is None:
             raise InputError("holdout", f"there is no flight '{name}'", did_you_mean(name, known))
         chosen.append(stem)

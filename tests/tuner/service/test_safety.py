@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.errors import InputError
 from tuner.service import tokens
-from tuner.service.naming import file_name
+from tuner.service.naming import recording_name
 from tuner.service.safety import COOKIE, RateLimit
 from tuner.service.serve import is_loopback, serve
 from tuner.service.service import Service
@@ -34,10 +34,10 @@ def guarded(settings):
 
 @given(st.text(max_size=300))
 def test_a_user_s_name_is_never_a_path(name):
-    made = file_name(name)
+    made = recording_name(name)
     assert re.fullmatch(r"[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}", made), made
     assert not made.lower().endswith((".yaml", ".yml"))
-    assert file_name(made) == made
+    assert recording_name(made) == made
 
 
 @pytest.mark.parametrize(
@@ -47,13 +47,13 @@ def test_a_user_s_name_is_never_a_path(name):
         ("../../etc/passwd", "passwd"),
         ("..\\..\\x.bag", "x.bag"),
         ("tune.yaml", "tune.yaml_"),
-        ("….bag", "_.bag"),
-        ("", "recording"),
-        ("..", "recording"),
+        ("….bag", "_-b4935894.bag"),
+        ("", "unnamed-e3b0c442"),
+        ("..", "unnamed-5ec1f7e7"),
     ],
 )
 def test_plain_names_are_kept_and_others_made_plain(name, kept):
-    assert file_name(name) == kept
+    assert recording_name(name) == kept
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
+from tuner.disk import file_name
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.ros.container import (
@@ -110,7 +111,7 @@ class Folder:
         if self._unpacked is None:
             self._unpacked = Path(mkdtemp(prefix="tune-"))
             weakref.finalize(self, shutil.rmtree, self._unpacked, True)
-        target = self._unpacked / path.stem
+        target = self._unpacked / file_name(path.stem)
         written = 0
         try:
             with zstd().open(path, "rb") as packed, target.open("wb") as stream:
