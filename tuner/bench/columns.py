@@ -96,7 +96,7 @@ def read_columns(
             raise RecordingError(path, f"has no column {names}", f"it needs {needed}")
     if not any(name in table.columns for name in TIMES):
         raise RecordingError(path, "has no column time", "add it, in s")
-    clocks = tuple(Clock(field=name) for name in TIMES)
+    clocks = tuple(Clock(field=name, unit="s") for name in TIMES)
     contents = table.read({ROWS: Request(tuple(chosen.values()), clocks)})
     rows = contents.samples[ROWS]
     if len(rows.receive) < FEWEST:

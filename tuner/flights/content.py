@@ -14,7 +14,7 @@ from tuner.flights.contradiction import contradiction
 from tuner.flights.damage import Damage
 from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Series
-from tuner.flights.formats import open_recording
+from tuner.flights.formats import is_tabular, open_recording
 from tuner.flights.frames import DOUBTS, correct_frames
 from tuner.flights.locate import Place, choose_map, locate, require_pose, unread
 from tuner.flights.mission import Mission, find_missions
@@ -25,7 +25,7 @@ from tuner.flights.stale import without_stale
 from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
 from tuner.flights.units import to_si
-from tuner.flights.yardstick import Stamped, scales_of, unit_of
+from tuner.flights.yardstick import Stamped, is_too_slow, scales_of, unit_of
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,9 @@ def read_signals(
         *contents.notes,
         *noticed,
     ]
+    if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
+        raw, quicker = _quickened(raw)
+        notes += quicker
     series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
     topics = {signal: data.topic for signal, data in raw.items()}
     damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
@@ -208,6 +211,18 @@ def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | No
     return settings.topics
 
 
+def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
+    """Return signals with times a thousandth as long, where gravity says that they are."""
+    if not is_too_slow({name: _stamped(data, 0) for name, data in raw.items()}):
+        return raw, []
+    quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
+    return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
+
+
+def _stamped(data: Raw, epoch: int) -> Stamped:
+    return Stamped(np.asarray((data.time - epoch) * 1e-9, dtype=np.float64), data.values)
+
+
 def _clean(
     path: Path, raw: Mapping[str, Raw], *, with_pose: bool
 ) -> tuple[dict[str, Series], int, list[Note]]:
@@ -215,10 +230,7 @@ def _clean(
     epoch = min((int(data.time.min()) for data in first), default=0)
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
-    recorded = {
-        signal: Stamped(np.asarray((data.time - epoch) * 1e-9, dtype=np.float64), data.values)
-        for signal, data in raw.items()
-    }
+    recorded = {signal: _stamped(data, epoch) for signal, data in raw.items()}
     scales = scales_of(recorded)
     for signal, data in raw.items():
         seconds, measured = recorded[signal].time, recorded[signal].values

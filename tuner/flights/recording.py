@@ -31,18 +31,23 @@ class Topic:
 
 
 class Clock(Section):
-    """A field that holds the time of a message, or of a table's row; a bare name means seconds.
+    """A field that holds the time of a message, or of a table's row.
 
     Attributes
     ----------
     field
         Its path or column.
     unit
-        Key of `NANOSECONDS`.
+        Key of `NANOSECONDS`; None is seconds in messages, and told by the step in tables.
     """
 
     field: str
-    unit: Literal["s", "ms", "us", "ns"] = "s"
+    unit: Literal["s", "ms", "us", "ns"] | None = None
+
+    @property
+    def nanoseconds(self) -> int:
+        """How many ns make its unit."""
+        return NANOSECONDS[self.unit or "s"]
 
     @model_validator(mode="before")
     @classmethod

@@ -4,25 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from tuner.errors import RecordingError
 from tuner.flights.damage import Cause, Damage
-from tuner.flights.flight import Array
 from tuner.flights.notes import Note, NoteCode
-from tuner.flights.recording import (
-    NANOSECONDS,
-    ROWS,
-    Clock,
-    Contents,
-    Nanoseconds,
-    Request,
-    Samples,
-    TabularRecording,
-)
+from tuner.flights.recording import ROWS, Contents, Request, Samples, TabularRecording
+from tuner.flights.times import NEVER, UNIT_NAMES, numbers_of, read_times
 
 if TYPE_CHECKING:
     import pyarrow
@@ -63,11 +51,14 @@ class Table(TabularRecording):
         clock = self.clock(request)
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
-        time = _nanoseconds(table.column(clock.field), clock)
-        fields = {name: _numbers(table.column(name)) for name in request.fields}
+        fields = {name: numbers_of(table.column(name)) for name in request.fields}
+        time, unit = read_times(self.path, table.column(clock.field), clock, fields.values())
         notes = []
+        if unit is not None and unit != "s":
+            told = (clock.field, UNIT_NAMES[unit])
+            notes.append(Note(NoteCode.UNIT_READ, topic=ROWS, count=len(time), names=told))
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
-        kept = time != _NEVER
+        kept = time != NEVER
         if not kept.all():
             lost = int((~kept).sum())
             notes.append(Note(NoteCode.ROWS_WITHOUT_TIME, topic=ROWS, count=lost))
@@ -140,72 +131,5 @@ class Table(TabularRecording):
         )
 
 
-#: Stands for a row without a time.
-_NEVER = np.iinfo(np.int64).min
-
-
 def _why(err: Exception) -> str:
     return f"is no readable table ({' '.join(str(err).split())[:120]})"
-
-
-def _numbers(column: pyarrow.ChunkedArray) -> Array:
-    """Return a column as floats, NaN where a cell holds no number."""
-    from pyarrow import ArrowInvalid, ArrowNotImplementedError, compute, float64  # noqa: PLC0415
-
-    try:
-        if _is_text(column):
-            column = compute.replace_substring_regex(column, pattern=r"^\s*$", replacement="nan")
-        return np.asarray(_array(compute.cast(column, float64())), dtype=np.float64)
-    except (ArrowInvalid, ArrowNotImplementedError):
-        return np.array([_number(cell) for cell in column.to_pylist()], dtype=np.float64)
-
-
-def _array(column: pyarrow.ChunkedArray) -> NDArray[Any]:
-    """Return a column's numbers, in a way that leaves pandas asleep (half a second) if it can."""
-    whole = column.combine_chunks()
-    if whole.null_count:
-        return np.asarray(whole.to_numpy(zero_copy_only=False))
-    return np.from_dlpack(whole)
-
-
-def _number(cell: object) -> float:
-    try:
-        return float(cell)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
-
-
-def _is_text(column: pyarrow.ChunkedArray) -> bool:
-    from pyarrow import types  # noqa: PLC0415
-
-    return bool(types.is_string(column.type))
-
-
-def _nanoseconds(column: pyarrow.ChunkedArray, clock: Clock) -> Nanoseconds:
-    """Return a time column in whole ns, with every digit that a text holds."""
-    from pyarrow import ArrowInvalid, compute, int64, types  # noqa: PLC0415
-
-    unit = NANOSECONDS[clock.unit]
-    if types.is_integer(column.type):
-        return np.asarray(_array(column), dtype=np.int64) * unit
-    if types.is_timestamp(column.type):
-        whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
-        return np.asarray(_array(compute.fill_null(whole, _NEVER)), dtype=np.int64)
-    seconds = _numbers(column)
-    known = np.isfinite(seconds) & (np.abs(seconds) < 9e18 / unit)
-    result = np.full(len(seconds), _NEVER, dtype=np.int64)
-    result[known] = np.rint(seconds[known] * unit)
-    if _is_text(column) and known.any() and np.abs(seconds[known]).max() > 1e6:
-        # A float has some 16 digits, too few for nanoseconds since 1970.
-        try:
-            parts = compute.split_pattern(column.combine_chunks(), ".", max_splits=1)
-            whole = compute.list_element(parts, 0)
-            start = np.from_dlpack(compute.cast(whole, int64()))
-        except ArrowInvalid:
-            return result
-        rest = np.zeros(len(seconds))
-        for i, text in enumerate(column.to_pylist()):
-            rest[i] = _number(f"0.{text.partition('.')[2]}") if "." in text else 0.0
-        exact = known & np.isfinite(rest) & (start >= 0)
-        result[exact] = start[exact] * unit + np.rint(rest[exact] * unit).astype(np.int64)
-    return result

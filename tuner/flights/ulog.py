@@ -107,7 +107,7 @@ class ULogRecording:
         stamp = receive
         for clock in clocks:
             if clock.field in data:
-                sampled = data[clock.field].astype(np.int64) * NANOSECONDS[clock.unit]
+                sampled = data[clock.field].astype(np.int64) * clock.nanoseconds
                 stamp = np.where(sampled > 0, sampled, receive)
                 break
         missing = [name for name in request.fields if name not in data]

@@ -36,6 +36,8 @@ REACH = 3
 """Bins on either side of a time over which the acceleration there is a mean."""
 LOOKED_AT = 300.0
 """s to either side of the middle stamp that are looked at; those far off are wrong."""
+SLOW = 0.03
+"""s from sample to sample, above which times may be a thousand times too long."""
 UPRIGHT = 0.3
 """Cosine of the tilt below which thrust carries little of the weight."""
 
@@ -101,6 +103,32 @@ def scales_of(recorded: Mapping[str, Stamped]) -> dict[str, Scale]:
     if len(scales) > 1 and _share_a_unit(recorded["position"], recorded["velocity"]):
         return dict.fromkeys(scales, _best_known(scales.values()))
     return scales
+
+
+def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
+    """Return whether times are a thousand times too long: lengths make sense only if they are.
+
+    A table's unit of time is told by its step, which slow microseconds share with quick
+    milliseconds.
+    """
+    if not {"position", "attitude"} <= set(recorded):
+        return False
+    step = np.diff(np.sort(recorded["position"].time))
+    if not len(step) or np.median(step) < SLOW:
+        return False
+    quick = {
+        name: Stamped(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
+    }
+    slowly, quickly = (
+        scale_of(signals["position"], signals["attitude"]) for signals in (recorded, quick)
+    )
+    return quickly.sure and _is_known(quickly) and not (slowly.sure and _is_known(slowly))
+
+
+def _is_known(scale: Scale) -> bool:
+    """Return whether lengths are in metres or in a unit of `NAMED`."""
+    low, high = BELIEVED
+    return any(low < scale.per_metre * UNITS[unit][0] < high for unit in ("si", *NAMED))
 
 
 def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:

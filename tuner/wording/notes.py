@@ -59,6 +59,9 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.NO_TACHOMETER: "rotors {all} have no tachometer",
     NoteCode.FRAME_TURNED: "{first} is {second}, which the topic map does not say: turned",
     NoteCode.UNIT_READ: "{first} is {second}, which the topic map does not say: read so",
+    NoteCode.TIME_READ: (
+        "times are a thousandth of what their step seemed to say, by gravity: read so"
+    ),
     NoteCode.UNIT_DOUBTED: (
         "{first} accelerates {times:.3g} times as fast as the attitude's tilt says under gravity: "
         "check its unit"

@@ -17,7 +17,7 @@ MODULE = '''
 import numpy as np
 
 from tuner.flights.formats import Reader
-from tuner.flights.recording import NANOSECONDS, ROWS, Contents, Samples, TabularRecording
+from tuner.flights.recording import ROWS, Contents, Samples, TabularRecording
 
 
 class StructuredArray(TabularRecording):
@@ -28,7 +28,7 @@ class StructuredArray(TabularRecording):
     def read(self, wanted):
         request = wanted[ROWS]
         clock = self.clock(request)
-        time = (self._rows[clock.field] * NANOSECONDS[clock.unit]).astype(np.int64)
+        time = (self._rows[clock.field] * clock.nanoseconds).astype(np.int64)
         fields = {name: self._rows[name].astype(float) for name in request.fields}
         return Contents({ROWS: Samples(time, time, fields)})
 

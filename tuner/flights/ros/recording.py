@@ -14,7 +14,6 @@ from tuner.errors import RecordingError
 from tuner.flights import px4
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.recording import (
-    NANOSECONDS,
     Clock,
     Contents,
     Nanoseconds,
@@ -150,7 +149,7 @@ def _samples(
     kept = {name: values[whole] for name, values in columns.items()}
     stamp = None
     if clock is not None:
-        stamp = kept.pop(clock.field).astype(np.int64) * NANOSECONDS[clock.unit]
+        stamp = kept.pop(clock.field).astype(np.int64) * clock.nanoseconds
     elif _SECONDS in kept:
         seconds = kept.pop(_SECONDS).astype(np.int64)
         stamp = seconds * 1_000_000_000 + kept.pop(_NANOSECONDS).astype(np.int64)

@@ -1,0 +1,90 @@
+"""One simulated flight of 14 s, and the many ways in which people write it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from tuner.config import ControllerFile, TrajectorySettings, read_vehicle
+from tuner.simulation.simulate import simulate
+
+RATE = 100.0
+XYZ = ("x", "y", "z")
+
+
+@cache
+def flown() -> Mapping[str, np.ndarray]:
+    """Return a lemniscate of some metres per second at 100 Hz, by the columns of `table`."""
+    vehicle = read_vehicle(Path(__file__).parents[3] / "configs/vehicles/hovergames_updated.yaml")
+    shape = TrajectorySettings(name="lemniscate", radius=2.0, omega=0.7, speed_scale=2.1)
+    (flight,) = simulate(vehicle, ControllerFile(), shape, duration=14.0, rate=RATE)
+    signals = flight.signals
+    columns = {"time": flight.time}
+    for name, prefix in (
+        ("position", ""), ("velocity", "v"), ("body_rate", "w"), ("acceleration", "a"),
+    ):  # fmt: skip
+        columns |= {f"{prefix}{axis}": signals[name][:, i] for i, axis in enumerate(XYZ)}
+    columns |= {f"q{axis}": signals["attitude"][:, i] for i, axis in enumerate(("w", *XYZ))}
+    for name in ("rotor_speed", "command"):
+        columns |= {f"{name}_{i + 1}": signals[name][:, i] for i in range(4)}
+    return columns
+
+
+def text(
+    columns: Mapping[str, np.ndarray | list[str]],
+    *,
+    separator: str = ",",
+    header: str | None = None,
+    digits: int = 9,
+) -> str:
+    """Return columns as lines of text; those of text as they are."""
+    cells = [
+        [f"{value:.{digits}f}" for value in column] if isinstance(column, np.ndarray) else column
+        for column in columns.values()
+    ]
+    rows = [separator.join(row) for row in zip(*cells, strict=True)]
+    return "\n".join([header or separator.join(columns), *rows]) + "\n"
+
+
+def with_time(change: object, **columns: np.ndarray) -> str:
+    """Return the flight as CSV with its times written by a function of (n,) ns since its start."""
+    table = dict(flown()) | columns
+    table["time"] = change(np.rint(table["time"] * 1e9).astype(np.int64))  # type: ignore[operator]
+    return text(table)
+
+
+EPOCH = 1_775_139_180_000_000_000
+"""ns since 1970: 2026-04-02 14:13:00 UTC."""
+
+
+def stamps(form: str) -> object:
+    """Return a function that writes ns as dates, by a form of `datetime` with `%f` for ns."""
+
+    def write(nanoseconds: np.ndarray) -> list[str]:
+        times = (nanoseconds + EPOCH).astype("datetime64[ns]")
+        days, clock = zip(*(str(time).split("T") for time in times), strict=True)
+        return [form.format(date=d, time=c[:12]) for d, c in zip(days, clock, strict=True)]
+
+    return write
+
+
+TIMES = {
+    "seconds": lambda t: t * 1e-9,
+    "milliseconds": lambda t: t * 1e-6,
+    "microseconds": lambda t: [str(v // 1000) for v in t],
+    "nanoseconds": lambda t: [str(v) for v in t],
+    "seconds since 1970": lambda t: [f"{(v + EPOCH) // 10**9}.{v % 10**9:09d}" for v in t],
+    "milliseconds since 1970": lambda t: [str((v + EPOCH) // 10**6) for v in t],
+    "microseconds since 1970": lambda t: [str((v + EPOCH) // 10**3) for v in t],
+    "nanoseconds since 1970": lambda t: [str(v + EPOCH) for v in t],
+    "2026-04-02T14:13:00.123Z": stamps("{date}T{time}Z"),
+    "2026-04-02 14:13:00.123": stamps("{date} {time}"),
+    "2026/04/02 14:13:00,123": lambda t: [
+        '"' + s.replace("-", "/").replace(".", ",") + '"' for s in stamps("{date} {time}")(t)
+    ],
+    "14:13:00.123": stamps("{time}"),
+}
+"""How times are written: (n,) ns since the flight's start -> a column."""
