@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from benchmarks.simulated_recordings import recorded
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.information import information_at
-from tuner.uncertainty.inverse import Inverse
+from tuner.numerics import Inverse
 
 Array = NDArray[np.float64]
 

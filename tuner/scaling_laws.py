@@ -10,8 +10,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-GRAVITY = 9.81
-"""m/s²."""
+from tuner.numerics import GRAVITY
+
 AIR = 1.225
 """kg/m³."""
 INCH = 0.0254

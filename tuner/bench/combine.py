@@ -10,6 +10,7 @@ from scipy.special import chdtrc  # scipy.stats takes a second to import
 
 from tuner.bench.measurement import Array, Measurement
 from tuner.coefficients import COEFFICIENTS
+from tuner.numerics import scaled_inverse, scaled_solve, symmetric_eigen
 
 CONFLICT = 3.0
 """Standard errors apart beyond which two measurements of one number contradict each other."""
@@ -120,7 +121,7 @@ def _inverse(information: Array, names: Sequence[str]) -> tuple[Array, Array]:
     The directions are those of coordinates in units of the default priors' standard deviations.
     """
     unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
-    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    values, vectors = symmetric_eigen(information * np.outer(unit, unit))
     measured = values > UNKNOWN * values.max(initial=1e-300)
     inverse = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
     return inverse * np.outer(unit, unit), vectors[:, ~measured]
@@ -136,7 +137,7 @@ def _normal_equations(
     information, pull = np.zeros((len(names), len(names))), np.zeros(len(names))
     for measurement in measurements:
         design = _design(measurement, names)
-        weight = np.linalg.inv(measurement.covariance)
+        weight = scaled_inverse(measurement.covariance)
         information += design.T @ weight @ design
         pull += design.T @ weight @ (measurement.value - design @ start)
     return information, pull
@@ -144,7 +145,7 @@ def _normal_equations(
 
 def _chi_square(measurement: Measurement, names: Sequence[str], scaled: Array) -> float:
     residual = measurement.value - _design(measurement, names) @ scaled
-    return float(residual @ np.linalg.solve(measurement.covariance, residual))
+    return float(residual @ scaled_solve(measurement.covariance, residual))
 
 
 def _conflicts(

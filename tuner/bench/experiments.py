@@ -14,7 +14,6 @@ from tuner.bench.bifilar import bifilar
 from tuner.bench.columns import open_table, read_columns
 from tuner.bench.flown import angle_of_attitude, attitude_of, is_table, steady_flight
 from tuner.bench.hovers import hover_weights, yaw_spin
-from tuner.bench.laws import GRAVITY
 from tuner.bench.measurement import Array, Measurement
 from tuner.bench.plan import (
     FASTEST_SPIN,
@@ -35,6 +34,7 @@ from tuner.bench.stands import thrust_stand, torque_stand
 from tuner.bench.step_response import step_response
 from tuner.config import VehicleFile
 from tuner.errors import ConfigError, RecordingError
+from tuner.numerics import GRAVITY
 
 ATTITUDE = ("qw", "qx", "qy", "qz")
 GYRATION = (0.05, 3.0)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuner.bench.laws import GRAVITY, fast_pair_speed, hover_motor_constant, spin_drag_over_torque
+from tuner.bench.laws import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
 from tuner.bench.measurement import Curve, Measurement, Remark
 from tuner.errors import ConfigError
+from tuner.numerics import GRAVITY
 
 
 def hover_weights(

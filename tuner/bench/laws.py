@@ -11,8 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-GRAVITY = 9.81
-"""m/s²."""
+from tuner.numerics import GRAVITY
 
 
 def bifilar_inertia(

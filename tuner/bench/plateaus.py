@@ -10,6 +10,7 @@ from scipy import stats
 from scipy.ndimage import median_filter
 
 from tuner.bench.measurement import Array
+from tuner.numerics import Z95, robust_sd
 
 OUTLIER = 3.0
 """Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
@@ -17,10 +18,6 @@ MIDDLE = (0.3, 0.95)
 """Share of a step, from and to, that is its middle: transients over, the next not begun."""
 FEWEST = 8
 """Samples without which a step has no mean."""
-ROBUST = 1.4826
-"""Standard deviations of a normal distribution in a median absolute deviation."""
-NORMAL = 1.959964
-"""Standard deviations of a normal distribution that a 95 % interval reaches to either side."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +86,7 @@ def without_outliers(values: Array) -> NDArray[np.bool_]:
     """Return (n,) which values lie within `OUTLIER` robust standard deviations of their median."""
     finite = np.isfinite(values)
     middle = np.median(values[finite])
-    spread = max(ROBUST * float(np.median(np.abs(values[finite] - middle))), 1e-12 * abs(middle))
+    spread = max(float(robust_sd(values[finite] - middle)), 1e-12 * abs(middle))
     return np.asarray(finite & (np.abs(values - middle) <= OUTLIER * spread))
 
 
@@ -110,4 +107,4 @@ def mean_and_error(values: Array) -> tuple[float, float]:
 
 def student(freedom: int) -> float:
     """Return by what factor few degrees of freedom widen an interval (Student's t)."""
-    return float(stats.t.ppf(0.975, max(freedom, 1))) / NORMAL
+    return float(stats.t.ppf(0.975, max(freedom, 1))) / Z95

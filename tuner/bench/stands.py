@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
 from tuner.bench.plateaus import levels_of, mean_and_error, student, without_outliers
 from tuner.errors import RecordingError
+from tuner.numerics import scaled_inverse
 
 SHORTEST = 1.0
 """s below which a level of the rotor speed is a transient."""
@@ -161,8 +162,7 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     variance = np.maximum(variance, 0.25 * np.median(variance))
     weight = 1.0 / np.maximum(variance, 1e-30)
     normal = design.T @ (design * weight[:, None])
-    unit = 1.0 / np.sqrt(np.diag(normal))
-    inverse = np.linalg.inv(normal * np.outer(unit, unit)) * np.outer(unit, unit)
+    inverse = scaled_inverse(normal)
     solution = inverse @ (design.T @ (weight * measured))
     freedom = len(levels) - design.shape[1]
     residual = measured - design @ solution

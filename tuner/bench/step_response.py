@@ -12,8 +12,9 @@ from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
 
 from tuner.bench.measurement import Array, Curve, Measurement, Remark
-from tuner.bench.plateaus import OUTLIER, ROBUST, student
+from tuner.bench.plateaus import OUTLIER, student
 from tuner.errors import RecordingError
+from tuner.numerics import robust_sd
 
 STEP = 0.02
 """Change of the command between two samples that counts as a step."""
@@ -68,7 +69,7 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     kept = _near_neighbours(speed)
     first = _fit(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
     residual = steps.simulated(first, speed, kept) - speed
-    spread = ROBUST * float(np.median(np.abs(residual[kept])))
+    spread = float(robust_sd(residual[kept]))
     kept &= np.abs(residual) <= 2 * OUTLIER * spread
     lags = _fit(steps, speed, kept, first, second=False)
     up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
@@ -173,7 +174,7 @@ def _decay(time: Array, constant: float, lag: float) -> Array:
 def _near_neighbours(speed: Array) -> NDArray[np.bool_]:
     """Return (n,) which samples are no spikes of the tachometer."""
     difference = np.abs(speed - median_filter(speed, size=5, mode="nearest"))
-    spread = max(ROBUST * float(np.median(difference)), 1e-9)
+    spread = max(float(robust_sd(difference)), 1e-9)
     return np.asarray(difference <= 6 * OUTLIER * spread)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients.registry import COEFFICIENTS
 from tuner.errors import ConfigError
+from tuner.numerics import symmetric_eigen, unit_diagonal
 
 if TYPE_CHECKING:
     from tuner.coefficients.space import Parameter
@@ -68,8 +69,8 @@ class JointPrior:
                 value = fixed.get(name, COEFFICIENTS[name].neutral or 0.0)
                 known = not log or value > 0
                 offset[place] += (math.log(value) if log else value) if known else self.mean[place]
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))
-        values, vectors = np.linalg.eigh(self.information * np.outer(unit, unit))
+        unit = unit_diagonal(self.information)
+        values, vectors = symmetric_eigen(self.information * np.outer(unit, unit))
         values = np.where(values > UNKNOWN * values.max(), values, 0.0)
         root = np.sqrt(values)[:, None] * vectors.T / unit
         return root @ design, root @ offset

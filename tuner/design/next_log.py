@@ -18,6 +18,7 @@ from sim_jax.numeric import GRAVITY
 from tuner.config import VehicleFile
 from tuner.config.job import InletName
 from tuner.design.log_proposal import LogProposal
+from tuner.numerics import errors_of
 from tuner.objective.criterion import Criterion
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
@@ -95,12 +96,6 @@ def hover_speed(vehicle: VehicleFile) -> float:
     """Return the rotor speed in rad/s at which a vehicle hovers."""
     thrust = vehicle.aerodynamics.motor_constant * len(vehicle.rotors)
     return float(np.sqrt(vehicle.mass * GRAVITY / thrust))
-
-
-def errors_of(information: Array) -> Array:
-    """Return the standard errors (K,) that an information (K, K) leaves."""
-    unit = 1.0 / np.sqrt(np.diag(information))
-    return np.asarray(unit * np.sqrt(np.diag(np.linalg.inv(information * np.outer(unit, unit)))))
 
 
 def beyond_noise(criterion: Criterion) -> float:

@@ -20,6 +20,7 @@ from tuner.design.candidate_problem import candidate_point, candidate_problem
 from tuner.design.candidates import Arena, Candidate, candidates
 from tuner.design.next_flight_json import Proposal, Proposals
 from tuner.examination.examination import Examination
+from tuner.numerics import log_determinant, scaled_inverse, unit_diagonal
 from tuner.objective.criterion import Criterion
 from tuner.objective.normal import Objective
 from tuner.uncertainty.covariance import WIDE
@@ -142,27 +143,18 @@ def _ratio(now: Array, gain: Array, place: int, count: int) -> float:
     places = [*range(count), *([place] if place >= count else [])]
     square = np.ix_(places, places)
     row = places.index(place)
-    before, after = (_inverse(matrix[square])[row, row] for matrix in (now, now + gain))
+    before, after = (scaled_inverse(matrix[square])[row, row] for matrix in (now, now + gain))
     return float(np.sqrt(after / before))
 
 
 def _volume(now: Array, gain: Array, count: int) -> float:
     """Return the factor on the geometric mean of the half axes of the fitted ones' ellipsoid."""
+    unit = unit_diagonal(now[:count, :count])
     before, after = (
-        np.linalg.slogdet(_scaled(matrix[:count, :count], now[:count, :count]))[1]
+        log_determinant(matrix[:count, :count] * np.outer(unit, unit))
         for matrix in (now, now + gain)
     )
     return float(np.exp(-0.5 * (after - before) / count))
-
-
-def _scaled(matrix: Array, by: Array) -> Array:
-    unit = 1.0 / np.sqrt(np.diag(by))
-    return np.asarray(matrix * np.outer(unit, unit))
-
-
-def _inverse(matrix: Array) -> Array:
-    unit = 1.0 / np.sqrt(np.diag(matrix))
-    return np.asarray(np.linalg.inv(_scaled(matrix, matrix)) * np.outer(unit, unit))
 
 
 def _inside(

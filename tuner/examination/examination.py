@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tuner.filter_error.information import with_hidden, with_strengths
 from tuner.filter_error.predictor import Predictor
+from tuner.numerics import scaled_solve
 from tuner.objective.alternatives import residuals_at
 from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
@@ -164,5 +165,5 @@ def _bias(full_problem: FullProblem, information: FisherInformation, reference: 
     """Return how the fitted coefficients follow the fixed ones, relative to both references."""
     count = len(full_problem.fitted)
     total, data = information.total[:count, :count], information.data[:count, count:]
-    follow = -np.linalg.solve(total, data).T
+    follow = -scaled_solve(total, data).T
     return np.asarray(follow * reference[count:, None] / reference[:count])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.filter_error.disturbances import LEAST, MOST, STRENGTHS
+from tuner.numerics import scaled_solve
 from tuner.objective.inlets import INLETS
 from tuner.uncertainty.information import FisherInformation
 
@@ -47,7 +48,7 @@ def with_hidden(
     others = np.flatnonzero(~upstream[:fitted])
     upper = looped.total[np.ix_(others, np.flatnonzero(upstream))]
     clear = np.eye(len(names))
-    clear[np.ix_(np.flatnonzero(upstream), others)] = -np.linalg.solve(
+    clear[np.ix_(np.flatnonzero(upstream), others)] = -scaled_solve(
         looped.total[np.ix_(others, others)], upper
     ).T
     blocks = clear @ looped.blocks @ clear.T
@@ -85,4 +86,4 @@ def with_strengths(
     changes = dict(information.changes)
     across = np.array([changes.pop(name).sum(axis=0) for name in STRENGTHS])[learnt]
     own = of_strengths[np.ix_(learnt, learnt)] + np.eye(len(learnt)) / USUALLY**2
-    return replace(information, lost=across.T @ np.linalg.solve(own, across), changes=changes)
+    return replace(information, lost=across.T @ scaled_solve(own, across), changes=changes)

@@ -26,6 +26,7 @@ from tuner.filter_error.recorded import (
 )
 from tuner.filter_error.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.flights.flight import Flight
+from tuner.numerics import robust_sd
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
@@ -167,7 +168,7 @@ class Predictor:
         for name, white in self._sizes():
             if name == "command":
                 continue  # how noisy it is is learnt
-            spread = noise[name] * 1.4826 * float(np.median(white)) if len(white) else 1.0
+            spread = noise[name] * float(robust_sd(white)) if len(white) else 1.0
             noise[name] = spread if spread > NOISIER else 1.0
         return self if noise == self.noise else replace(self, noise=noise).at(objective, point)
 

@@ -25,6 +25,7 @@ from tuner.filter_error.disturbances import LEAST, MOST, within
 from tuner.filter_error.predictor import Predictor, unscaled
 from tuner.filter_error.recorded import gathered
 from tuner.flights.flight import Flight
+from tuner.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.loss import gauss_newton, robust_loss
 from tuner.objective.normal import Objective
@@ -177,10 +178,8 @@ def _step(space: Space, point: Point, gradient: Array, hessian: Array, free: Mas
     free = free.copy()
     while True:
         moves = np.flatnonzero(free)
-        unit = 1.0 / np.sqrt(np.diag(hessian)[moves])
-        scaled = hessian[np.ix_(moves, moves)] * np.outer(unit, unit)
         change = np.zeros(len(gradient))
-        change[moves] = -unit * np.linalg.solve(scaled, unit * gradient[moves])
+        change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], gradient[moves])
         share = _share_after(space, point, change)
         leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
         if not len(leaves):

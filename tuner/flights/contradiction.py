@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 from tuner.flights.flight import Series
-from tuner.flights.frames import GRAVITY
 from tuner.flights.mission import Mission
 from tuner.flights.motion import (
     alike,
@@ -24,6 +23,7 @@ from tuner.flights.motion import (
 )
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.yardstick import Stamped, pull_and_tilt
+from tuner.numerics import GRAVITY
 
 AGAINST = -0.5
 """Correlation below which two signals that should be alike are opposites."""

@@ -20,8 +20,8 @@ from tuner.flights.motion import (
 )
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.units import to_enu_flu
+from tuner.numerics import GRAVITY
 
-GRAVITY = 9.81
 #: Notes of what fits no reading.
 DOUBTS = (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED, NoteCode.VELOCITY_DOUBTED)
 #: Motion below these, in m/s^2, rad/s and m/s, contradicts nothing.

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from tuner.flights.flight import SIGNALS, Array, InitialState, Series
+from tuner.numerics import robust_sd
 
 #: Seconds before the mission in which a steady hover is looked for.
 HOVER = 1.0
@@ -92,7 +93,7 @@ def _estimate(series: Series, column: int, hover: bool, line: bool, derivative: 
         return float("nan") if derivative else _nearest(series, column)
     if hover:
         middle = np.median(values)
-        spread = 1.4826 * np.median(np.abs(values - middle)) + 1e-12
+        spread = robust_sd(values - middle) + 1e-12
         kept = np.abs(values - middle) < 5 * spread
         time, values = time[kept], values[kept]
         if not line or len(time) < 5:

@@ -20,10 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.flights.flight import Array
-from tuner.flights.frames import ATTITUDE_READINGS, GRAVITY
+from tuner.flights.frames import ATTITUDE_READINGS
 from tuner.flights.motion import rotate
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.units import UNITS
+from tuner.numerics import GRAVITY
 
 LENGTHS = {"position": False, "velocity": True}
 """Signals of lengths that may come in another unit than metres; whether they are speeds."""

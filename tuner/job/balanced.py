@@ -24,6 +24,7 @@ from sim_jax.markers import markers_of
 from tuner.examination.examination import Examination, examine
 from tuner.findings import Code, Finding, Level
 from tuner.job.prepare import Job
+from tuner.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
 from tuner.objective.criterion import Point, SegmentSums
@@ -81,7 +82,7 @@ class _Settling:
             moves = (columns[:, :, inside] != 0.0).any(axis=(0, 1, 2)) & ~held
             gradient, hessian = self._normal_equations(vector, residuals, columns, inside)
             free = np.flatnonzero(moves)
-            step = np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
+            step = scaled_solve(hessian[np.ix_(free, free)], gradient[free])
             vector[free] -= np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             if np.abs(step).max(initial=0.0) < SETTLED:
                 break
@@ -101,10 +102,10 @@ class _Settling:
         shared = _shared_part(residuals[:, :, inside])[:, None, None]
         error = residuals - shared * residuals.mean(axis=1, keepdims=True)
         slopes = columns - shared[..., None] * columns.mean(axis=1, keepdims=True)
-        spread = _spread(error[:, :, inside], axis=(1, 2))[:, None, None]
+        spread = robust_sd(error[:, :, inside], axis=(1, 2))[:, None, None]
         error = np.where(inside, error, 0.0) / spread
         slopes = np.where(inside[:, None], slopes, 0.0) / spread[..., None]
-        robust = np.minimum(1.0, ROBUST / np.maximum(np.abs(error), 1e-300))
+        robust = huber_weights(error, ROBUST)
         kinds, windows = np.asarray(point.offsets).shape[0], error.shape[-1]
         size = columns.shape[-1] + kinds
         gradient, hessian = np.zeros((size, windows)), np.zeros((size, size, windows))
@@ -144,15 +145,10 @@ def _shared_part(residuals: Vector) -> Vector:
     """
     stretches = residuals.shape[1]
     mean = residuals.mean(axis=1)
-    within = _spread(residuals - mean[:, None], axis=(1, 2)) ** 2
+    within = robust_sd(residuals - mean[:, None], axis=(1, 2)) ** 2
     within = within * stretches / max(stretches - 1, 1)
-    between = np.maximum(_spread(mean, axis=(1,)) ** 2, within / stretches)
+    between = np.maximum(robust_sd(mean, axis=(1,)) ** 2, within / stretches)
     return np.asarray(1.0 - np.sqrt(within / stretches / between))
-
-
-def _spread(values: Vector, axis: tuple[int, ...]) -> Vector:
-    """Return a robust standard deviation about zero."""
-    return np.asarray(1.4826 * np.median(np.abs(values), axis=axis))
 
 
 def with_inputs_balanced(

@@ -30,6 +30,7 @@ from tuner.disk import make_folder
 from tuner.errors import ConfigError
 from tuner.findings import Code, Finding
 from tuner.job.folder import folder_for
+from tuner.numerics import Z95
 from tuner.report import render
 from tuner.result import (
     BEST_FIT_FILE,
@@ -42,7 +43,6 @@ from tuner.result import (
 from tuner.uncertainty.verdict import (
     IDENTIFIABLE_ERROR,
     NOT_FITTED,
-    QUANTILE,
     WELL_KNOWN,
     Reason,
     ReasonCode,
@@ -264,7 +264,7 @@ def _coefficients(
         known = bool(combination.determined[place])
         scaled = float(combination.scaled[place])
         deviation = float(np.sqrt(combination.covariance[place, place]))
-        ends = (scaled - QUANTILE * deviation, scaled + QUANTILE * deviation)
+        ends = (scaled - Z95 * deviation, scaled + Z95 * deviation)
         coefficients[name] = CoefficientResult(
             unit=unit,
             initial=before,
@@ -304,13 +304,13 @@ def _judged(
     row, scaled = COEFFICIENTS[name], float(combination.scaled[place])
     deviation = float(np.sqrt(combination.covariance[place, place]))
     relative = deviation if row.scale == "log" else deviation / max(abs(scaled), least)
-    half_width = QUANTILE * deviation
+    half_width = Z95 * deviation
     unit = None if row.scale == "log" else row.unit
     if relative > IDENTIFIABLE_ERROR:
         code = ReasonCode.MEASURED_ROUGHLY
         return Verdict.NOT_IDENTIFIABLE, Reason(code=code, half_width=half_width, unit=unit)
     best = max(measurements, key=lambda m: _weight(name, m, combination)).experiment
-    well = QUANTILE * relative < WELL_KNOWN
+    well = Z95 * relative < WELL_KNOWN
     reason = Reason(code=ReasonCode.INTERVAL, half_width=half_width, unit=unit, channel=best)
     return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, reason
 

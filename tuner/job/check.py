@@ -16,6 +16,7 @@ from tuner.config import VehicleFile
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Array, Flight
 from tuner.job.prepare import Job
+from tuner.numerics import symmetric_eigen, unit_diagonal
 from tuner.objective.explained import Source, squared_speed
 from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.motor_order import order_findings
@@ -265,10 +266,9 @@ def check_information(job: Job) -> Iterator[Finding]:
 
 def singular_directions(information: NDArray[np.float64]) -> list[NDArray[np.float64]]:
     """Return the directions (K,) in scaled coordinates about which the data say nothing."""
-    size = np.sqrt(np.diag(information))
-    normalised = information / np.outer(size, size)
-    values, vectors = np.linalg.eigh(normalised)
-    return [vectors[:, i] / size for i in range(len(values)) if values[i] < SINGULAR * values[-1]]
+    unit = unit_diagonal(information)
+    values, vectors = symmetric_eigen(information * np.outer(unit, unit))
+    return [vectors[:, i] * unit for i in range(len(values)) if values[i] < SINGULAR * values[-1]]
 
 
 def _members(direction: NDArray[np.float64]) -> Sequence[int]:

@@ -13,13 +13,13 @@ from tuner.config import VehicleFile
 from tuner.design.log_proposal import LogProposal
 from tuner.design.next_log import (
     beyond_noise,
-    errors_of,
     share_at_twice_the_rate,
     signals_to_add,
 )
 from tuner.errors import InputError
 from tuner.flights.flight import Series
 from tuner.job.prepare import Job, job_of
+from tuner.numerics import errors_of
 from tuner.objective.inlets import INLETS, STEADY_TORQUE, TURNING
 from tuner.objective.normal import Objective
 from tuner.recordings import Recording

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tuner.config import CHANNELS
 from tuner.flights.flight import Flight, Series
+from tuner.numerics import robust_sd
 
 #: Smallest believable standard deviation, in the channel's unit (attitude: rad).
 FLOOR = {
@@ -43,7 +44,7 @@ def white_noise(series: Series) -> NDArray[np.float64]:
         time, values = series.time[measured], series.values[measured, column]
         if len(values) > 8:
             error = _third_difference(time, values)
-            spread[column] = 1.4826 * np.median(np.abs(error))
+            spread[column] = robust_sd(error)
     return spread
 
 

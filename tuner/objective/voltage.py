@@ -21,6 +21,7 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 
 from tuner.flights.flight import Array as Numbers
 from tuner.flights.flight import Flight, Series
+from tuner.numerics import robust_sd
 
 VOLTAGE = "battery_voltage"
 OFTEN = 20.0
@@ -165,7 +166,7 @@ def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -
         there = np.interp(reading.time, load.time, load.values[:, 0])
         both = np.stack([reading.values[:, 0], there], axis=1)
         left = both - trend @ np.linalg.lstsq(trend, both, rcond=None)[0]
-        spread = 1.4826 * np.median(np.abs(left[:, 1]))
+        spread = float(robust_sd(left[:, 1]))
         calm = spikes_count | (np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12))
         falls.append(-left[calm, 0])
         varied.append(left[calm, 1])

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import scaled_inverse, scaled_solve
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
@@ -56,7 +57,7 @@ def clocks_that_differ(
         )
     )
     moves = np.flatnonzero(np.concatenate([free.coefficients, free.offsets.ravel()]))
-    inverse = _inverse(hessian[np.ix_(moves, moves)])
+    inverse = scaled_inverse(hessian[np.ix_(moves, moves)], RIDGE)
     late = np.concatenate([np.zeros(len(objective.space)), np.ravel(points.offsets[best])])[moves]
     late = late - inverse @ gradient[moves]
     first, clocks = len(objective.space), len(CLOCKS) * objective.flights
@@ -73,12 +74,6 @@ def clocks_that_differ(
     return stay.reshape(free.offsets.shape)
 
 
-def _inverse(hessian: NDArray[np.float64]) -> NDArray[np.float64]:
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    scaled = hessian * np.outer(unit, unit) + RIDGE * np.eye(len(hessian))
-    return np.asarray(np.linalg.inv(scaled) * np.outer(unit, unit))
-
-
 def _rise(inverse: NDArray[np.float64], late: NDArray[np.float64], clocks: list[int]) -> float:
     square = inverse[np.ix_(clocks, clocks)]
-    return float(0.5 * late[clocks] @ np.linalg.solve(square, late[clocks]))
+    return float(0.5 * late[clocks] @ scaled_solve(square, late[clocks]))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tuner.numerics import scaled_solve, symmetric_eigen
 from tuner.selection.linear import RIDGE, Array, Columns, Linear
 from tuner.uncertainty.covariance import scatter
 from tuner.uncertainty.overdispersion import allowed_for
@@ -83,14 +84,13 @@ class Evidence:
     def of(linear: Linear, square: Array, alone: Array, model: Columns, group: Columns) -> Evidence:
         """Return the evidence beside a model whose minimum is at ``alone`` (P,)."""
         usual = linear.prior_sd[group]
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(square)[model], 1e-300))
-        own = square[np.ix_(model, model)] * np.outer(unit, unit) + RIDGE * np.eye(len(model))
-        follow = -unit[:, None] * np.linalg.solve(own, unit[:, None] * square[np.ix_(model, group)])
+        own, across = square[np.ix_(model, model)], square[np.ix_(model, group)]
+        follow = -scaled_solve(own, across, RIDGE)
         left = square[np.ix_(group, group)] + square[np.ix_(group, model)] @ follow
         pull = linear.pull + linear.prior @ alone
         slope = (linear.slopes(alone).sum(axis=0) + pull)[group] * usual
         known = left * np.outer(usual, usual) - np.eye(len(group))  # by the flights alone
-        values, axes = np.linalg.eigh(0.5 * (known + known.T))
+        values, axes = symmetric_eigen(known)
         values = np.maximum(values, FLAT * max(values[-1], 1.0))
         slope, moves = axes.T @ slope, follow * usual @ axes
         both = np.concatenate([model, group])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import REGISTRY
 from tuner.coefficients.space import Parameter, Space
+from tuner.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
@@ -152,9 +153,7 @@ class Linear:
         score = self._spread(self.score)[inside].sum(axis=0)
         slope = score + self.pull + hessian @ change
         square = hessian[np.ix_(free, free)]
-        unit = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
-        scaled = square * np.outer(unit, unit) + RIDGE * np.eye(len(free))
-        change[free] -= unit * np.linalg.solve(scaled, unit * slope[free])
+        change[free] -= scaled_solve(square, slope[free], RIDGE)
         return change
 
     def change_of_loss(self, change: Array) -> Array:

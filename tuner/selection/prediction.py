@@ -15,6 +15,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.coefficients.space import Space
+from tuner.numerics import scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.search.fitted import Fitted
@@ -93,4 +94,4 @@ def _gain_of_offsets(
     gradient = np.asarray(sums.gradient)[free][:, inside].sum(axis=-1)
     hessian = np.asarray(sums.hessian)[np.ix_(free, free)][..., inside].sum(axis=-1)
     hessian = hessian + np.eye(len(free)) / OFFSET_SD**2
-    return float(0.5 * gradient @ np.linalg.solve(hessian, gradient))
+    return float(0.5 * gradient @ scaled_solve(hessian, gradient))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
+from tuner.numerics import scaled_inverse, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.selection.linear import RIDGE, Columns, Linear
 from tuner.selection.steady import chance_of_gusts
 from tuner.selection.table import SelectionCode
@@ -320,12 +321,11 @@ def _is_determined(linear: Linear, model: Columns, group: Columns) -> bool:
     information = linear.information()
     if not np.all(np.diag(information)[group] > 0.0):
         return False
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    unit = unit_diagonal(information)
     information = information * np.outer(unit, unit)
     own, across = information[np.ix_(group, group)], information[np.ix_(group, model)]
-    of_model = information[np.ix_(model, model)] + 1e-13 * np.eye(len(model))
-    left = own - across @ np.linalg.solve(of_model, across.T)
-    return bool(np.linalg.eigvalsh(left)[0] > DETERMINED)
+    left = own - across @ scaled_solve(information[np.ix_(model, model)], across.T, 1e-13)
+    return bool(symmetric_eigen(left)[0][0] > DETERMINED)
 
 
 def _chance(
@@ -354,7 +354,7 @@ def _chance(
         do that scatter most, which may be one manoeuvre's.
     """
     total = linear.information() + linear.prior
-    follow = np.linalg.solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
+    follow = scaled_solve(total[np.ix_(model, model)], total[np.ix_(model, group)])
     without, with_group = (
         (at := linear.slopes(change))[:, group] - at[:, model] @ follow for change in minima
     )
@@ -366,7 +366,7 @@ def _chance(
     sum_of_scores = (without - with_group).sum(axis=0)
     spread = long_run(with_group * unit, linear.flight) * count / (count - 1.0)
     along = sum_of_scores * unit
-    hotelling = max(float(along @ np.linalg.solve(spread + RIDGE * np.eye(size), along)), 0.0)
+    hotelling = max(float(along @ scaled_solve(spread + RIDGE * np.eye(size), along)), 0.0)
     return float(fdtrc(size, count - size, hotelling * (count - size) / (size * (count - 1.0))))
 
 
@@ -376,7 +376,7 @@ def _effective_count(scores: NDArray[np.float64]) -> float:
     Where a few scatter most, as those of one manoeuvre, few are all that its estimate rests on.
     """
     square = scores.T @ scores + RIDGE * np.eye(scores.shape[1])
-    shares = np.einsum("sp,sp->s", scores @ np.linalg.inv(square), scores)
+    shares = np.einsum("sp,sp->s", scores @ scaled_inverse(square), scores)
     return float(shares.sum() ** 2 / max((shares**2).sum(), 1e-300))
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import Inverse, scaled_root, symmetric_eigen
 from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
-from tuner.uncertainty.inverse import Inverse
 from tuner.uncertainty.stretches import Stretches, stretches_of
 
 Array = NDArray[np.float64]
@@ -20,6 +20,8 @@ FULL_LEVERAGE = 0.5
 """Leverage of a stretch of time on the fit up to which its score is corrected in full."""
 MAX_LEVERAGE = 0.999
 """Leverage beyond which it is corrected no further."""
+RIDGE = 1e-13
+"""Of the scaled information: below rounding errors of what flights and priors add up to."""
 
 
 @dataclass(frozen=True)
@@ -118,12 +120,11 @@ def scatter(stretches: Stretches, total: Array) -> tuple[Array, Array]:
     the stretches' information, less what the fit takes out, those would be quadratic forms whose
     first two moments are those of a χ² with so many.
     """
-    unit = 1.0 / np.sqrt(np.diag(total))
+    factor, unit = scaled_root(total, RIDGE)
     scale = np.outer(unit, unit)
-    factor = np.linalg.cholesky(total * scale + 1e-13 * np.eye(len(total)))
     white = np.linalg.inv(factor)
     leverage = white @ (stretches.information * scale) @ white.T
-    values, vectors = np.linalg.eigh(0.5 * (leverage + leverage.transpose(0, 2, 1)))
+    values, vectors = symmetric_eigen(leverage)
     left = 1.0 - np.clip(values, 0.0, MAX_LEVERAGE)
     by = np.sqrt(left * np.maximum(left, 1.0 - FULL_LEVERAGE))
     correct = (vectors / by[:, None]) @ vectors.transpose(0, 2, 1)

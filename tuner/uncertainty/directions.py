@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import scale_group
 from tuner.files import Part
+from tuner.numerics import symmetric_eigen
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def weakest(
     count
         How many at most.
     """
-    values, vectors = np.linalg.eigh(covariance / np.outer(reference, reference))
+    values, vectors = symmetric_eigen(covariance / np.outer(reference, reference))
     directions = []
     for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:count]:
         largest = vector[np.argmax(np.abs(vector))]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.coefficients.space import Parameter, Space
+from tuner.numerics import Z95, scaled_inverse
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
@@ -19,7 +20,7 @@ from tuner.uncertainty.directions import Direction, weakest
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.information import FisherInformation, information_at
 from tuner.uncertainty.parts import Spread, spread_of
-from tuner.uncertainty.verdict import QUANTILE, Precision, Reason, Verdict, judge
+from tuner.uncertainty.verdict import Precision, Reason, Verdict, judge
 
 Array = NDArray[np.float64]
 
@@ -143,7 +144,7 @@ def uncertainty_at(
     for index, parameter in enumerate(space.parameters):
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
         channel, flight = _source(shares[..., index], information.channels, flights)
-        half_width = float(QUANTILE * covariance.error[index])
+        half_width = float(Z95 * covariance.error[index])
         precision = Precision(
             name=parameter.name,
             half_width=half_width,
@@ -187,7 +188,7 @@ def _estimates(
     parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, known
     low, high = (
         space.from_scaled(index, float(np.clip(scaled + side * error, *_limits(parameter))))
-        for side in (-QUANTILE, QUANTILE)
+        for side in (-Z95, Z95)
     )
     value = space.from_scaled(index, scaled)
     slope = value if parameter.scale == "log" else 1.0
@@ -248,7 +249,7 @@ def _shares(information: FisherInformation, flights: int) -> tuple[Array, Array]
     H is a sum over channels, flights and priors, and so is the inverse of the variance, but for
     what nuisances that all flights share take from all alike.
     """
-    inverse = np.linalg.inv(information.total)
+    inverse = scaled_inverse(information.total)
     along = inverse / np.diag(inverse)
     precision = 1.0 / np.diag(inverse)
     if information.lost is not None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients.space import Space
+from tuner.numerics import scaled_inverse, unit_diagonal
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import Sources
@@ -39,10 +40,10 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
     held = set(fitted.held.values())
     moves = np.array([name not in held for name in space.names])
     inverse = np.zeros_like(flights_only)
-    inverse[np.ix_(moves, moves)] = np.linalg.inv(flights_only[np.ix_(moves, moves)])
+    inverse[np.ix_(moves, moves)] = scaled_inverse(flights_only[np.ix_(moves, moves)])
     alone = end + inverse @ rows.T @ (rows @ end + offset)
     alone_error = np.sqrt(np.diag(inverse)) * uncertainty.covariance.beyond_noise
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(prior.information), 1e-300))
+    unit = unit_diagonal(prior.information)
     measured = np.linalg.pinv(prior.information * np.outer(unit, unit), rcond=1e-10)
     ground_error = np.sqrt(np.diag(measured)) * unit
     sources = {}

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import Inverse
 from tuner.uncertainty.information import FisherInformation
-from tuner.uncertainty.inverse import Inverse
 from tuner.uncertainty.overdispersion import allowed_for
 
 Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class IndependentErrors:
         from_flights = np.diag(inverse.sandwiched(white, np.zeros_like(white)))
         return IndependentErrors(
             inverse=inverse,
-            matrix=inverse.sandwiched(white, information.given),
+            matrix=_positive(inverse.sandwiched(white, information.given), inverse.matrix),
             from_flights=from_flights,
             disturbed=_disturbed(information, inverse.matrix, from_flights),
         )
@@ -75,6 +75,16 @@ class IndependentErrors:
         allowed = allowed_for(ratio, freedom, covariance / np.outer(own, own), self.disturbed)
         beyond = np.where(speaks, self.from_flights * (allowed**2 - 1.0), 0.0)
         return np.asarray(np.sqrt(variance + beyond))
+
+
+def _positive(matrix: Array, inverse: Array) -> Array:
+    """Return a covariance (K, K) whose variances are positive.
+
+    What learnt strengths take is no noise and counts as negative in the sandwich. Where it takes
+    all that small residuals leave, residuals are as large as assumed.
+    """
+    left = np.diag(matrix) > LEAST * np.diag(inverse)
+    return np.where(np.outer(left, left), matrix, inverse)
 
 
 def _disturbed(information: FisherInformation, inverse: Array, from_flights: Array) -> Array:

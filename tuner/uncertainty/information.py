@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.coefficients.space import Space
+from tuner.numerics import huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 
@@ -227,7 +228,7 @@ def information_from_jacobian(
         for segment in range(segments):
             rows = columns[..., segment] / scale[segment]
             error = residuals[..., segment] / scale[segment]
-            robust = np.minimum(1.0, float(criterion.huber) / np.maximum(np.abs(error), 1e-300))
+            robust = huber_weights(error, float(criterion.huber))
             stretch = np.minimum((time[:, segment] / block).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index

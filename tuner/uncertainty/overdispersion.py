@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes a quarter of a second to import
 
+from tuner.numerics import Z95
+
 Array = NDArray[np.float64]
 
 QUARTILE = 2.0
@@ -69,7 +71,7 @@ def allowed_for(ratio: Array, freedom: Array, correlation: Array, expected: Arra
     centre = np.exp(centre - centre.max())
     weight = likelihood * (about @ centre)
     weight /= weight.sum(axis=1, keepdims=True)
-    sd, half = np.sqrt(variance), special.ndtri(0.975)
+    sd, half = np.sqrt(variance), Z95
     low, high = np.zeros_like(ratio), np.full_like(ratio, np.log(sd[-1]))
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)

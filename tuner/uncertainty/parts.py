@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a second to import
+from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
+from tuner.numerics import Z95, Inverse
 from tuner.objective.alternatives import DRAWS, READINGS, STEP
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
-from tuner.uncertainty.inverse import Inverse
 from tuner.uncertainty.stretches import parts_of
 
 Array = NDArray[np.float64]
@@ -21,7 +21,7 @@ SIMULATORS_STEP = 1.0 / 4000.0
 """s of a simulator's finest usual step. A lag that it steps by Euler's rule, as most do, is half a
 step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second order. Not by more:
 the standard error of what is only known to lie within limits is their half-width over √3."""
-WIDER = float(stdtrit(DRAWS, 0.975) / ndtri(0.975))
+WIDER = float(stdtrit(DRAWS, 0.975) / Z95)
 """Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
 FEWEST = 3
 """Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
@@ -113,7 +113,9 @@ def left_out(information: FisherInformation) -> Array | None:
 
     Without a flight the estimate moves by δ = (H - H_i)⁻¹ g_i, one Gauss-Newton step; if H were
     right, the covariance of δ would be (H - H_i)⁻¹ - H⁻¹. The mean of the ratio of their squares
-    scales the errors that H speaks for; a flight counts by how much it tells of the coefficient.
+    scales the errors that H speaks for; a flight counts by how much it tells of the coefficient,
+    and not at all where the others and the priors leave it open: nothing contradicts it there.
+    H - H_i is summed up from the others, for the difference would be rounding errors of any sign.
     (The plain jackknife takes all flights for alike, and one that alone tells of a coefficient for
     one that contradicts the others.) Errors that last for a whole flight show here alone; few
     flights leave open how large they are (`allowed_for`).
@@ -126,14 +128,18 @@ def left_out(information: FisherInformation) -> Array | None:
     known = np.diag(inverse.matrix)
     weights, squares = np.zeros_like(parts.score), np.zeros_like(parts.score)
     for number in range(parts.count):
-        without = Inverse.of(total - parts.information[number], information.given).matrix
+        others = np.delete(parts.information, number, axis=0).sum(axis=0)
+        rest = Inverse.of(others + information.given, information.given)
+        without = rest.matrix
         expected = np.maximum(np.diag(without) - known, 0.0)
-        tells = expected > TELLS * known
+        tells = (expected > TELLS * known) & rest.known
         moved = (without @ parts.score[number]) ** 2
         weights[number] = np.where(tells, expected / (expected + known), 0.0)
         squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
-    beyond = (weights * squares).sum(axis=0) / of_all
+    beyond = np.where(
+        weights.any(axis=0), (weights * squares).sum(axis=0) / of_all, 1.0
+    )
     alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
     given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
     # one degree of freedom is the estimate's own

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import Inverse
 from tuner.uncertainty.information import BLOCK, FisherInformation
-from tuner.uncertainty.inverse import Inverse
 
 Array = NDArray[np.float64]
 

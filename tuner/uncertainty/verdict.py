@@ -11,10 +11,9 @@ from enum import StrEnum
 from typing import Literal
 
 from tuner.files import Part
+from tuner.numerics import Z95
 from tuner.uncertainty.directions import Direction
 
-QUANTILE = 1.959964
-"""Of the normal distribution, for 95 % intervals."""
 WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
 IDENTIFIABLE_ERROR = 0.25
@@ -193,7 +192,7 @@ def _not_identifiable(precision: Precision, directions: Sequence[Direction]) -> 
     if precision.data_error >= NO_INFORMATION_ERROR:
         return Reason(code=ReasonCode.NO_INFORMATION, prior_given=given, bound=bound)
     if precision.data_error > IDENTIFIABLE_ERROR:
-        half_width = QUANTILE * precision.data_error
+        half_width = Z95 * precision.data_error
         code = ReasonCode.WIDE_INTERVAL
         return Reason(code=code, half_width=half_width, prior_given=given, bound=bound)
     return Reason(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import Z95
 from tuner.objective.criterion import Criterion, Jacobian
 from tuner.objective.normal import Objective
 from tuner.uncertainty.residual import Residual
@@ -57,7 +58,7 @@ def _residual(flight: str, channel: str, time: Array, error: Array) -> Residual:
             for lag in range(1, LAGS)
         ]
     )
-    limit = 1.96 / np.sqrt(count * error.shape[1])
+    limit = Z95 / np.sqrt(count * error.shape[1])
     return Residual(
         flight=flight,
         channel=channel,

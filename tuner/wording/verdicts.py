@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from tuner.coefficients import scale_group
+from tuner.numerics import Z95
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.error_parts import ErrorParts
-from tuner.uncertainty.verdict import QUANTILE, Reason, ReasonCode, Verdict
+from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
 from tuner.wording.phrases import listed, percent, quantity
 
 NEGLIGIBLE = 0.01
@@ -64,7 +65,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
     least = NEGLIGIBLE * max(error or 0.0 for error in named.values())
     size = 1.0 if unit is not None else max(abs(value), 1e-300)
     return ", ".join(
-        f"{cause} ±{quantity(QUANTILE * error / size, unit)}"
+        f"{cause} ±{quantity(Z95 * error / size, unit)}"
         for cause, error in named.items()
         if error and (cause == "noise alone" or error >= least)
     )
@@ -110,7 +111,7 @@ def direction_in_words(direction: Direction) -> str:
     known = (
         "is not identifiable"
         if direction.null
-        else f"is known to ±{percent(1.96 * direction.error)}"
+        else f"is known to ±{percent(Z95 * direction.error)}"
     )
     if direction.common_scale:
         group = listed([name for name in moves if name in scale_group()])

@@ -10,12 +10,12 @@ from tests.tuner.job.test_windows import job_through
 from tuner.config import values_of
 from tuner.design import next_log as design
 from tuner.design.log_proposal import LogProposal
-from tuner.design.next_log import errors_of
 from tuner.errors import RecordingError
 from tuner.flights.flight import Series
 from tuner.job import next_log
 from tuner.job.next_log import what_to_log
 from tuner.job.prepare import job_of
+from tuner.numerics import errors_of
 from tuner.recordings import recordings_of
 from tuner.search.fitted import Fitted
 from tuner.search.progress import beginning, criterion_of, point_of
