@@ -26,7 +26,9 @@ from tuner.config import Options, settle, values_of
 from tuner.engine import Report, engine_for
 from tuner.flights.flight import Array, Flight
 from tuner.job.disturbances import examined
+from tuner.job.explanation import Explanation
 from tuner.job.first_terms import with_first_terms
+from tuner.job.listener import SILENT
 from tuner.job.prepare import Job, job_of
 from tuner.job.selected import Selected
 from tuner.job.terms import search_with_terms
@@ -36,6 +38,7 @@ from tuner.objective.windows import Window
 from tuner.recordings import read_usable
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Estimate, Uncertainty
+from tuner.wording.findings import one_line
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
 WORKERS = int(os.environ.get("TUNE_LAB_WORKERS", "0")) or None
@@ -176,8 +179,13 @@ def trial_of(seed: int) -> Trial:
         job = job_at(lab, Path(name), seed=seed)
         clock = time.process_time()
         selected = searched(job, Path(name))
-        selected, fitted, examination = examined(selected, lambda *_: None, lambda _: None)
+        explanation = Explanation(SILENT)
+        selected, fitted, examination = examined(
+            selected, lambda *_: None, lambda _: None, explanation
+        )
         seconds = time.process_time() - clock
+    if examination is None:
+        raise RuntimeError(one_line(explanation.findings[-1]))
     free = {
         name: estimate
         for name, estimate in examination.uncertainty.estimates.items()

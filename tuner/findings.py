@@ -5,10 +5,14 @@ Sentences and remedies are made from them in `tuner.wording.findings`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
+
+LARGEST = 1e300
+"""What stands for a number that is not finite, which JSON does not have."""
 
 Level = Literal["failure", "warning", "info"]
 
@@ -20,6 +24,8 @@ class Code(StrEnum):
     SALVAGED = "salvaged"  # those of `tuner.flights.damage.Damage`; names: its cause and subject
     LEFT_OUT = "left_out"  # names: what the flight lacks, what to do
     FLIGHT_WORSE = "flight_worse"  # before, after; names: position or attitude, its unit
+    FLIGHT_CRASHES = "flight_crashes"  # seconds
+    PART_FAILED = "part_failed"  # names: the type of the error, its text
     MISSING_SIGNALS = "missing_signals"  # names: the signals
     POSE_GAP = "pose_gap"  # seconds
     WRONG_VEHICLE = "wrong_vehicle"  # lift, weight (N), mass (kg)
@@ -90,3 +96,9 @@ class Finding:
     subject: str
     numbers: Mapping[str, int | float] = field(default_factory=dict)
     names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Replace what JSON has no number for."""
+        if not all(math.isfinite(number) for number in self.numbers.values()):
+            finite = {n: v if math.isfinite(v) else LARGEST for n, v in self.numbers.items()}
+            object.__setattr__(self, "numbers", finite)

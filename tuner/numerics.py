@@ -26,8 +26,8 @@ ROBUST = 1.4826
 ROUNDING = 1e-12
 """Share of the largest eigenvalue, at unit diagonal, below which information is rounding error."""
 UNKNOWN = 1e-24
-"""What a direction that nothing is known of counts as known to, likewise: its variance is beyond any
-other, and what rounding errors give other coefficients of it is not seen in theirs."""
+"""Likewise, what a direction that nothing is known of counts as known to: its variance is larger
+than any other, and what rounding errors mix of it into other coefficients is not seen in theirs."""
 SEEN = 1e-6
 """Share of a coefficient in unknown directions from which it is unknown."""
 

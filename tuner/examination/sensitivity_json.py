@@ -57,7 +57,7 @@ class OutputSensitivity(Part):
     flight, channel, axis, unit
         Which signal.
     rmse
-        Simulated minus recorded, in ``unit`` as everything here.
+        Simulated minus recorded, in ``unit`` as everything here; None where the simulation crashed.
     change
         Coefficient -> RMS change for +1 %.
     rmse_up, rmse_down
@@ -68,7 +68,7 @@ class OutputSensitivity(Part):
     channel: str
     axis: str
     unit: str
-    rmse: float
+    rmse: FiniteOrNone
     change: dict[str, float]
     rmse_up: dict[str, FiniteOrNone]
     rmse_down: dict[str, FiniteOrNone]

@@ -15,6 +15,7 @@ from tuner.filter_error.predictor import Predictor
 from tuner.filter_error.recorded import FLIGHT_CONTROLLER
 from tuner.filter_error.refit import STEPS, with_least_innovations
 from tuner.findings import Code, Finding
+from tuner.job.explanation import Explanation
 from tuner.job.holding import with_undetermined_held
 from tuner.job.innovations import Innovations
 from tuner.job.polish import polished
@@ -28,7 +29,6 @@ from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.progress import Progress
 from tuner.selection.candidates import is_stand_in
-from tuner.spans import span
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import full_problem_of
 from tuner.wording.phrases import listed
@@ -44,26 +44,33 @@ ROUGHLY = 2
 """Steps before they do so first: what is missing would in time be taken for disturbances."""
 
 
+Examined = tuple[Selected, Fitted, Examination | None]
+"""A job's fit, and how well it is known; None where the examination failed."""
+
+
 def examined(
     selected: Selected,
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
-) -> tuple[Selected, Fitted, Examination]:
-    """Return the fit with what pushed the flights, or with what they leave open held.
+    explanation: Explanation,
+) -> Examined:
+    """Return the fit with estimated disturbances, or with what the flights leave open held.
 
     And how well each coefficient is known; first the terms, of which innovations may call for
     others.
     """
-    with span("disturbances"):
-        followed = with_disturbances(selected, on_progress, on_message)
+    followed = explanation.part(
+        "disturbances", partial(with_disturbances, selected, on_progress, on_message), None
+    )
     on_message("Examining how well each coefficient is known.")
     if followed is not None:
         return followed
-    with span("examination"):
-        held = with_undetermined_held(
-            selected.job, selected.fitted, on_progress, on_message, in_doubt=selected.in_doubt
-        )
-    return (selected, *held)
+    job, fitted = selected.job, selected.fitted
+    hold = partial(
+        with_undetermined_held, job, fitted, on_progress, on_message, in_doubt=selected.in_doubt
+    )
+    not_known: tuple[Fitted, Examination | None] = fitted, None
+    return selected, *explanation.part("examination", hold, not_known)
 
 
 def with_disturbances(

@@ -174,7 +174,7 @@ def turning_unexplained(job: Job, explained: Mapping[str, float]) -> tuple[Findi
 def flights_worse(
     initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
 ) -> tuple[Finding, ...]:
-    """Return which flights the fitted coefficients meet worse than the initial ones did.
+    """Return which flights the fitted coefficients meet worse than the initial ones, or crash.
 
     Parameters
     ----------
@@ -183,6 +183,12 @@ def flights_worse(
     """
     findings = []
     for flight in best:
+        crashed = best[flight].crash_time
+        if crashed is not None:
+            if initial[flight].crash_time is None:
+                numbers = {"seconds": crashed}
+                findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
+            continue
         for what, unit in MET_BY.items():
             before, after = initial[flight].length(what), best[flight].length(what)
             if after > (1.0 + WORSE) * before:

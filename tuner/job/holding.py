@@ -38,6 +38,8 @@ MAX_ROUNDS = 3
 NOTHING = 0.002
 """Share of the loss by which it may rise where one of what trades off exactly is held: what an
 optimiser leaves. More says that the others cannot follow, their bounds being in the way, say."""
+MUCH = 2.0
+"""Times the loss of flights in their closed loop, likewise: gusts make less of a difference."""
 
 
 def with_undetermined_held(
@@ -52,7 +54,8 @@ def with_undetermined_held(
 
     A fit that predicts from recorded states keeps the values of all but those that trade off:
     together they predict, even where the flights do not tell them apart, and each one's verdict
-    says so. There, too, all are kept if the flights are met worse by what follows.
+    says so. All are kept where the flights are met worse by what follows: by anything there, and by
+    twice the loss in a closed loop.
     """
 
     def examined(fitted: Fitted) -> Examination:
@@ -76,7 +79,7 @@ def with_undetermined_held(
             "others are fitted again."
         )
         rest = hold(job, fitted, stand_ins, on_progress)
-        if predicts and _rises(fitted, rest) > NOTHING:
+        if _rises(fitted, rest) > NOTHING if predicts else _misses(fitted, rest):
             on_message(
                 f"With {listed(names)} at the initial value the flights are met worse: all keep "
                 "their values."
@@ -124,6 +127,15 @@ def _rises(fitted: Fitted, other: Fitted) -> float:
         for f in (fitted, other)
     )
     return after / before - 1.0
+
+
+def _misses(fitted: Fitted, other: Fitted) -> bool:
+    """Return whether another fit meets the flights much worse, each by the noise of this one."""
+    here, there = (
+        float(np.sum(fitted.objective.sums(p, fitted.criterion, derivatives=False).loss))
+        for p in (fitted.point, other.point)
+    )
+    return not there < MUCH * here
 
 
 def stand_ins_of(uncertainty: Uncertainty) -> dict[str, str]:

@@ -48,6 +48,7 @@ from tuner.selection.table import SelectionRow
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import (
+    NOT_EXAMINED,
     NOT_FITTED,
     Reason,
     Verdict,
@@ -65,7 +66,7 @@ CONTROLLER_FILE = "controller.yaml"
 def result_of(
     job: Job,
     fitted: Fitted,
-    uncertainty: Uncertainty,
+    uncertainty: Uncertainty | None,
     validation: Validation,
     *,
     sources: Mapping[str, Sources] | None = None,
@@ -74,7 +75,10 @@ def result_of(
     effective: EffectiveResult | None = None,
     next_log: tuple[LogProposal, ...] = (),
 ) -> RunResult:
-    """Assemble ``result.json``."""
+    """Assemble ``result.json``.
+
+    ``uncertainty`` is None where it was not examined, or not yet.
+    """
     settings = job.settings
     return RunResult(
         status=Status.CONVERGED if fitted.converged else Status.STOPPED,
@@ -147,7 +151,7 @@ def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
 
 
 def _coefficients(
-    job: Job, fitted: Fitted, uncertainty: Uncertainty
+    job: Job, fitted: Fitted, uncertainty: Uncertainty | None
 ) -> dict[str, CoefficientResult]:
     best, judgements = best_values(job, fitted), _judgements(job, fitted, uncertainty)
     bounds = {
@@ -161,7 +165,7 @@ def _coefficients(
             coefficients[name] = _fixed(name, initial)
             continue
         lower, upper = bounds[name]
-        estimate = uncertainty.estimates[name]
+        estimate = None if uncertainty is None else uncertainty.estimates[name]
         verdict, reason = judgements[name]
         coefficients[name] = CoefficientResult(
             unit=COEFFICIENTS[name].unit,
@@ -170,10 +174,10 @@ def _coefficients(
             fitted=True,
             lower=lower,
             upper=upper,
-            std_error=estimate.std_error,
-            std_error_parts=estimate.parts,
-            ci95=_interval(estimate.ci95),
-            identifiable=reason.identifiable,
+            std_error=None if estimate is None else estimate.std_error,
+            std_error_parts=None if estimate is None else estimate.parts,
+            ci95=None if estimate is None else _interval(estimate.ci95),
+            identifiable=None if estimate is None else reason.identifiable,
             verdict=verdict,
             reason=reason,
             note=judgement_in_words(verdict, reason),
@@ -182,20 +186,22 @@ def _coefficients(
 
 
 def _judgements(
-    job: Job, fitted: Fitted, uncertainty: Uncertainty
+    job: Job, fitted: Fitted, uncertainty: Uncertainty | None
 ) -> dict[str, tuple[Verdict, Reason]]:
     """Return the verdict on each free coefficient, and its reason."""
-    judgements = {
-        name: (estimate.verdict, estimate.reason)
-        for name, estimate in uncertainty.estimates.items()
-    }
+    values = job.space.numbers(fitted.point.coefficients)
+    judgements = dict.fromkeys(values, (Verdict.NOT_EXAMINED, NOT_EXAMINED))
+    if uncertainty is not None:
+        judgements = {
+            name: (estimate.verdict, estimate.reason)
+            for name, estimate in uncertainty.estimates.items()
+        }
     for parameter in job.space.parameters:
         if parameter.name in fitted.held:
             for name in parameter.ratios:
                 judgements[name] = judge_after_holding(
                     name, *judgements[name], fitted.held[parameter.name]
                 )
-    values = job.space.numbers(fitted.point.coefficients)
     for name in impossible_inertia(job, fitted):
         judgements[name] = judge_impossible_inertia(values[name])
     return judgements

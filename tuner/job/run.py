@@ -8,12 +8,14 @@ from __future__ import annotations
 import datetime
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from math import nan
 from pathlib import Path
 
 from tuner.comparison.compare import table_of
 from tuner.config import Options, Settings, VehicleFile, settle, with_values, write_vehicle
+from tuner.design.log_proposal import LogProposal
 from tuner.disk import make_folder
 from tuner.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.examination.examination import Examination
@@ -26,9 +28,10 @@ from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check_information, check_recordings
 from tuner.job.cross_validation import cross_validate, jackknife_errors
-from tuner.job.disturbances import examined
-from tuner.job.effective import effective_fit
+from tuner.job.disturbances import Examined, examined
+from tuner.job.effective import Effective, effective_fit
 from tuner.job.examination_files import write_knowledge, write_next_flight
+from tuner.job.explanation import Explanation
 from tuner.job.findings import (
     finer_than_steps,
     flights_worse,
@@ -57,7 +60,8 @@ from tuner.search.iteration import Iteration
 from tuner.search.progress import Progress
 from tuner.spans import span
 from tuner.uncertainty.ground import sources_of
-from tuner.wording.findings import one_line, remedy, sentence
+from tuner.uncertainty.sources import Sources
+from tuner.wording.findings import remedy, sentence
 from tuner.wording.phrases import clause
 from tuner.wording.result import export_sentence
 
@@ -112,49 +116,69 @@ def run(
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
     job, findings = _prepared(settings)
-    _report(findings, listener, force=force)
-    selected, fitted, examination = _fitted(
-        job, findings, folder, listener, resume=resume, force=force
+    explanation = Explanation(listener)
+    _check(findings, explanation, force=force)
+    found, (selected, fitted, examination) = _fitted(
+        job,
+        findings,
+        folder,
+        explanation,
+        listener,
+        command=command,
+        resume=resume,
+        force=force,
     )
-    job = selected.job
-    drawing = BackgroundDrawing()
-    with span("balance"):
-        fitted, examination, inertia = with_inputs_balanced(
-            job, fitted, examination, listener.on_message, in_doubt=selected.in_doubt
-        )
-    uncertainty = examination.uncertainty
-    sources = sources_of(fitted, uncertainty, examination.known)
-    conflicts = ground_conflicts(sources)
-    _report(conflicts, listener, force=True)
+    job, drawing = selected.job, BackgroundDrawing()
+    fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
+    explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
-    fitted, validation = _validated(job, fitted, vehicle, inertia, listener)
-    noticed = (*finer_than_steps(uncertainty), *voltage_taken(settings.vehicle, vehicle))
-    fitted = replace(fitted, findings=(*fitted.findings, *noticed, *conflicts))
-    with span("effective coefficients"):
-        effective = effective_fit(
+    if found.fits(job, fitted):
+        validation = found.validation
+    else:
+        validation = _flown(job, fitted, vehicle, listener)
+    explanation.notice(_of_flights(job, validation, inertia))
+    explanation.notice(voltage_taken(settings.vehicle, vehicle))
+    sources = _known(fitted, examination, explanation)
+
+    def written(
+        effective: Effective | None = None, next_log: tuple[LogProposal, ...] = ()
+    ) -> RunResult:
+        result = result_of(
+            job,
+            replace(fitted, findings=(*fitted.findings, *explanation.findings)),
+            None if examination is None else examination.uncertainty,
+            validation,
+            sources=sources,
+            command=command,
+            selection=selected.rows_given(fitted.held),
+            effective=None if effective is None else effective.result,
+            next_log=next_log,
+        )
+        with span("results"):
+            write_folder(
+                folder, result, vehicle, job, None if effective is None else effective.vehicle
+            )
+        return result
+
+    written()
+    _write_flown(folder, validation, fitted)
+    effective = explanation.part(
+        "effective coefficients",
+        lambda: effective_fit(
             job,
             fitted,
             vehicle,
             validation.best,
             on_progress=_reporting(listener),
             on_message=listener.on_message,
-        )
-    with span("what to log"):
-        next_log = what_to_log(job, fitted, examination.known, vehicle)
-    result = result_of(
-        job,
-        fitted,
-        uncertainty,
-        validation,
-        sources=sources,
-        command=command,
-        selection=selected.rows_given(fitted.held),
-        effective=None if effective is None else effective.result,
-        next_log=next_log,
+        ),
+        None,
     )
-    with span("results"):
-        write_folder(folder, result, vehicle, job, None if effective is None else effective.vehicle)
-        _write_flown(folder, validation, fitted)
+    next_log: tuple[LogProposal, ...] = ()
+    if examination is not None:
+        log = partial(what_to_log, job, fitted, examination.known, vehicle)
+        next_log = explanation.part("what to log", log, next_log)
+    result = written(effective, next_log)
     if cross_validated or refits is not None:
         result = _with_refits(
             (job, fitted),
@@ -164,20 +188,32 @@ def run(
             refits=refits,
             listener=listener,
         )
-
-    listener.on_message("Simulating which flight would be the most informative next.")
-    with span("examination"):
-        write_knowledge(folder, job, examination, fitted)
+    if examination is not None:
+        of_fit = folder, job, examination, fitted
+        explanation.part("knowledge", partial(write_knowledge, *of_fit), None)
+        listener.on_message("Simulating which flight would be the most informative next.")
+        explanation.part("next flight", partial(write_next_flight, *of_fit), None)
     drawing.begin(folder)
-    with span("next flight"):
-        write_next_flight(folder, job, examination, fitted)
-    try:
-        with span("exports"):  # while figures are still being drawn
-            _export(folder, settings, listener)
-    finally:
-        with span("page"):
-            render(folder, wait_for_plots=drawing.wait)
+    explanation.part("exports", partial(_export, folder, settings, listener), None)
+    if explanation.findings != result.findings[len(fitted.findings) :]:
+        findings = (*fitted.findings, *explanation.findings)
+        result = result.model_copy(update={"findings": findings})
+        result.write(folder)
+    explanation.part("page", partial(render, folder, wait_for_plots=drawing.wait), None)
     return folder, result
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Where the search of a job ended, and how the flights are met there."""
+
+    job: Job
+    fitted: Fitted
+    validation: Validation
+
+    def fits(self, job: Job, fitted: Fitted) -> bool:
+        """Return whether a fit is the one that was found."""
+        return job is self.job and fitted is self.fitted
 
 
 def _prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
@@ -194,16 +230,21 @@ def _fitted(
     job: Job,
     findings: tuple[Finding, ...],
     folder: Path,
+    explanation: Explanation,
     listener: Listener,
     *,
+    command: str,
     resume: bool,
     force: bool,
-) -> tuple[Selected, Fitted, Examination]:
-    """Return where the search of a job ends, the fit that is reported, and how well it is known."""
+) -> tuple[_Found, Examined]:
+    """Return where the search of a job ends, the fit that is reported, and how well it is known.
+
+    What was found is written before it is examined.
+    """
     with ProgramsAhead(job) as ahead:
         with span("check"):
             at_start = tuple(check_information(job))
-        _report(at_start, listener, force=force)
+        _check(at_start, explanation, force=force)
 
         make_folder(folder)
         on_progress = _keeping_best(folder, listener)
@@ -224,31 +265,78 @@ def _fitted(
                 f"Continue the search with --out {folder} --resume."
             )
             raise
+        found = _written_as_found(folder, selected, listener, command)
         if selected.job is job:
             ahead.await_examination()
-        return examined(selected, on_progress, listener.on_message)
+        return found, examined(selected, on_progress, listener.on_message, explanation)
 
 
-def _validated(
-    job: Job,
-    fitted: Fitted,
-    vehicle: VehicleFile,
-    inertia: Sequence[Finding],
-    listener: Listener,
-) -> tuple[Fitted, Validation]:
-    """Return the fit with what its simulated flights say of it, and these.
+def _written_as_found(folder: Path, selected: Selected, listener: Listener, command: str) -> _Found:
+    """Write where the search ended, and how the flights are met there, nothing explained yet."""
+    job, fitted = selected.job, selected.fitted
+    vehicle = vehicle_fitted(job, fitted)
+    validation = _flown(job, fitted, vehicle, listener)
+    rows = selected.rows_given(fitted.held)
+    result = result_of(job, fitted, None, validation, command=command, selection=rows)
+    with span("results"):
+        write_folder(folder, result, vehicle, job)
+    return _Found(job, fitted, validation)
+
+
+def _flown(job: Job, fitted: Fitted, vehicle: VehicleFile, listener: Listener) -> Validation:
+    listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
+    with span("validation"):
+        return validate(job, fitted, vehicle)
+
+
+def _of_flights(
+    job: Job, validation: Validation, inertia: Sequence[Finding]
+) -> tuple[Finding, ...]:
+    """Return what the simulated flights say of a fit.
 
     ``inertia`` is what the balance of moments has said; if nothing, the turning is looked at.
     """
-    listener.on_message("Simulating each flight with the initial and the fitted coefficients.")
-    with span("validation"):
-        validation = validate(job, fitted, vehicle)
-    worse = (
+    return (
         *flights_worse(validation.initial, validation.best),
         *(inertia or turning_unexplained(job, validation.turning_explained)),
     )
-    _report(worse, listener, force=True)
-    return replace(fitted, findings=(*worse, *fitted.findings)), validation
+
+
+def _balanced(
+    selected: Selected,
+    fitted: Fitted,
+    examination: Examination | None,
+    explanation: Explanation,
+    listener: Listener,
+) -> tuple[Fitted, Examination | None, tuple[Finding, ...]]:
+    """Return the fit whose moments balance, its examination, and what was found of inertia."""
+    as_it_is: tuple[Fitted, Examination | None, tuple[Finding, ...]] = fitted, examination, ()
+    if examination is None:
+        return as_it_is
+    balance = partial(
+        with_inputs_balanced,
+        selected.job,
+        fitted,
+        examination,
+        listener.on_message,
+        in_doubt=selected.in_doubt,
+    )
+    return explanation.part("balance", balance, as_it_is)
+
+
+def _known(
+    fitted: Fitted, examination: Examination | None, explanation: Explanation
+) -> dict[str, Sources]:
+    """Return what flights and ground measurements say each, and notice what is to be said."""
+    if examination is None:
+        return {}
+    uncertainty, known = examination.uncertainty, examination.known
+    explanation.notice(finer_than_steps(uncertainty))
+    sources: dict[str, Sources] = explanation.part(
+        "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
+    )
+    explanation.notice(ground_conflicts(sources))
+    return sources
 
 
 def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
@@ -295,10 +383,9 @@ def _with_refits(
     return result
 
 
-def _report(findings: Sequence[Finding], listener: Listener, *, force: bool) -> None:
-    """Pass findings on to the listener; refuse to go on after a failure unless forced."""
-    for finding in findings:
-        listener.on_message(one_line(finding))
+def _check(findings: Sequence[Finding], explanation: Explanation, *, force: bool) -> None:
+    """Tell findings; refuse to go on after a failure unless forced."""
+    explanation.tell(findings)
     failure = next((finding for finding in findings if finding.level == "failure"), None)
     if failure is not None and not force:
         what, to_do = clause(sentence(failure)), clause(remedy(failure))

@@ -137,9 +137,7 @@ def left_out(information: FisherInformation) -> Array | None:
         weights[number] = np.where(tells, expected / (expected + known), 0.0)
         squares[number] = np.where(tells, moved / np.where(tells, expected, 1.0), 0.0)
     of_all = np.maximum(weights.sum(axis=0), 1e-300)
-    beyond = np.where(
-        weights.any(axis=0), (weights * squares).sum(axis=0) / of_all, 1.0
-    )
+    beyond = np.where(weights.any(axis=0), (weights * squares).sum(axis=0) / of_all, 1.0)
     alike = of_all**2 / np.maximum((weights**2).sum(axis=0), 1e-300)
     given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
     # one degree of freedom is the estimate's own

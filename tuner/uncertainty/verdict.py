@@ -38,6 +38,8 @@ class Verdict(StrEnum):
     """Not fitted, as the settings say."""
     HELD = "held"
     """Kept at its initial value because the flights do not identify it."""
+    NOT_EXAMINED = "not_examined"
+    """Fitted, and its interval was not computed, or not yet."""
     TIED = "tied"
     """A constant multiple of another coefficient, as the job file says."""
 
@@ -65,6 +67,8 @@ class ReasonCode(StrEnum):
     """Ground measurements determine it no better than ``half_width``."""
     NOT_FITTED = "not_fitted"
     """It is fixed."""
+    NOT_EXAMINED = "not_examined"
+    """It was fitted, and how well it is known was not computed, or not yet."""
 
 
 class Reason(Part):
@@ -121,6 +125,8 @@ class Reason(Part):
 
 NOT_FITTED = Reason(code=ReasonCode.NOT_FITTED)
 """Why a coefficient is `Verdict.FIXED`."""
+NOT_EXAMINED = Reason(code=ReasonCode.NOT_EXAMINED)
+"""Why a coefficient is `Verdict.NOT_EXAMINED`."""
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,20 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "Look at its figures and at inspect: it may have been flown, or recorded, otherwise.",
     ),
+    Code.FLIGHT_CRASHES: (
+        (
+            "With the fitted coefficients the simulated flight crashes after {seconds:.1f} s; with "
+            "the initial ones it does not."
+        ),
+        "Do not use this fit: free other coefficients, and look at inspect.",
+    ),
+    Code.PART_FAILED: (
+        (
+            "This part of the explanation failed ({given}: {text}) and is left out; the rest "
+            "of the result does not depend on it."
+        ),
+        "Please report it, with the job's log.",
+    ),
     Code.MISSING_SIGNALS: (
         (
             "The recording holds no {names}, without which the flight says less about the motors, "
@@ -331,6 +345,7 @@ def _values(finding: Finding) -> dict[str, object]:
     if names:
         values |= {"names": listed(names), "first": names[0], "last": names[-1]}
         values |= {"coefficients": listed(finding.names), "given": finding.names[0]}
+        values["text"] = finding.names[-1]
         values["unit"] = finding.names[-1]
     seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
     values["explained_percent"] = percent(max(numbers.get("explained", 0.0), 0.0))

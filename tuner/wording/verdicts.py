@@ -93,6 +93,7 @@ def _main_clause(reason: Reason) -> str:
         f"{reason.correlated_with}, whose value alone was not measured",
         ReasonCode.MEASURED_ROUGHLY: f"measured only to ±{_half_width(reason)} (95 %)",
         ReasonCode.NOT_FITTED: "",
+        ReasonCode.NOT_EXAMINED: "its interval was not computed",
     }[reason.code]
 
 

@@ -159,10 +159,12 @@ def test_a_flight_that_a_fit_left_worse_is_named():
     assert worse.numbers == {"before": pytest.approx(29.0), "after": pytest.approx(40.0)}
     assert flights_worse(after, after) == ()
     crashed = {"f": errors([[0.1, 0, 0]] * 9, [[0, 0, 0]] * 9, crash_time=1.0)}
-    assert {finding.names[0] for finding in flights_worse(before, crashed)} == {
-        "position",
-        "attitude",
-    }
+    (crash,) = flights_worse(before, crashed)
+    assert (crash.code, crash.subject, crash.numbers) == (
+        Code.FLIGHT_CRASHES,
+        "f",
+        {"seconds": 1.0},
+    )
     assert flights_worse(crashed, crashed) == ()
 
 

@@ -26,6 +26,7 @@ VERDICTS = {
     Verdict.WEAKLY_KNOWN: ("weak", "◐", PALETTE[4]),
     Verdict.NOT_IDENTIFIABLE: ("not", "○", PALETTE[1]),
     Verdict.HELD: ("not", "○", PALETTE[1]),
+    Verdict.NOT_EXAMINED: ("not", "○", GREY),
     Verdict.TIED: ("kept", "=", GREY),
     Verdict.FIXED: ("kept", "–", GREY),
 }

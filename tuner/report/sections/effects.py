@@ -58,7 +58,7 @@ def _of(knowledge: Knowledge, channel: str) -> list[OutputSensitivity]:
 def _together(rmse: Sequence[float | None]) -> float | None:
     """Return the root mean square over outputs of one unit, None if one of them failed."""
     known = [value for value in rmse if value is not None]
-    return float(np.sqrt(np.mean(np.square(known)))) if len(known) == len(rmse) else None
+    return float(np.sqrt(np.mean(np.square(known)))) if known and len(known) == len(rmse) else None
 
 
 def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
@@ -70,8 +70,9 @@ def _by_signal(knowledge: Knowledge, names: Sequence[str]) -> Chart:
         for channel, axis, unit in signals:
             outputs = [o for o in knowledge.outputs if (o.channel, o.axis) == (channel, axis)]
             change = float(np.sqrt(np.mean([o.change[name] ** 2 for o in outputs])))
-            rmse = float(np.sqrt(np.mean([o.rmse**2 for o in outputs])))
-            shares.append(float(np.log10(max(change / max(rmse, 1e-300), FAINTEST))))
+            rmse = _together([o.rmse for o in outputs if o.rmse is not None])
+            share = change / max(rmse, 1e-300) if rmse else 0.0  # none was flown to its end
+            shares.append(float(np.log10(max(share, FAINTEST))))
             each = "".join(f"<br>{o.flight}: {o.change[name]:.3g} {unit}" for o in outputs)
             sentences.append(
                 f"{name} +1 % changes {_name(channel, axis)} by {change:.3g} {unit}{each}"

@@ -1,0 +1,92 @@
+"""What a run has found survives whatever explains it, and every finding is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tuner.config import Options
+from tuner.errors import OutputError
+from tuner.findings import LARGEST, Code, Finding
+from tuner.job import disturbances
+from tuner.job.explanation import Explanation
+from tuner.job.listener import SILENT, Listener
+from tuner.job.run import run
+from tuner.result import read_run
+from tuner.uncertainty.verdict import Verdict
+from tuner.wording.findings import one_line
+
+FLIGHTS = Path(__file__).parents[3] / "reference_flights"
+JOB = """
+terms: none
+disturbances: none
+free: [motor_constant, input_scaling, inertia_zz]
+"""
+CONVERGE = "Eigenvalues did not converge"
+
+
+def fails(*_: object, **__: object) -> None:
+    raise np.linalg.LinAlgError(CONVERGE)
+
+
+def test_a_part_that_fails_is_named_and_the_rest_goes_on() -> None:
+    told: list[str] = []
+    explanation = Explanation(Listener(on_message=told.append))
+    assert explanation.part("intervals", lambda: 1, None) == 1
+    assert explanation.part("intervals", fails, None) is None
+    (finding,) = explanation.findings
+    assert (finding.code, finding.subject) == (Code.PART_FAILED, "intervals")
+    assert told == [one_line(finding)]
+    assert f"LinAlgError: {CONVERGE}" in told[0]
+
+
+def test_a_full_disk_is_no_part() -> None:
+    def full() -> None:
+        raise OutputError("folder", "is full", "free some space")
+
+    with pytest.raises(OutputError):
+        Explanation(SILENT).part("intervals", full, None)
+
+
+def test_a_finding_is_told_once() -> None:
+    told: list[str] = []
+    explanation = Explanation(Listener(on_message=told.append))
+    finding = Finding(Code.SPINS_REVERSED, "warning", "motors")
+    explanation.tell([finding])
+    explanation.notice([finding])
+    assert told == [one_line(finding)]
+    assert explanation.findings == (finding,)
+
+
+def test_a_finding_holds_numbers_that_json_has() -> None:
+    finding = Finding(Code.FLIGHT_WORSE, "warning", "f", {"before": 1.0, "after": np.inf})
+    assert finding.numbers == {"before": 1.0, "after": LARGEST}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("broken", [False, True])
+def test_flights_that_hardly_tell_anything_end_in_a_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: bool
+) -> None:
+    """One flight alone tells of what turns the vehicle about its vertical axis."""
+    job, folder, told = tmp_path / "job.yaml", tmp_path / "run", list[str]()
+    job.write_text(JOB)
+    if broken:
+        monkeypatch.setattr(disturbances, "with_undetermined_held", fails)
+        monkeypatch.setattr("tuner.job.run.what_to_log", fails)
+    flights = [str(FLIGHTS / f"{name}.bag") for name in ("circle_3mps", "yaw_spin_3rps")]
+    options = Options(flights=flights, config=str(job))
+    listener = Listener(on_message=told.append)
+    folder, result = run(options, out=folder, listener=listener)
+    assert (folder / "report.html").stat().st_size > 10_000
+    assert read_run(folder).result == result
+    assert [one_line(finding) for finding in result.findings if one_line(finding) not in told] == []
+    failed = [finding.subject for finding in result.findings if finding.code is Code.PART_FAILED]
+    assert failed == (["examination"] if broken else [])
+    for name in ("motor_constant", "input_scaling"):  # the moments of inertia are no rigid body's
+        coefficient = result.coefficients[name]
+        assert (coefficient.verdict is Verdict.NOT_EXAMINED) is broken
+        assert (coefficient.std_error is None) is broken
+    assert not any(finding.code is Code.FLIGHT_CRASHES for finding in result.findings)
