@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
+
+from tuner.cli.options import Many
 
 if TYPE_CHECKING:
     from tuner.service.database import Database
@@ -15,6 +18,7 @@ if TYPE_CHECKING:
 EXAMPLES = (
     "tune serve --port 8000",
     "tune serve --host 0.0.0.0 --data /srv/tune --workers 4",
+    "tune serve --tokens always --allow-host tune.lab.example",
     "tune serve token add alice",
 )
 serve = App(
@@ -47,6 +51,8 @@ def _serve(
     port: int = 8000,
     data: Data = None,
     database: DatabaseUrl = None,
+    tokens: Literal["auto", "always"] = "auto",
+    allow_host: Annotated[tuple[str, ...], Many] = (),
     store: str | None = None,
     workers: int = 2,
     cluster: str | None = None,
@@ -61,6 +67,11 @@ def _serve(
         Listen to this address. Any but the loopback one demands tokens of all visitors.
     port
         Listen to this port; 0 takes a free one.
+    tokens
+        Demand tokens on the loopback address, too (always): behind a proxy, or where others share
+        this machine.
+    allow_host
+        Answer under these names alone, beside the loopback ones: what visitors of a proxy type.
     store
         Keep recordings and results in this folder or fsspec URL. Default: in the data folder.
     workers
@@ -84,14 +95,17 @@ def _serve(
     for option, value in (("workers", workers), ("max-upload", max_upload), ("memory", memory)):
         if not value > 0:
             raise InputError(f"--{option}", f"is {value}", "give a number above zero")
+    for name in allow_host:
+        if not re.fullmatch(r"[A-Za-z0-9.-]+", name):
+            raise InputError("--allow-host", f"'{name}' is no host name", "write tune.lab.example")
     limits = Limits(upload_bytes=int(max_upload * GIB), memory_bytes=int(memory * GIB))
     settings = ServiceSettings(
         data=data or default_data(),
         database=database or "",
         store=store or "",
         workers=workers,
-        demands_tokens=not is_loopback(host),
-        hosts=LOOPBACK if is_loopback(host) else (),
+        demands_tokens=tokens == "always" or not is_loopback(host),
+        hosts=(*LOOPBACK, *map(str.lower, allow_host)) if allow_host or is_loopback(host) else (),
         limits=limits,
     )
     run(

@@ -2,7 +2,8 @@
 
 A page elsewhere on the web must not reach a server on this machine through its user's browser: not
 under a name that it made point here (the host is checked), and not with a form of its own (the
-origin is checked).
+origin is checked, and a session counts for a form only where the browser says which page sent it).
+A proxy that lets others in is not for a server without tokens.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
 from urllib.parse import urlsplit
 
 import anyio.to_thread
@@ -29,9 +31,14 @@ from tuner.service.metrics import Metrics
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 
-COOKIE = "tune_token"
+COOKIE = "tune_session"
 OPEN_TO_ALL = ("/healthz", "/login", "/static/")
+FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip", "via")
+"""Headers by which a request shows that it came through a proxy."""
+READING = ("GET", "HEAD", "OPTIONS")
 UPLOADS = ("/api/v1/recordings", "/recordings")
+VISITOR: ContextVar[str | None] = ContextVar("VISITOR", default=None)
+"""Whose session the request under way is of."""
 MOST_VISITORS = 10_000
 #: Pages run the service's own script and style, and load nothing from elsewhere.
 PAGE_POLICY = (
@@ -98,14 +105,21 @@ class Guard:
 
     async def _check(self, request: Request) -> None:
         settings = self._service.settings
-        host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
-        if settings.hosts and host not in settings.hosts:
-            raise NotAllowedError("the request", "names another host", "open the server's own URL")
-        if request.method not in ("GET", "HEAD", "OPTIONS"):
+        if settings.hosts and _host_name(request.headers) not in settings.hosts:
+            remedy = "open the server's own URL, or start it with --allow-host"
+            raise NotAllowedError("the request", "names another host", remedy)
+        if not settings.demands_tokens and any(name in request.headers for name in FORWARDED):
+            raise NotAllowedError(
+                "the request",
+                "came through a proxy, and this server asks nobody for a token",
+                "start it with --tokens always",
+            )
+        if request.method not in READING:
             _check_origin(request.headers)
         visitor = request.client.host if request.client else "unknown"
         if settings.demands_tokens:
             name = await anyio.to_thread.run_sync(self._owner, request)
+            VISITOR.set(name if COOKIE in request.cookies else None)
             if name is not None:
                 visitor = f"token {name}"
             elif not request.url.path.startswith(OPEN_TO_ALL):
@@ -114,13 +128,17 @@ class Guard:
             raise TooManyError("the server", "is asked too often by you", "wait some seconds")
 
     def _owner(self, request: Request) -> str | None:
-        kind, _, word = request.headers.get("authorization", "").partition(" ")
-        token = word.strip() if kind.lower() == "bearer" else request.cookies.get(COOKIE, "")
-        return tokens.owner(self._service.database, token) if token else None
+        database, headers = self._service.database, request.headers
+        kind, _, word = headers.get("authorization", "").partition(" ")
+        if kind.lower() == "bearer":
+            return tokens.owner(database, word.strip())
+        session = request.cookies.get(COOKIE, "")
+        is_ours = request.method in READING or "origin" in headers or "sec-fetch-site" in headers
+        return tokens.logged_in(database, session) if session and is_ours else None
 
     async def _body(self, request: Request, receive: Receive) -> Receive:
         """Return what gives a body on, once it has arrived whole and is not too large."""
-        if request.url.path in UPLOADS or request.method in ("GET", "HEAD", "OPTIONS"):
+        if request.url.path in UPLOADS or request.method in READING:
             return receive  # a file is counted as it is taken apart
         most, body, more = self._service.settings.limits.body_bytes, b"", True
         while more:
@@ -138,10 +156,18 @@ class Guard:
         return replay
 
 
+def _host_name(headers: Headers) -> str:
+    """Return the name under which a request addresses the server, without its port."""
+    try:
+        return urlsplit(f"//{headers.get('host', '')}").hostname or ""
+    except ValueError:  # half of an IPv6 address
+        return ""
+
+
 def _check_origin(headers: Headers) -> None:
     """Refuse what a page of another site sends."""
     origin = headers.get("origin")
-    elsewhere = origin is not None and urlsplit(origin).netloc != headers.get("host")
+    elsewhere = origin is not None and origin.partition("://")[2] != headers.get("host")
     if elsewhere or headers.get("sec-fetch-site") in ("cross-site", "same-site"):
         raise NotAllowedError(
             "the request", "comes from a page of another site", "use the server's own pages"

@@ -91,8 +91,8 @@ def _serve(service: Service, *, host: str, port: int, say: Callable[[str], None]
     if settings.demands_tokens and not tokens.names(service.database):
         service.close()
         raise InputError(
-            "--host",
-            f"{host} can be reached from other machines, and nobody has a token",
+            "tune serve",
+            "demands tokens, and nobody has one",
             "make one with: tune serve token add NAME",
         )
     logging.getLogger("tuner.service").setLevel(logging.INFO)

@@ -1,4 +1,4 @@
-"""The tables: recordings, jobs with their states, events, files and points, and tokens.
+"""The tables: recordings, jobs with their states, events, files and points, tokens and sessions.
 
 Times are s since 1970, UTC.
 """
@@ -175,3 +175,13 @@ class TokenRow(Base):
     name: Mapped[str] = mapped_column(String(100), primary_key=True)
     sha256: Mapped[str] = mapped_column(String(64))
     added: Mapped[float]
+
+
+class SessionRow(Base):
+    """A browser that showed a token, by the SHA-256 of a word that only it has."""
+
+    __tablename__ = "sessions"
+
+    sha256: Mapped[str] = mapped_column(String(64), primary_key=True)
+    token: Mapped[str] = mapped_column(ForeignKey("tokens.name", ondelete="CASCADE"))
+    expires: Mapped[float]

@@ -1,4 +1,4 @@
-"""Visitors' tokens: made here, shown once, kept as hashes, compared in constant time."""
+"""Visitors' tokens, shown once, and the sessions of browsers that showed one: kept as hashes."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from sqlalchemy import delete, select
 
 from tuner.errors import InputError
 from tuner.service.database import Database
-from tuner.service.tables import TokenRow
+from tuner.service.tables import SessionRow, TokenRow
 
 PREFIX = "tune_"
 """What a token begins with, so that one that leaks is recognised."""
+SESSION = 7 * 86400
+"""s for which a browser stays logged in"""
 
 
 def add(database: Database, name: str) -> str:
@@ -38,7 +40,7 @@ def add(database: Database, name: str) -> str:
 
 
 def remove(database: Database, name: str) -> None:
-    """Let a visitor's token hold no more.
+    """Let a visitor's token, and the sessions that it opened, hold no more.
 
     Raises
     ------
@@ -69,6 +71,30 @@ def owner(database: Database, token: str) -> str | None:
     return found
 
 
+def log_in(database: Database, token: str) -> str | None:
+    """Open a session, and return the word that it goes by; None if it is nobody's token."""
+    if (name := owner(database, token)) is None:
+        return None
+    word, now = secrets.token_urlsafe(32), time.time()
+    with database.writing() as session:
+        session.execute(delete(SessionRow).where(SessionRow.expires < now))
+        session.add(SessionRow(sha256=_hash(word), token=name, expires=now + SESSION))
+    return word
+
+
+def logged_in(database: Database, word: str) -> str | None:
+    """Return whose session goes by a word, None if there is none."""
+    with database.reading() as session:
+        row = session.get(SessionRow, _hash(word))
+    return None if row is None or row.expires < time.time() else row.token
+
+
+def log_out(database: Database, word: str) -> None:
+    """End the session that goes by a word."""
+    with database.writing() as session:
+        session.execute(delete(SessionRow).where(SessionRow.sha256 == _hash(word)))
+
+
 def _hash(token: str) -> str:
-    """Return the SHA-256 of a token: it has 256 random bits, so that no salt is needed."""
+    """Return the SHA-256 of a secret: it has 256 random bits, so that no salt is needed."""
     return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()

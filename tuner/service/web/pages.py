@@ -289,22 +289,32 @@ def login_page() -> Response:
 
 @web.post("/login")
 async def login(request: Request) -> Response:
-    """Keep a visitor's token in a cookie that no script reads and no other site sends."""
+    """Open a session, which a cookie names that no script reads and no other site sends."""
     async with request.form(max_files=0, max_fields=10, max_part_size=1000) as form:
         token = str(form.get("token", "")).strip()
     service = service_of(request)
-    if await anyio.to_thread.run_sync(tokens.owner, service.database, token) is None:
+    word = await anyio.to_thread.run_sync(tokens.log_in, service.database, token)
+    if word is None:
         error = NoTokenError("the token", "is none of this server", "ask who runs it for one")
         return render("login.html.jinja", 401, problem=str(error))
     answer = RedirectResponse("/", status_code=303)
     answer.set_cookie(
         COOKIE,
-        token,
+        word,
         httponly=True,
         samesite="strict",
         secure=request.url.scheme == "https",
-        max_age=30 * 86400,
+        max_age=tokens.SESSION,
     )
+    return answer
+
+
+@web.post("/logout")
+def logout(service: Served, request: Request) -> Response:
+    """End the browser's session, here and there."""
+    tokens.log_out(service.database, request.cookies.get(COOKIE, ""))
+    answer = RedirectResponse("/login", status_code=303)
+    answer.delete_cookie(COOKIE, httponly=True, samesite="strict")
     return answer
 
 

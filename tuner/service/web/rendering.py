@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
 from tuner.flights.notes import Note
+from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
 from tuner.service.tables import State
 from tuner.wording.notes import note_in_words
@@ -46,7 +47,7 @@ def environment() -> Environment:
         "note": lambda raw: note_in_words(Note.read(raw)),
     }
     made.filters |= filters
-    made.globals |= {"states": STATES}
+    made.globals |= {"states": STATES, "visitor": VISITOR.get}
     return made
 
 
