@@ -28,7 +28,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "thrust_setpoint": (-0.02, 1.02),
     "commanded_thrust": (-1e4, 1e4),
     "commanded_torque": (-1e4, 1e4),
-    "rotor_speed": (0.0, 20_000.0),
+    "rotor_speed": (0.0, 100_000.0),  # in revolutions a minute, if nothing says the unit
     "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
 }
 

@@ -133,6 +133,7 @@ def read_signals(
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *passed_over,
         *unread(recording, chosen, places),
+        *_open_unit(places),
         *contents.notes,
         *noticed,
     ]
@@ -146,6 +147,14 @@ def read_signals(
     return Signals(
         recording, chosen, places, contents.samples, topics, series, tuple(notes), damage
     )
+
+
+def _open_unit(places: Mapping[str, Place]) -> list[Note]:
+    """Note that no map says in which unit rotor speeds are, and what they were taken for."""
+    place = places.get("rotor_speed")
+    if place is None or place.source.unit is not None:
+        return []
+    return [Note(NoteCode.SPEED_UNIT_OPEN, "info", place.topic, names=(place.unit,))]
 
 
 def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:

@@ -47,6 +47,7 @@ class NoteCode(StrEnum):
     NO_TACHOMETER = "no_tachometer"  # names: the rotors
     FRAME_TURNED = "frame_turned"  # names: the signal, the frame that it is in
     UNIT_READ = "unit_read"  # names: the signal, the unit that it is in
+    SPEED_UNIT_OPEN = "speed_unit_open"  # names: the unit of `UNITS` that is assumed
     TIME_READ = "time_read"
     UNIT_DOUBTED = "unit_doubted"  # times; names: the signal
     ATTITUDE_DOUBTED = "attitude_doubted"  # agreement, upright

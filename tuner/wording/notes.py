@@ -59,6 +59,10 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.NO_TACHOMETER: "rotors {all} have no tachometer",
     NoteCode.FRAME_TURNED: "{first} is {second}, which the topic map does not say: turned",
     NoteCode.UNIT_READ: "{first} is {second}, which the topic map does not say: read so",
+    NoteCode.SPEED_UNIT_OPEN: (
+        "the topic map gives rotor_speed no unit: {first} is taken, and held against the weight "
+        "that the rotors carry"
+    ),
     NoteCode.TIME_READ: (
         "times are a thousandth of what their step seemed to say, by gravity: read so"
     ),

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from tests.tuner.flights import ways
+from tuner.config import Options, read_vehicle, settle, with_values
 from tuner.errors import RecordingError
 from tuner.flights import Flight, load_flight
 from tuner.flights.notes import NoteCode
+from tuner.recordings import read_recordings
 from tuner.wording.notes import note_in_words
 
 COLUMNS = {
@@ -80,3 +82,46 @@ def test_quick_microseconds_are_no_slow_milliseconds(tmp_path: Path) -> None:
     flight = read(tmp_path, ways.text(table, digits=6))
     assert_same(flight, ("position", "attitude"))
     assert NoteCode.TIME_READ in {note.code for note in flight.notes}
+
+
+def as_fitted(path: Path, **values: float) -> Flight:
+    """Return a recording as a fit takes it, of a vehicle with some other coefficients."""
+    vehicle = with_values(read_vehicle(ways.VEHICLE), values)
+    (recording,) = read_recordings(settle(Options([str(path)], vehicle=vehicle)))
+    return recording.flight
+
+
+@pytest.mark.parametrize("commands", [True, False], ids=["commands", "no commands"])
+@pytest.mark.parametrize(
+    ("factor", "name"), [(1.0, None), (30 / np.pi, "a minute"), (0.5 / np.pi, "a second")]
+)
+def test_rotor_speeds_in(factor: float, name: str | None, commands: bool, tmp_path: Path) -> None:
+    """Also from a vehicle file whose motor constant is twice and a half times too small."""
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.with_speeds(factor, commands=commands))
+    for values in ({}, {"motor_constant": 0.4 * 1.386e-5}):
+        flight = as_fitted(path, **values)
+        assert_same(flight, ("rotor_speed",))
+        assert flight.initial.rotor_speed == pytest.approx(
+            [ways.flown()[f"rotor_speed_{i}"][0] for i in range(1, 5)], rel=0.1
+        )
+        said = [note_in_words(n) for n in flight.notes if n.code is NoteCode.UNIT_READ]
+        assert said == [
+            f"rotor_speed is in revolutions {name}, which the topic map does not say: read so"
+        ] * (name is not None)
+
+
+def test_rotor_speeds_that_carry_the_vehicle_in_no_unit_are_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.with_speeds(3.0, commands=False))
+    with pytest.raises(
+        RecordingError, match=r"9\.\d times the weight in rad/s.*unit \(si, rpm"
+    ) as e:
+        as_fitted(path)
+    assert "\n" not in str(e.value)
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\nextends: table\nsignals:\n  rotor_speed: {fields: "
+        "[rotor_speed_1, rotor_speed_2, rotor_speed_3, rotor_speed_4], unit: si}\n"
+    )
+    path.with_suffix(".yaml").write_text("topics: own.yaml\n")
+    assert as_fitted(path).has("rotor_speed")

@@ -11,6 +11,7 @@ import numpy as np
 from tuner.config import ControllerFile, TrajectorySettings, read_vehicle
 from tuner.simulation.simulate import simulate
 
+VEHICLE = Path(__file__).parents[3] / "configs/vehicles/hovergames_updated.yaml"
 RATE = 100.0
 XYZ = ("x", "y", "z")
 
@@ -18,9 +19,8 @@ XYZ = ("x", "y", "z")
 @cache
 def flown() -> Mapping[str, np.ndarray]:
     """Return a lemniscate of some metres per second at 100 Hz, by the columns of `table`."""
-    vehicle = read_vehicle(Path(__file__).parents[3] / "configs/vehicles/hovergames_updated.yaml")
     shape = TrajectorySettings(name="lemniscate", radius=2.0, omega=0.7, speed_scale=2.1)
-    (flight,) = simulate(vehicle, ControllerFile(), shape, duration=14.0, rate=RATE)
+    (flight,) = simulate(read_vehicle(VEHICLE), ControllerFile(), shape, duration=14.0, rate=RATE)
     signals = flight.signals
     columns = {"time": flight.time}
     for name, prefix in (
@@ -88,3 +88,13 @@ TIMES = {
     "14:13:00.123": stamps("{time}"),
 }
 """How times are written: (n,) ns since the flight's start -> a column."""
+
+
+def with_speeds(factor: float, *, commands: bool = True) -> str:
+    """Return the flight as CSV with its rotor speeds in another unit than rad/s."""
+    table = {
+        name: factor * column if name.startswith("rotor") else column
+        for name, column in flown().items()
+        if commands or not name.startswith("command")
+    }
+    return text(table)
