@@ -32,6 +32,9 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
 }
 
+#: Share of samples out of range above which a signal is in another unit rather than corrupt.
+WHOLLY = 0.5
+
 #: No recording lasts longer, in s, to either side of its middle.
 LONGEST = 43_200.0
 
@@ -65,7 +68,12 @@ def clean(
 
     low, high = RANGES.get(signal, (-np.inf, np.inf))
     beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
-    note(int(beyond.any(axis=1).sum()), NoteCode.OUT_OF_RANGE, lower=low, upper=high)
+    dropped = int(beyond.any(axis=1).sum())
+    if dropped > WHOLLY * len(values):
+        median = float(np.nanmedian(values))
+        note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
+    else:
+        note(dropped, NoteCode.OUT_OF_RANGE, lower=low, upper=high)
     values = np.where(beyond, np.nan, values)
     if signal in {"command", "thrust_setpoint"}:
         values = np.clip(values, 0.0, 1.0)

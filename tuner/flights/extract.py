@@ -10,10 +10,12 @@ import numpy as np
 from tuner.flights.flight import SIGNALS, Array
 from tuner.flights.formats import is_tabular
 from tuner.flights.locate import Place
-from tuner.flights.notes import Note
+from tuner.flights.notes import Note, NoteCode
+from tuner.flights.ranges import NAMES, unit_by_range, unit_of_angles
 from tuner.flights.recording import Clock, Contents, Nanoseconds, Recording, Request, Samples
 from tuner.flights.stamps import believe
 from tuner.flights.units import ATTITUDES, quaternion_of, to_enu_flu, to_si
+from tuner.flights.yardstick import Stamped
 
 #: Signals for which the time of recording is as good as a stamp.
 UNHURRIED = {"lap", "battery_voltage"}
@@ -60,26 +62,57 @@ def extract(
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
     unhurried = {topic for topic, held in kinds.items() if held <= UNHURRIED}
     times, notes = believe(contents.samples, receive_only, unhurried)
-    signals = {}
-    for signal, place in places.items():
+    signals: dict[str, Raw] = {}
+    told: list[Note] = []
+    for signal in sorted(places, key=lambda name: name in ATTITUDES):  # which positions may tell
+        place = places[signal]
         samples = contents.samples.get(place.topic)
         if samples is None or not len(samples.receive):
             continue
-        time, values = times[place.topic], _values(samples, signal, place)
+        time, values = times[place.topic], _columns(samples, signal, place)
+        raw = Raw(place.topic, time, values)
+        unit = _unit(recording, signal, place, raw, signals.get("position"))
+        if unit != place.unit:
+            count, names = len(time), (signal, NAMES[unit])
+            told.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
+        values = _values(samples, signal, place, to_si(values, unit))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
             time, values = time[there], values[there]
         if len(time):
             signals[signal] = Raw(place.topic, time, values)
-    return signals, contents, notes
+    ordered = {signal: signals[signal] for signal in places if signal in signals}
+    return ordered, contents, (*notes, *told)
 
 
-def _values(samples: Samples, signal: str, place: Place) -> Array:
-    columns, _, _ = SIGNALS[signal]
+def _columns(samples: Samples, signal: str, place: Place) -> Array:
+    """Return (n, k) numbers as recorded, in the order of the signal's columns."""
     fields: Sequence[str] = place.fields
     if place.source.quaternion == "xyzw" and signal in ATTITUDES:
         fields = (fields[3], *fields[:3])
-    values = to_si(np.column_stack([samples.fields[name] for name in fields]), place.unit)
+    return np.column_stack([samples.fields[name] for name in fields])
+
+
+def _unit(
+    recording: Recording, signal: str, place: Place, recorded: Raw, position: Raw | None
+) -> str:
+    """Return the unit of recorded numbers: the map's, or else the one in which they make sense."""
+    if place.source.unit is not None:
+        return place.unit
+    if signal not in ATTITUDES or place.source.quaternion != "rpy":
+        return unit_by_range(signal, recorded.values, place.unit)
+    epoch = int(recorded.time[0])
+
+    def stamped(raw: Raw) -> Stamped:
+        return Stamped(np.asarray((raw.time - epoch) * 1e-9, dtype=np.float64), raw.values)
+
+    where = None if position is None else stamped(position)
+    return unit_of_angles(recording.path, stamped(recorded), where, must=signal == "attitude")
+
+
+def _values(samples: Samples, signal: str, place: Place, values: Array) -> Array:
+    """Return (n, k) values in the columns and axes of a `Flight`."""
+    columns, _, _ = SIGNALS[signal]
     if place.source.quaternion == "rpy" and signal in ATTITUDES:
         values = quaternion_of(values)
     if place.source.rotor is not None:

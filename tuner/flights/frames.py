@@ -105,6 +105,8 @@ def correct_frames(
         apply("body_rate", *_judge_rate(fixed, clock))
     if "velocity" in fixed:
         apply("velocity", *_judge_velocity(fixed, clock))
+    if {"rate_setpoint", "body_rate"} <= set(fixed):
+        apply("rate_setpoint", _judge_setpoint(fixed, clock), None)
     return fixed, tuple(notes)
 
 
@@ -170,6 +172,22 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
     return None, doubt if here > 0.9 else None
+
+
+def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | None:
+    """Return how else to read rate set-points, which a vehicle's body rate follows."""
+    rate = smooth(on_clock(series, "body_rate", clock))
+    wanted = smooth(on_clock(series, "rate_setpoint", clock))
+    if min(rms(rate), rms(wanted)) < ENOUGH_TURNING:
+        return None
+
+    def mismatch(setpoints: Array) -> float:
+        known = np.isfinite(rate).all(axis=1) & np.isfinite(setpoints).all(axis=1)
+        return rms((setpoints - rate)[known]) / rms(rate[known])
+
+    best = min(_RATES, key=lambda r: mismatch(r.read(wanted)))
+    there, here = mismatch(best.read(wanted)), mismatch(wanted)
+    return best if there < GOOD and there < here / 3 else None
 
 
 def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:

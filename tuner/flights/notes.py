@@ -32,6 +32,7 @@ class NoteCode(StrEnum):
     CLOCK_DRIFTS = "clock_drifts"  # drift (share)
     ROWS_WITHOUT_TIME = "rows_without_time"
     OUT_OF_RANGE = "out_of_range"  # lower, upper; names: the signal, as of all below
+    UNIT_UNKNOWN = "unit_unknown"  # lower, upper, median
     NOT_A_NUMBER = "not_a_number"
     OUT_OF_ORDER = "out_of_order"
     FAR_IN_TIME = "far_in_time"

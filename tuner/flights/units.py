@@ -17,12 +17,14 @@ UNITS: Mapping[str, tuple[float, float]] = {
     "deg": (math.pi / 180, 0.0),
     "deg/s": (math.pi / 180, 0.0),
     "g": (9.80665, 0.0),
+    "mg": (9.80665e-3, 0.0),
     "mm": (1e-3, 0.0),
     "cm": (1e-2, 0.0),
     "mV": (1e-3, 0.0),
     "percent": (1e-2, 0.0),
     "pwm_us": (1e-3, -1.0),
     "pwm_16bit": (1 / 65535, 0.0),
+    "signed": (0.5, 0.5),
 }
 
 #: Signals whose vectors are written in world or in body axes.

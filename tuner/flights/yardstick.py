@@ -121,15 +121,17 @@ def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
         name: Stamped(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
     }
     slowly, quickly = (
-        scale_of(signals["position"], signals["attitude"]) for signals in (recorded, quick)
+        fits_gravity(signals["position"], signals["attitude"]) for signals in (recorded, quick)
     )
-    return quickly.sure and _is_known(quickly) and not (slowly.sure and _is_known(slowly))
+    return quickly and not slowly
 
 
-def _is_known(scale: Scale) -> bool:
-    """Return whether lengths are in metres or in a unit of `NAMED`."""
-    low, high = BELIEVED
-    return any(low < scale.per_metre * UNITS[unit][0] < high for unit in ("si", *NAMED))
+def fits_gravity(
+    position: Stamped, attitude: Stamped, units: Iterable[str] = ("si", *NAMED)
+) -> bool:
+    """Return whether positions in one of some units accelerate as an attitude says."""
+    scale, (low, high) = scale_of(position, attitude), BELIEVED
+    return scale.sure and any(low < scale.per_metre * UNITS[unit][0] < high for unit in units)
 
 
 def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:

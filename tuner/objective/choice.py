@@ -22,7 +22,12 @@ rotors can be fed into a simulation that turns: real 100 Hz logs of commands tha
 to 0.5, one at 41 Hz of a faster loop has 0.0."""
 
 REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
-DROPPED = (NoteCode.OUT_OF_RANGE, NoteCode.NOT_A_NUMBER, NoteCode.OUTLIERS)
+DROPPED = (
+    NoteCode.OUT_OF_RANGE,
+    NoteCode.UNIT_UNKNOWN,
+    NoteCode.NOT_A_NUMBER,
+    NoteCode.OUTLIERS,
+)
 """What reading says of samples that it dropped for their values."""
 FED_BY: dict[InletName, Source] = {"actuator": "command", "rotor_speed": "rotor_speed"}
 """Inlet in which the simulated vehicle turns by what was recorded of its rotors -> that signal."""

@@ -41,6 +41,10 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.CLOCK_DRIFTS: "the publisher's clock drifts by {ppm:+.0f} ppm against its stamps",
     NoteCode.ROWS_WITHOUT_TIME: "{count} rows without a time left out",
     NoteCode.OUT_OF_RANGE: "{samples} outside {lower:g} to {upper:g} dropped",
+    NoteCode.UNIT_UNKNOWN: (
+        "{samples} dropped: they lie around {median:.4g}, outside {lower:g} to {upper:g}, and no "
+        "unit is certain; give {first} its 'unit' in the topic map"
+    ),
     NoteCode.NOT_A_NUMBER: "{samples} without a number dropped",
     NoteCode.OUT_OF_ORDER: "{samples} out of order, put in order",
     NoteCode.FAR_IN_TIME: "{samples} stamped hours away from the others dropped",

@@ -125,3 +125,45 @@ def test_rotor_speeds_that_carry_the_vehicle_in_no_unit_are_asked_for(tmp_path: 
     )
     path.with_suffix(".yaml").write_text("topics: own.yaml\n")
     assert as_fitted(path).has("rotor_speed")
+
+
+@pytest.mark.parametrize("way", ways.VALUES)
+def test_values_of(way: str, tmp_path: Path) -> None:
+    content, signal, unit = ways.VALUES[way]
+    flight = read(tmp_path, content())
+    assert_same(flight)
+    codes = (NoteCode.UNIT_READ, NoteCode.FRAME_TURNED)
+    said = [n.names[1] for n in flight.notes if n.code in codes and n.names[0] == signal]
+    assert said == [unit] * (unit is not None)
+    if signal == "battery_voltage":
+        assert flight.series[signal].values[0] == pytest.approx(16.4)
+
+
+@pytest.mark.parametrize("change", [lambda u: 47 + 1500 * u, lambda u: 10 * u, lambda u: 1e4 * u])
+def test_commands_in_no_certain_unit_are_dropped_with_a_warning(change, tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.changed({"command": change}))
+    assert not flight.has("command")
+    (note,) = [n for n in flight.notes if n.code is NoteCode.UNIT_UNKNOWN]
+    assert note.kind == "warning"
+    assert note_in_words(note).endswith("give command its 'unit' in the topic map")
+
+
+@pytest.mark.parametrize("unit", ["deg", "si"])
+@pytest.mark.parametrize("slow", [1.0, 0.05])
+def test_angles(unit: str, slow: float, tmp_path: Path) -> None:
+    """Slow flights tilt by a degree, or a radian: gravity knows which."""
+    path, truth = tmp_path / "flight.csv", ways.flown()
+    table = {name: truth[name] for name in ("time", "x", "y", "z")}
+    table |= ways.angles(1.0 if unit == "si" else np.degrees(1.0))
+    if slow < 1:
+        table = ways.gentle(slow, np.degrees(1.0) if unit == "deg" else 1.0)
+    path.write_text(ways.text(table))
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\ntime: time\nsignals:\n  position: [x, y, z]\n"
+        "  attitude: {fields: [roll, pitch, yaw], quaternion: rpy}\n"
+    )
+    flight = load_flight(path, topics=tmp_path / "own.yaml")
+    tilt = np.abs(flight.series["attitude"].values[:, 1:3]).max()
+    assert tilt == pytest.approx(0.49 if slow == 1.0 else slow / 4, rel=0.2)
+    said = [n.names[1] for n in flight.notes if n.code is NoteCode.UNIT_READ]
+    assert said == ["in degrees"] * (unit == "deg")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -98,3 +98,72 @@ def with_speeds(factor: float, *, commands: bool = True) -> str:
         if commands or not name.startswith("command")
     }
     return text(table)
+
+
+def changed(changes: Mapping[str, Callable[[np.ndarray], np.ndarray]]) -> str:
+    """Return the flight as CSV, the columns that begin with some words changed."""
+    table = dict(flown())
+    for prefix, change in changes.items():
+        table |= {name: change(of) for name, of in table.items() if name.startswith(prefix)}
+    return text(table)
+
+
+def volts(factor: float) -> str:
+    """Return the flight as CSV with a battery."""
+    table = dict(flown())
+    return text(table | {"battery_voltage": factor * (16.4 - 0.02 * table["time"])})
+
+
+VALUES: Mapping[str, tuple[Callable[[], str], str, str | None]] = {
+    "commands 0 to 1": (lambda: changed({}), "command", None),
+    "commands in microseconds": (
+        lambda: changed({"command": lambda u: 1e3 + 1e3 * u}), "command", "in microseconds of PWM",
+    ),
+    "commands in percent": (
+        lambda: changed({"command": lambda u: 100 * u}), "command", "in percent",
+    ),
+    "commands of 16 bits": (
+        lambda: changed({"command": lambda u: np.rint(65535 * u)}), "command", "of 16 bits",
+    ),
+    "commands from -1 to 1": (
+        lambda: changed({"command": lambda u: 2 * u - 1}), "command", "from -1 to 1",
+    ),
+    "acceleration in g": (
+        lambda: changed({"a": lambda a: a / 9.80665}), "acceleration", "in g",
+    ),
+    "acceleration in thousandths of g": (
+        lambda: changed({"a": lambda a: a / 9.80665e-3}), "acceleration", "in thousandths of g",
+    ),
+    "a battery in millivolts": (lambda: volts(1000.0), "battery_voltage", "in millivolts"),
+    "a battery in volts": (lambda: volts(1.0), "battery_voltage", None),
+    "body rate in degrees per second": (
+        lambda: changed({"w": np.degrees}), "body_rate", "in degrees per second",
+    ),
+    "position and velocity in millimetres": (
+        lambda: changed({axis: lambda p: 1000 * p for axis in ("x", "y", "z", "v")}),
+        "position", "in millimetres",
+    ),
+    "position in centimetres": (
+        lambda: changed({axis: lambda p: 100 * p for axis in XYZ}), "position", "in centimetres",
+    ),
+}  # fmt: skip
+"""Way -> CSV, the signal in another unit, and what is said of it."""
+
+
+def angles(factor: float = 1.0) -> dict[str, np.ndarray]:
+    """Return roll, pitch and yaw of the flight, in radians times a factor."""
+    w, x, y, z = (flown()[f"q{axis}"] for axis in ("w", *XYZ))
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(2 * (w * y - z * x))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return {"roll": factor * roll, "pitch": factor * pitch, "yaw": factor * yaw}
+
+
+def gentle(tilt: float, factor: float) -> dict[str, np.ndarray]:
+    """Return a pose that rolls by up to `tilt` / 2 rad and drifts as gravity then pushes it."""
+    time = np.arange(0.0, 20.0, 1 / RATE)
+    roll = 0.5 * tilt * np.sin(2.0 * time)
+    across = 9.81 * 0.5 * tilt * np.sin(2.0 * time) / 4.0
+    nothing = np.zeros_like(time)
+    where = {"time": time, "x": nothing, "y": across, "z": nothing + 1.0}
+    return where | {"roll": factor * roll, "pitch": nothing, "yaw": nothing}
