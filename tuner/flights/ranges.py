@@ -12,9 +12,9 @@ import numpy as np
 
 from tuner.errors import RecordingError
 from tuner.flights.flight import Array
-from tuner.flights.frames import GRAVITY
 from tuner.flights.units import quaternion_of, to_si
 from tuner.flights.yardstick import NAMED, Stamped, fits_gravity
+from tuner.numerics import GRAVITY
 
 #: Units that are told, and how a sentence calls them.
 NAMES = {

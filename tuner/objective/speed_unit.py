@@ -15,9 +15,9 @@ import numpy as np
 from tuner.config import VehicleFile
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight, Series
-from tuner.flights.frames import GRAVITY
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.units import UNITS
+from tuner.numerics import GRAVITY
 from tuner.objective.explained import squared_speed
 
 SPEED_UNITS = {"si": "in rad/s", "rpm": "in revolutions a minute", "hz": "in revolutions a second"}
