@@ -15,6 +15,7 @@ def inspect(
     topics: Topics = None,
     namespace: Namespace = None,
     json: Switch = False,
+    suggest: Switch = False,
 ) -> None:
     """Report what recordings hold and what can be fitted to them, without simulating anything.
 
@@ -22,7 +23,18 @@ def inspect(
     ----------
     json
         Print JSON instead of tables.
+    suggest
+        Print a topic map to begin with: the best guess for every column, its unit, and why.
     """
+    if suggest:
+        from pathlib import Path
+
+        from tuner.flights.suggest import suggested_map
+        from tuner.recording_paths import find_flights
+
+        for path in find_flights(flights):
+            sys.stdout.write(suggested_map(Path(path)))
+        return
     from tuner.flights.inspection import as_json, inspect_recordings
     from tuner.recording_paths import find_flights
 

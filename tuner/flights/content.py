@@ -16,7 +16,14 @@ from tuner.flights.extract import Raw, extract
 from tuner.flights.flight import Series
 from tuner.flights.formats import is_tabular, open_recording
 from tuner.flights.frames import DOUBTS, correct_frames
-from tuner.flights.locate import Place, choose_map, locate, require_pose, unread
+from tuner.flights.locate import (
+    Place,
+    choose_map,
+    locate,
+    require_pose,
+    unread,
+    with_guesses,
+)
 from tuner.flights.mission import Mission, find_missions
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Contents, Recording, Samples
@@ -125,12 +132,16 @@ def read_signals(
             "give a map for this format",
         )
     chosen = choose_map(recording, candidates)
+    taken: tuple[Note, ...] = ()
+    if given is None:
+        chosen, taken = with_guesses(recording, chosen)
     places, passed_over = locate(recording, chosen, strict=given is not None)
     if with_pose:
-        require_pose(recording, chosen, places)
+        require_pose(recording, chosen, places, given=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
     notes = [
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
+        *taken,
         *passed_over,
         *unread(recording, chosen, places),
         *_open_unit(places),

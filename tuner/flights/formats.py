@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tuner.disk import readable
 from tuner.errors import RecordingError
+from tuner.flights.csv_layout import is_table
 from tuner.flights.recording import Recording
 
 
@@ -86,11 +87,8 @@ def _open_micro_sd(path: Path, _: tuple[Path, ...]) -> Recording:
 
 
 def _is_table(head: Head) -> bool:
-    """Return whether a file is Parquet, or text with a separator in its first line."""
-    line, _, _ = head.start.partition(b"\n")
-    printable = all(byte >= 32 or byte in b"\r\n\t" for byte in head.start)
-    text = printable and any(separator in line for separator in b",;\t")
-    return text or head.start.startswith(b"PAR1")
+    """Return whether a file is Parquet, or a text with cells."""
+    return head.start.startswith(b"PAR1") or is_table(head.start)
 
 
 def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:

@@ -111,7 +111,7 @@ def read_inertial(
         given = given_map(path, settings, sidecar)
         signals = read_signals(path, settings, sidecar, given, with_pose=False)
     if not is_inertial(signals):
-        require_pose(signals.recording, signals.topic_map, signals.places)
+        require_pose(signals.recording, signals.topic_map, signals.places, given=given is not None)
         return None
     runs = flying(signals)
     if (error := obstacle(path, signals.series, runs)) is not None:

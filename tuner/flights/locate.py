@@ -6,11 +6,13 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Literal
 
 from tuner.errors import RecordingError
+from tuner.flights.columns import recognised
 from tuner.flights.formats import is_tabular
 from tuner.flights.notes import Note, NoteCode
-from tuner.flights.recording import Recording
+from tuner.flights.recording import Clock, Recording
 from tuner.flights.topics import Source, TopicMap
 from tuner.wording.notes import reason_in_words
 
@@ -130,23 +132,90 @@ def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) 
     return (note,) if others else ()
 
 
-def require_pose(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) -> None:
-    """Raise a `RecordingError` with the nearest topic names if a pose is missing."""
+def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tuple[Note, ...]]:
+    """Return a map of a table with the columns that it lacks and whose names say what they hold.
+
+    Returns
+    -------
+    tuple
+        The map, and a note for each signal that was added.
+    """
+    if not is_tabular(recording.format):
+        return topics, ()
+    columns = recording.fields("")
+    found = recognised(columns, getattr(recording, "units", {}))
+    held = locate(recording, topics)[0]
+    if not {"position", "attitude"} <= set(held) and len(found) > len(held):
+        topics = topics.replace(name="the columns' names", time=(), signals={})
+    times = topics.time
+    if not any(clock.field in columns for clock in times) and "time" in found:
+        time = found["time"]
+        times = (Clock(field=time.fields[0], unit=time.unit),)  # type: ignore[arg-type]
+    whole = topics.replace(time=times)
+    places, _ = locate(recording, whole)
+    taken = {field for place in places.values() for field in place.fields}
+    signals, notes = dict(topics.signals), []
+    for name, columns_of in found.items():
+        signal = "attitude" if name == "angles" else name
+        if name == "time" or signal in places or taken & set(columns_of.fields):
+            continue
+        order: Literal["wxyz", "rpy"] = "rpy" if name == "angles" else "wxyz"
+        fields = columns_of.fields
+        signals[signal] = (Source(fields=fields, unit=columns_of.unit, quaternion=order),)
+        notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *fields)))
+    return whole.replace(signals=signals), tuple(notes)
+
+
+def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool) -> tuple[str, str]:
+    """Return why a table holds no pose, and what to do."""
+    columns = recording.fields("")
+    listed = f"{', '.join(columns[:NAMED])}{', ...' if len(columns) > NAMED else ''}"
+    clocks = [clock.field for clock in topics.time]
+    if not any(field in columns for field in clocks):
+        named = f"the topic map '{topics.name}' finds no time: no column {' or '.join(clocks)}"
+        return (
+            named if given else f"has no column that is a time among {listed}",
+            "name it under 'time' in a topic map (--topics FILE)",
+        )
+    if given:
+        sources = [
+            source for name in what.split(" and ") for source in topics.signals.get(name, ())
+        ]
+        wanted = (
+            ", ".join(name for source in sources for name in source.fields or ()) or "are named"
+        )
+        return (
+            f"the topic map '{topics.name}' finds no {what}: no columns {wanted}",
+            "correct it: tune inspect FILE --suggest writes one for these columns",
+        )
+    return (
+        f"has no columns that by their names are its {what}, among {listed}",
+        "name them in a topic map (--topics FILE), which tune inspect FILE --suggest begins",
+    )
+
+
+def require_pose(
+    recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, given: bool = False
+) -> None:
+    """Raise a `RecordingError` with the nearest topic names if a pose is missing.
+
+    Parameters
+    ----------
+    recording, topics, places
+        As of `locate`.
+    given
+        Whether a user wrote the map.
+    """
     missing = [signal for signal in ("position", "attitude") if signal not in places]
     if not missing:
         return
     what = " and ".join(missing)
+    if is_tabular(recording.format):
+        raise RecordingError(recording.path, *_obstacle(recording, topics, what, given=given))
     sources = [source for signal in missing for source in topics.signals.get(signal, ())]
     if not sources:
         raise RecordingError(
             recording.path, f"the topic map '{topics.name}' names no topic for {what}", "add one"
-        )
-    if is_tabular(recording.format):
-        columns = [name for source in sources for name in source.fields or ()]
-        raise RecordingError(
-            recording.path,
-            f"the topic map '{topics.name}' finds no {what}: no columns {', '.join(columns)}",
-            "give a topic map for these columns (--topics FILE)",
         )
     names = [topic.name for topic in recording.topics if topic.count]
     if all(source.topic == "*" for source in sources):

@@ -21,6 +21,7 @@ class NoteCode(StrEnum):
     LAYOUT_UNKNOWN = "layout_unknown"  # names: the message type, the signal
     FIELD_MISSING = "field_missing"  # names: the field, the signal, a field that is called alike
     COLUMNS_UNREAD = "columns_unread"  # names: those columns of a table, some of them
+    COLUMNS_TAKEN = "columns_taken"  # names: the signal, the columns
     WITHOUT_POSE = "without_pose"  # seconds with turning motors
     OTHER_CLOCK = "other_clock"  # seconds
     STAMPS_UNSET = "stamps_unset"

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tuner.errors import RecordingError
+from tuner.flights.csv_layout import LONGEST_LINE, layout_of
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import ROWS, Contents, Request, Samples, TabularRecording
@@ -15,8 +17,6 @@ from tuner.flights.times import NEVER, UNIT_NAMES, numbers_of, read_times
 if TYPE_CHECKING:
     import pyarrow
 
-#: A longer line, in bytes, is no row of a table.
-LONGEST_LINE = 1 << 20
 #: Tables with more columns or cells are no flight.
 MOST_COLUMNS = 10_000
 MOST_CELLS = 500_000_000
@@ -24,6 +24,11 @@ MOST_CELLS = 500_000_000
 
 class Table(TabularRecording):
     """A CSV or Parquet file with a line of column names.
+
+    Attributes
+    ----------
+    units
+        Column -> what a row of units says of it.
 
     Raises
     ------
@@ -34,6 +39,7 @@ class Table(TabularRecording):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._skipped = 0
+        self.units: Mapping[str, str] = {}
         with path.open("rb") as stream:
             self._parquet = stream.read(4) == b"PAR1"
         columns = self._parquet_columns() if self._parquet else self._csv_columns()
@@ -67,15 +73,9 @@ class Table(TabularRecording):
         return Contents({ROWS: samples}, tuple(notes), tuple(damage))
 
     def _csv_columns(self) -> list[str]:
-        with self.path.open("rb") as stream:
-            self._before = 0
-            line = stream.readline(LONGEST_LINE)
-            while line.startswith(b"#") and self._before < 1000:
-                self._before += 1
-                line = stream.readline(LONGEST_LINE)
-        text = line.decode(errors="replace").lstrip("\ufeff").rstrip("\r\n")
-        self._separator = max(",;\t", key=text.count)
-        return [name.strip().strip('"') for name in text.split(self._separator)]
+        self._layout = layout_of(self.path)
+        self.units = self._layout.units
+        return list(self._layout.columns)
 
     def _parquet_columns(self) -> list[str]:
         from pyarrow import ArrowException, parquet  # noqa: PLC0415 (a third of a second)
@@ -103,24 +103,25 @@ class Table(TabularRecording):
 
     def _read_csv(self, names: list[str]) -> pyarrow.Table:
         import pyarrow  # noqa: PLC0415
-        from pyarrow import csv  # noqa: PLC0415
+        from pyarrow import compute, csv  # noqa: PLC0415
 
         def skip(_: object) -> str:
             self._skipped += 1
             return "skip"
 
         self._skipped = 0
-        return csv.read_csv(
-            self.path,
+        layout = self._layout
+        table = csv.read_csv(
+            self.path if layout.separator != " " else _single_blanks(self.path),
             read_options=csv.ReadOptions(
                 use_threads=False,
                 block_size=4 * LONGEST_LINE,
-                skip_rows=self._before + 1,
+                skip_rows=layout.lines_before,
                 column_names=self.columns,
-                encoding="latin-1",
+                encoding=layout.encoding,
             ),
             parse_options=csv.ParseOptions(
-                delimiter=self._separator, invalid_row_handler=skip, newlines_in_values=False
+                delimiter=layout.separator, invalid_row_handler=skip, newlines_in_values=False
             ),
             # As text first: a stray word must not cost a column, nor a float a time's last digits.
             convert_options=csv.ConvertOptions(
@@ -129,6 +130,16 @@ class Table(TabularRecording):
                 strings_can_be_null=False,
             ),
         )
+        if not layout.decimal_comma:
+            return table
+        cells = [compute.replace_substring(table.column(name), ",", ".") for name in names]
+        return pyarrow.table(cells, names=names)
+
+
+def _single_blanks(path: Path) -> io.BytesIO:
+    """Return a text in which cells are apart by one blank."""
+    with path.open("rb") as stream:
+        return io.BytesIO(b"\n".join(b" ".join(line.split()) for line in stream))
 
 
 def _why(err: Exception) -> str:

@@ -19,6 +19,7 @@ TEXTS: Mapping[NoteCode, str] = {
     NoteCode.COLUMNS_UNREAD: (
         "{count} columns are not read, which the topic map does not name: {all}{more}"
     ),
+    NoteCode.COLUMNS_TAKEN: "{first} is taken from the columns {others}, by their names",
     NoteCode.WITHOUT_POSE: (
         "no pose was recorded: the {seconds:.1f} s with turning motors are fitted without motion "
         "capture, by body rate and specific force"

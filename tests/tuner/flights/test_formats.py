@@ -146,7 +146,7 @@ def test_decoding_agrees_with_rosbags_bit_for_bit() -> None:
         (b"\x1f\x8b\x08" + b"x" * 50, "is packed"),
         (b"\x00\x01\x02\x03" * 50, "is of no known format"),
         (b"one column\n1\n2\n", "is of no known format"),
-        (b"a,b\n1,2\n", "no position and attitude"),
+        (b"a,b\n1,2\n", "no column that is a time among a, b"),
     ],
 )
 def test_what_is_no_recording_is_refused(tmp_path: Path, content: bytes, message: str) -> None:

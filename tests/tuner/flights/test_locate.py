@@ -53,7 +53,7 @@ def test_the_nearest_column_of_a_table_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="no column 'pzz' for the position, did you mean 'pz'"):
         load_flight(path, topics=tmp_path / "own.yaml")
     (tmp_path / "own.yaml").write_text(text.replace("pzz", "pz").replace("time: time", "time: t"))
-    with pytest.raises(RecordingError, match="finds no position"):
+    with pytest.raises(RecordingError, match="finds no time: no column t;"):
         load_flight(path, topics=tmp_path / "own.yaml")
 
 

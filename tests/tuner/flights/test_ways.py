@@ -12,6 +12,7 @@ from tuner.config import Options, read_vehicle, settle, with_values
 from tuner.errors import RecordingError
 from tuner.flights import Flight, load_flight
 from tuner.flights.notes import NoteCode
+from tuner.flights.suggest import suggested_map
 from tuner.recordings import read_recordings
 from tuner.wording.notes import note_in_words
 
@@ -167,3 +168,46 @@ def test_angles(unit: str, slow: float, tmp_path: Path) -> None:
     assert tilt == pytest.approx(0.49 if slow == 1.0 else slow / 4, rel=0.2)
     said = [n.names[1] for n in flight.notes if n.code is NoteCode.UNIT_READ]
     assert said == ["in degrees"] * (unit == "deg")
+
+
+@pytest.mark.parametrize("way", ways.TABLES)
+def test_table_with(way: str, tmp_path: Path) -> None:
+    content, path = ways.TABLES[way](), tmp_path / "flight.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    flight = load_flight(path)
+    assert_same(flight, ("position", "attitude"))
+    if way == "PlotJuggler":
+        assert_same(flight, ("body_rate", "acceleration", "command"))
+    assert not [n for n in flight.notes if n.code in ("outliers", "not_a_number")]
+    assert not flight.damage
+
+
+@pytest.mark.parametrize("way", ways.NOT_READ)
+def test_what_stands_in_the_way_is_named(way: str, tmp_path: Path) -> None:
+    content, message = ways.NOT_READ[way]
+    with pytest.raises(RecordingError) as caught:
+        read(tmp_path, content())
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("way", ["PlotJuggler", "posX,quatW", "a row of other units"])
+def test_a_suggested_map_reads_the_table_alike(way: str, tmp_path: Path) -> None:
+    content, path = ways.TABLES[way](), tmp_path / "flight one.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    suggestion = suggested_map(path)
+    (tmp_path / "own.yaml").write_text(suggestion)
+    assert_same(load_flight(path, topics=tmp_path / "own.yaml"), ("position", "attitude"))
+    assert "# rotor_speed: {fields: [..., ..., ..., ...], unit: si}" in suggestion
+
+
+def test_a_suggestion_says_units_by_numbers_and_what_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(
+        ways.changed(
+            {"x": lambda p: 1e3 * p, "y": lambda p: 1e3 * p, "z": lambda p: 1e3 * p}
+        ).replace("wz", 'odd""#', 1)
+    )
+    suggestion = suggested_map(path)
+    assert "by the numbers in millimetres" in suggestion
+    assert "# not used: " in suggestion

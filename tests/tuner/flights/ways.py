@@ -167,3 +167,108 @@ def gentle(tilt: float, factor: float) -> dict[str, np.ndarray]:
     nothing = np.zeros_like(time)
     where = {"time": time, "x": nothing, "y": across, "z": nothing + 1.0}
     return where | {"roll": factor * roll, "pitch": nothing, "yaw": nothing}
+
+
+POSE = ("time", "x", "y", "z", "qw", "qx", "qy", "qz")
+COMMANDS = tuple(f"command_{i}" for i in range(1, 5))
+
+
+def renamed(names: Mapping[str, str], **form: str) -> str:
+    """Return some columns of the flight as CSV, under other names."""
+    return text({new: flown()[old] for new, old in names.items()}, **form)
+
+
+def pose(*names: str, **form: str) -> str:
+    """Return the flight's pose as CSV, its columns under other names."""
+    return renamed(dict(zip(names, POSE, strict=True)), **form)
+
+
+def comma(content: str) -> str:
+    """Return CSV as spreadsheets write it where numbers have a decimal comma."""
+    return content.replace(",", ";").replace(".", ",")
+
+
+_PLOTJUGGLER = {
+    "__time": "time",
+    **{f"/optitrack/pose/pose/position/{a}": a for a in XYZ},
+    **{f"/optitrack/pose/pose/orientation/{a}": f"q{a}" for a in (*XYZ, "w")},
+    **{f"/mavros/imu/data/angular_velocity/{a}": f"w{a}" for a in XYZ},
+    **{f"/mavros/imu/data/linear_acceleration/{a}": f"a{a}" for a in XYZ},
+    **{f"/mavros/rc/out/channels[{i}]": f"command_{i + 1}" for i in range(4)},
+}
+_ECHO = {
+    "%time": "time",
+    **{f"field.pose.position.{a}": a for a in XYZ},
+    **{f"field.pose.orientation.{a}": f"q{a}" for a in (*XYZ, "w")},
+}
+
+
+def echoed() -> str:
+    """Return a pose as `rostopic echo -p` prints it."""
+    lines = renamed(_ECHO).splitlines()
+    rows = []
+    for row in lines[1:]:
+        seconds, _, rest = row.partition(",")
+        rows.append(f"{EPOCH + round(float(seconds) * 1e9)},{rest}")
+    return "\n".join([lines[0], *rows]) + "\n"
+
+
+TABLES: Mapping[str, Callable[[], str | bytes]] = {
+    "time,x,y,z,qw,...": lambda: pose(*POSE),
+    "t,x,y,z,qx,qy,qz,qw": lambda: renamed(
+        {"t": "time", **{n: n for n in ("x", "y", "z", "qx", "qy", "qz", "qw")}}
+    ),
+    "timestamp,X,Y,Z": lambda: pose("timestamp", "X", "Y", "Z", "QW", "QX", "QY", "QZ"),
+    "Time (s),X (m)": lambda: pose("Time (s)", "X (m)", "Y (m)", "Z (m)", *POSE[4:]),
+    "t,x [m]": lambda: pose("t [s]", "x [m]", "y [m]", "z [m]", *POSE[4:]),
+    "pose.position.x": lambda: pose(
+        "time",
+        *(f"pose.position.{a}" for a in XYZ),
+        *(f"pose.orientation.{a}" for a in ("w", *XYZ)),
+    ),
+    "x_estimate": lambda: pose("t", "x_estimate", "y_estimate", "z_estimate", *POSE[4:]),
+    "posX,quatW": lambda: pose("Time", "posX", "posY", "posZ", "quatW", "quatX", "quatY", "quatZ"),
+    "p_x,q_w": lambda: pose("t", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z"),
+    "PlotJuggler": lambda: renamed(_PLOTJUGGLER),
+    "rostopic echo -p": echoed,
+    "a first line with #": lambda: "# " + pose(*POSE),
+    "lines of comments before": lambda: "# lab, 2026\n# with OptiTrack\n" + pose(*POSE),
+    "a row of units": lambda: pose(*POSE).replace("\n", "\ns,m,m,m,-,-,-,-\n", 1),
+    "a row of other units": lambda: text(
+        {n: 1e3 * flown()[n] if n in ("time", *XYZ) else flown()[n] for n in POSE}
+    ).replace("\n", "\n[ms],[mm],[mm],[mm],[],[],[],[]\n", 1),
+    "semicolons and decimal commas": lambda: comma(pose(*POSE)),
+    "tabs": lambda: pose(*POSE, separator="\t"),
+    "tabs and decimal commas": lambda: pose(*POSE, separator="\t").replace(".", ","),
+    "blanks": lambda: "# " + pose(*POSE, separator="  "),
+    "UTF-16": lambda: pose(*POSE).encode("utf-16"),
+    "UTF-8 with a mark": lambda: pose(*POSE).encode("utf-8-sig"),
+    "blanks around": lambda: pose(*POSE, separator=" , ").replace("\n", "  \n"),
+    "a separator at each end": lambda: pose(*POSE).replace("\n", ",\n"),
+    "a separator at each row's end": lambda: (
+        pose(*POSE).replace("\n", ",\n").replace(",\n", "\n", 1)
+    ),
+    "quoted names": lambda: '"' + pose(*POSE).replace("\n", '"\n', 1).replace(",", '","', 7),
+    "lines of Windows": lambda: pose(*POSE).replace("\n", "\r\n"),
+    "an index first": lambda: "\n".join(
+        f"{i - 1 if i else ''},{row}" for i, row in enumerate(pose(*POSE).splitlines())
+    ),
+}
+"""Way -> the content of a table that holds a pose."""
+
+NOT_READ: Mapping[str, tuple[Callable[[], str], str]] = {
+    "no time": (
+        lambda: renamed({n: n for n in POSE[1:]}), "no column that is a time among x, y, z",
+    ),
+    "no attitude": (
+        lambda: renamed({n: n for n in POSE[:4]}), "by their names are its attitude, among time, x",
+    ),
+    "other names": (
+        lambda: pose("time", "north", "east", "up", *POSE[4:]),
+        "by their names are its position, among time, north",
+    ),
+    "no line of names": (
+        lambda: pose(*POSE).partition("\n")[2], "has no line of column names",
+    ),
+}  # fmt: skip
+"""Way -> a table that is not read, and how the line that says why begins."""
