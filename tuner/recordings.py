@@ -21,6 +21,7 @@ from tuner.flights.stale import is_stale
 from tuner.objective.allocation import with_commands
 from tuner.objective.choice import FED_BY, choose_inlet
 from tuner.objective.inlets import INLETS, window_seconds
+from tuner.objective.motor_order import flight_in_rotor_order
 from tuner.objective.speed_unit import with_speeds_in_si
 from tuner.objective.windows import require_windows
 from tuner.simulation.trajectory import with_named_reference
@@ -212,6 +213,7 @@ def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
             f"{denied.numbers['agreement']:.2f} of 1)",
             "look for a time that runs backwards, and at frame and quaternion in the topic map",
         )
+    flight = flight_in_rotor_order(flight, settings.vehicle)
     flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
     choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
     chosen = choice.inlet

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, JsonValue, model_validator
 from tuner.coefficients import COEFFICIENTS
 from tuner.disk import write_text
 from tuner.errors import ConfigError, did_you_mean
+from tuner.motor_orders import MotorOrder
 from tuner.yaml_files.document import commented, dump_yaml
 from tuner.yaml_files.section import (
     NonNegative,
@@ -178,6 +179,9 @@ class VehicleFile(Section):
     rotors
         Four in PX4's motor order (front right, rear left, front left, rear right), or six or eight
         in any order.
+    motor_order
+        In which its recordings list the motors: ``px4``, ``ardupilot``, ``betaflight``,
+        ``crazyflie`` or the recorded motor, from 1, of each rotor; a topic map that says so wins.
     motor, aerodynamics, setup, battery
         See there.
     effects
@@ -191,6 +195,7 @@ class VehicleFile(Section):
     mass: Positive
     inertia: Inertia
     rotors: tuple[Rotor, ...]
+    motor_order: MotorOrder | None = None
     motor: Motor
     aerodynamics: Aerodynamics
     setup: Setup = Setup()

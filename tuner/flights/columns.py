@@ -37,7 +37,7 @@ _SPEED = {"rotor_speed", "rpm", "motor_speed", "rotorspeed", "motorspeed", "erpm
 _COMMAND = {"command", "cmd", "pwm", "motor", "mot", "throttle", "motors", "actuator", "u",
             "control", "output", "channels"}  # fmt: skip
 _BATTERY = {"battery_voltage", "vbat", "voltage", "battery", "bat", "batt", "voltage_v"}
-_TIME = {"time", "t", "timestamp", "stamp", "time_s", "secs", "seconds", "__time", "%time",
+_TIME = {"time", "t", "timestamp", "stamp", "time_s", "seconds", "__time", "%time",
          "datetime", "date", "rosbagtimestamp", "clock", "elapsed"}  # fmt: skip
 #: Signal -> words that speak of it where its columns are numbered.
 _MATRICES = {
@@ -52,6 +52,11 @@ _MATRICES = {
 _OTHER = {"setpoint", "sp", "ref", "reference", "target", "desired", "des", "cmdvel", "goal",
           "error", "err", "cov", "covariance", "std", "var", "variance", "bias", "raw_adc", "mag",
           "integral", "delta", "temperature", "temp", "current", "goalpose", "noise"}  # fmt: skip
+#: Words that only say of what, or by whom.
+_BODIES = {"mocap", "vicon", "optitrack", "vrpn", "qualisys", "qtm", "drone", "quad", "uav", "cf",
+           "vehicle", "body", "robot", "crazyflie", "pose", "state", "odom", "odometry", "out",
+           "signals", "local", "world", "global", "marker", "rigid", "gt", "truth", "ground",
+           "log", "sim", "measured", "meas"}  # fmt: skip
 _ESTIMATE = {"est", "estimate", "estimated", "kalman", "ekf", "filtered"}
 
 
@@ -108,7 +113,8 @@ def guess(name: str, written: str | None = None) -> Guess | None:
     if not words or _OTHER & set(words):
         return None
     whole = "_".join(words)
-    if whole in _TIME or bare.strip().lower() in _TIME or words[-1:] == ["__time"]:
+    last = re.split(r"[./]", bare.strip().lower())[-1]
+    if whole in _TIME or last in _TIME:
         return Guess("time", "", unit if unit in TIME_UNITS else None, "")
     unit = None if unit in TIME_UNITS - {"s"} else unit
     unit = None if unit == "s" else unit
@@ -144,12 +150,13 @@ def _numbered(words: set[str], unit: str | None) -> str | None:
 
 def _along(axis: str, words: set[str]) -> str | None:
     """Return the signal of a column that is called by an axis."""
+    single = {word for word in words if "_" not in word}
     rules = (
         ("attitude", axis == "w" or bool(words & _ATTITUDE)),
         ("body_rate", bool(words & (_RATE - {"angular"})) or {"twist", "angular"} <= words),
         ("acceleration", bool(words & _FORCE)),
         ("velocity", bool(words & (_VELOCITY | {"twist"}))),
-        ("position", not words or bool(words & _POSITION) or words <= _ESTIMATE),
+        ("position", bool(words & _POSITION) or single <= _ESTIMATE | _BODIES),
     )
     return next((signal for signal, holds in rules if holds), None)
 

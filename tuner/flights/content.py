@@ -33,6 +33,10 @@ from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
 from tuner.flights.units import to_si
 from tuner.flights.yardstick import Stamped, is_too_slow, scales_of, unit_of
+from tuner.motor_orders import columns_of, order_in_words
+
+PER_MOTOR = ("command", "rotor_speed")
+"""Signals with a column a motor."""
 
 
 @dataclass(frozen=True)
@@ -139,18 +143,24 @@ def read_signals(
     if with_pose:
         require_pose(recording, chosen, places, given=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
+    order = sidecar.motor_order or chosen.motor_order
     notes = [
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *taken,
         *passed_over,
         *unread(recording, chosen, places),
         *_open_unit(places),
+        *_alone(places),
         *contents.notes,
         *noticed,
     ]
     if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
         raw, quicker = _quickened(raw)
         notes += quicker
+    if order is not None and set(PER_MOTOR) & set(raw):
+        raw = _in_order(raw, columns_of(order))
+        names = (order_in_words([column + 1 for column in columns_of(order)]),)
+        notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
     series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
     topics = {signal: data.topic for signal, data in raw.items()}
     damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
@@ -158,6 +168,13 @@ def read_signals(
     return Signals(
         recording, chosen, places, contents.samples, topics, series, tuple(notes), damage
     )
+
+
+def _alone(places: Mapping[str, Place]) -> list[Note]:
+    """Note that a pose is all that was recorded."""
+    drives = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
+    alone = {"position", "attitude"} <= set(places) and not set(drives) & set(places)
+    return [Note(NoteCode.POSE_ALONE)] if alone else []
 
 
 def _open_unit(places: Mapping[str, Place]) -> list[Note]:
@@ -229,6 +246,16 @@ def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | No
     if isinstance(settings.topics, str | Path):
         return load_topic_map(settings.topics)
     return settings.topics
+
+
+def _in_order(raw: dict[str, Raw], columns: list[int]) -> dict[str, Raw]:
+    """Return signals with a column a motor in PX4's order."""
+    ordered = {
+        name: replace(raw[name], values=raw[name].values[:, columns])
+        for name in PER_MOTOR
+        if name in raw
+    }
+    return {name: ordered.get(name, data) for name, data in raw.items()}
 
 
 def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:

@@ -97,11 +97,22 @@ def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:
     return Table(path)
 
 
+def _is_matlab(head: Head) -> bool:
+    return head.start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"))
+
+
+def _open_matlab(path: Path, _: tuple[Path, ...]) -> Recording:
+    from tuner.flights.matlab import MatlabTable  # noqa: PLC0415
+
+    return MatlabTable(path)
+
+
 #: The first that matches reads a recording.
 READERS: tuple[Reader, ...] = (
     Reader("ros", "ROS 1 .bag, ROS 2 folders, .db3 and .mcap", _is_ros, _open_ros),
     Reader("ulog", "PX4 .ulg", lambda head: head.start.startswith(b"ULog"), _open_ulog),
     Reader("micro_sd", "Crazyflie micro-SD logs", _is_micro_sd, _open_micro_sd),
+    Reader("table", "MATLAB .mat", _is_matlab, _open_matlab, tabular=True),
     Reader("table", ".csv and .parquet", _is_table, _open_table, tabular=True),
 )
 

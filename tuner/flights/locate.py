@@ -169,6 +169,9 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
 def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool) -> tuple[str, str]:
     """Return why a table holds no pose, and what to do."""
     columns = recording.fields("")
+    obstacle = getattr(recording, "obstacle", None)
+    if obstacle is not None and not given:
+        return str(obstacle[0]), str(obstacle[1])
     listed = f"{', '.join(columns[:NAMED])}{', ...' if len(columns) > NAMED else ''}"
     clocks = [clock.field for clock in topics.time]
     if not any(field in columns for field in clocks):

@@ -50,6 +50,8 @@ class NoteCode(StrEnum):
     FRAME_TURNED = "frame_turned"  # names: the signal, the frame that it is in
     UNIT_READ = "unit_read"  # names: the signal, the unit that it is in
     SPEED_UNIT_OPEN = "speed_unit_open"  # names: the unit of `UNITS` that is assumed
+    MOTOR_ORDER_GIVEN = "motor_order_given"  # names: the order of `MOTOR_ORDERS`, or the motors
+    POSE_ALONE = "pose_alone"
     TIME_READ = "time_read"
     UNIT_DOUBTED = "unit_doubted"  # times; names: the signal
     ATTITUDE_DOUBTED = "attitude_doubted"  # agreement, upright

@@ -178,7 +178,17 @@ class TabularRecording:
         The `Reader.format`.
     columns
         Their names.
+
+    Attributes
+    ----------
+    units
+        Column -> what a row of units says of it.
+    obstacle
+        Why its columns say nothing by themselves, and what to do; None where they may.
     """
+
+    units: Mapping[str, str] = {}
+    obstacle: tuple[str, str] | None = None
 
     def __init__(self, path: Path, format_name: str, columns: Sequence[str]) -> None:
         self.path = path

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from tuner.motor_orders import MotorOrder
 from tuner.yaml_files.section import Number, Section, read_model
 
 
@@ -22,6 +23,8 @@ class Sidecar(Section):
         The topic map of this recording: a file beside it, or a shipped map's name.
     namespace
         Prefix of its topics.
+    motor_order
+        In which its motors were recorded, as in a topic map.
     """
 
     trajectory: Mapping[str, str | Number] | None = None
@@ -29,6 +32,7 @@ class Sidecar(Section):
     end: Number | None = None
     topics: str | None = None
     namespace: str = ""
+    motor_order: MotorOrder | None = None
 
 
 def sidecar_path(recording: Path) -> Path:

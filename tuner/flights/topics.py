@@ -15,6 +15,7 @@ from tuner.flights.flight import SIGNALS
 from tuner.flights.formats import is_tabular
 from tuner.flights.recording import Clock
 from tuner.flights.units import ATTITUDES, UNITS
+from tuner.motor_orders import MotorOrder
 from tuner.yaml_files.section import Section, Whole, read_model, refuse
 from tuner.yaml_files.shipped import configs_folder, find_config
 
@@ -90,6 +91,9 @@ class TopicMap(Section):
         Fields that hold the time, the preferred one first; none means the message's header.
     messages
         ``.msg`` files, or folders of them, for ROS types that a recording does not define.
+    motor_order
+        In which the columns of ``command`` and ``rotor_speed`` are listed, of `MOTOR_ORDERS` or
+        four numbers; None where nothing is said.
     signals
         Signal of `SIGNALS` to its sources. In a table, a list of columns says it all.
     """
@@ -100,6 +104,7 @@ class TopicMap(Section):
     priority: Whole = 0
     time: Annotated[tuple[Clock, ...], BeforeValidator(_as_list)] = ()
     messages: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = ()
+    motor_order: MotorOrder | None = None
     signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_list)]]
 
     @model_validator(mode="before")
@@ -187,6 +192,7 @@ def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: in
     return topic_map.replace(
         signals={**under.signals, **topic_map.signals},
         time=topic_map.time or under.time,
+        motor_order=topic_map.motor_order or under.motor_order,
         messages=(*topic_map.messages, *under.messages),
     )
 

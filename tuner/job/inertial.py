@@ -23,6 +23,7 @@ from tuner.inertial.signals import stretches_of
 from tuner.job.bench import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.folder import folder_for
 from tuner.job.listener import SILENT, Listener
+from tuner.objective.motor_order import columns_of_rotors, in_rotor_order
 from tuner.recordings import left_out_of
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
@@ -52,6 +53,9 @@ def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[
             continue
         if flight is None:
             return (), ()
+        columns = columns_of_rotors(settings.vehicle, flight.notes)
+        if columns is not None:
+            flight = replace(flight, series=in_rotor_order(flight.series, columns))
         flights.append(flight)
     if left_out and not flights:
         raise left_out[0][1]

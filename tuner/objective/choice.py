@@ -118,11 +118,13 @@ def inlet_for(flight: Flight, requested: str) -> InletName:
     if requested == "auto":
         if preferred is not None:
             return preferred.name
+        alone = any(note.code is NoteCode.POSE_ALONE for note in flight.notes)
         fed = tuple(dict.fromkeys(signal for inlet in INLETS.values() for signal in inlet.needs))
         raise RecordingError(
             flight.path,
-            "holds neither a reference with velocities, nor rate set-points, nor four motor "
-            "commands, nor four rotor speeds, nor thrust set-points" + _dropped(flight, fed),
+            f"holds {'a pose alone, and ' if alone else ''}neither a reference with velocities, "
+            "nor rate set-points, nor four motor commands, nor four rotor speeds, nor thrust "
+            f"set-points{_dropped(flight, fed)}",
             "name its trajectory in the job file",
         )
     (inlet,) = (inlet for inlet in INLETS.values() if inlet.name == requested)

@@ -7,8 +7,8 @@ angular acceleration; of the two senses of spin, one makes the yaw.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
@@ -16,7 +16,10 @@ from scipy import signal
 
 from tuner.config import VehicleFile
 from tuner.findings import Code, Finding
-from tuner.flights.flight import Array, Series
+from tuner.flights.content import PER_MOTOR
+from tuner.flights.flight import Array, Flight, Series
+from tuner.flights.notes import Note, NoteCode
+from tuner.motor_orders import columns_of
 from tuner.objective.explained import (
     Source,
     common_clock,
@@ -118,6 +121,43 @@ def order_findings(
     if order.fields != tuple(sorted(order.fields)):
         return (Finding(Code.MOTOR_ORDER, "warning", name, names=order.fields),)
     return (Finding(Code.SPINS_REVERSED, "warning", name),)
+
+
+def columns_of_rotors(vehicle: VehicleFile, notes: Sequence[Note]) -> list[int] | None:
+    """Return the recorded column, from 0, of each rotor, where only the vehicle file says it.
+
+    Parameters
+    ----------
+    vehicle
+        Whose file may say in which order its recordings are.
+    notes
+        Of the recording, whose topic map may have said it, and then was read so.
+    """
+    said = any(note.code is NoteCode.MOTOR_ORDER_GIVEN for note in notes)
+    return None if said or vehicle.motor_order is None else columns_of(vehicle.motor_order)
+
+
+def in_rotor_order(series: Mapping[str, Series], columns: list[int]) -> dict[str, Series]:
+    """Return signals with what was recorded of motors in the order of the rotors."""
+    return {
+        name: Series(of.time, of.values[:, columns]) if name in PER_MOTOR else of
+        for name, of in series.items()
+    }
+
+
+def flight_in_rotor_order(flight: Flight, vehicle: VehicleFile) -> Flight:
+    """Return a flight with its motors in the order of the vehicle's rotors."""
+    columns = columns_of_rotors(vehicle, flight.notes)
+    if columns is None:
+        return flight
+    signals = {n: of[:, columns] if n in PER_MOTOR else of for n, of in flight.signals.items()}
+    initial = {name: getattr(flight.initial, name)[columns] for name in PER_MOTOR}
+    return replace(
+        flight,
+        series=in_rotor_order(flight.series, columns),
+        signals=signals,
+        initial=replace(flight.initial, **initial),
+    )
 
 
 def _alike(turning: Array, squares: Array, arms: Array) -> float:

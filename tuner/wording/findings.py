@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from tuner.findings import Code, Finding
+from tuner.motor_orders import order_in_words
 from tuner.wording import composed
 from tuner.wording.phrases import as_sentence, listed, percent
 
@@ -206,7 +207,7 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
             "The recorded motors are not in the order of the vehicle file's rotors: how they turn "
             "the vehicle makes them {names} of the columns that the topic map lists."
         ),
-        "List the topic map's fields in that order.",
+        "Write motor_order: {order} into the topic map, or list its fields in that order.",
     ),
     Code.SPINS_REVERSED: (
         "The recorded motors yaw the vehicle against the rotors' spins in the vehicle file.",
@@ -347,6 +348,8 @@ def _values(finding: Finding) -> dict[str, object]:
         values |= {"coefficients": listed(finding.names), "given": finding.names[0]}
         values["text"] = finding.names[-1]
         values["unit"] = finding.names[-1]
+        if all(name.isdecimal() for name in names):
+            values["order"] = order_in_words([int(name) for name in names])
     seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
     values["explained_percent"] = percent(max(numbers.get("explained", 0.0), 0.0))
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}

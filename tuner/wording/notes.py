@@ -68,6 +68,11 @@ TEXTS: Mapping[NoteCode, str] = {
         "the topic map gives rotor_speed no unit: {first} is taken, and held against the weight "
         "that the rotors carry"
     ),
+    NoteCode.MOTOR_ORDER_GIVEN: "its motors are read in the order {first}",
+    NoteCode.POSE_ALONE: (
+        "a pose alone was recorded, and nothing that drives the vehicle: no motor commands, rotor "
+        "speeds, set-points or reference"
+    ),
     NoteCode.TIME_READ: (
         "times are a thousandth of what their step seemed to say, by gravity: read so"
     ),

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import struct
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
+from scipy import signal
+from scipy.io import savemat
 
 from tests.tuner.flights import ways
 from tuner.config import Options, read_vehicle, settle, with_values
-from tuner.errors import RecordingError
+from tuner.errors import ConfigError, RecordingError
 from tuner.flights import Flight, load_flight
+from tuner.flights.flight import Series
+from tuner.flights.matlab import MAGIC
 from tuner.flights.notes import NoteCode
 from tuner.flights.suggest import suggested_map
+from tuner.objective.explained import levers
+from tuner.objective.motor_order import order_findings
 from tuner.recordings import read_recordings
+from tuner.wording.findings import one_line
 from tuner.wording.notes import note_in_words
 
 COLUMNS = {
@@ -27,7 +37,9 @@ COLUMNS = {
 }
 
 
-def assert_same(flight: Flight, signals: tuple[str, ...] = tuple(COLUMNS)) -> None:
+def assert_same(
+    flight: Flight, signals: tuple[str, ...] = tuple(COLUMNS), share: float = 2e-3
+) -> None:
     """Check that a flight holds what was flown, to the digits that were written."""
     truth = ways.flown()
     assert flight.duration == pytest.approx(14.0, abs=0.05)
@@ -39,7 +51,7 @@ def assert_same(flight: Flight, signals: tuple[str, ...] = tuple(COLUMNS)) -> No
         )
         size = np.abs(expected).max()
         inside = slice(5, -5)
-        assert np.abs(again - expected)[inside].max() < 2e-3 * size, name
+        assert np.abs(again - expected)[inside].max() < share * size, name
 
 
 def read(folder: Path, content: str) -> Flight:
@@ -211,3 +223,151 @@ def test_a_suggestion_says_units_by_numbers_and_what_is_not_used(tmp_path: Path)
     suggestion = suggested_map(path)
     assert "by the numbers in millimetres" in suggestion
     assert "# not used: " in suggestion
+
+
+MATRIX = ("time", *COLUMNS["position"], *COLUMNS["attitude"])
+
+
+def test_matlab_structures_each_with_a_time_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mat"
+    savemat(path, ways.structures(), do_compression=True)
+    assert_same(load_flight(path), ("position", "attitude", "body_rate", "command"), 0.03)
+
+
+def test_matlab_structure_of_simulink(tmp_path: Path) -> None:
+    table = ways.flown()
+    signals = [{"values": table[name], "label": name} for name in MATRIX[1:]]
+    savemat(tmp_path / "flight.mat", {"out": {"time": table["time"], "signals": signals}})
+    assert_same(load_flight(tmp_path / "flight.mat"), ("position", "attitude"))
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_matlab_matrix_needs_names(transposed: bool, tmp_path: Path) -> None:
+    matrix, path = np.column_stack([ways.flown()[n] for n in MATRIX]), tmp_path / "flight.mat"
+    savemat(path, {"data": matrix.T if transposed else matrix})
+    with pytest.raises(RecordingError, match="bare matrix 'data' of 8 columns") as caught:
+        load_flight(path)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\ntime: 'data[0]'\nsignals:\n"
+        "  position: ['data[1]', 'data[2]', 'data[3]']\n"
+        "  attitude: ['data[4]', 'data[5]', 'data[6]', 'data[7]']\n"
+    )
+    assert_same(load_flight(path, topics=tmp_path / "own.yaml"), ("position", "attitude"))
+
+
+def test_matlab_arrays_beside_each_other(tmp_path: Path) -> None:
+    savemat(tmp_path / "flight.mat", {name: ways.flown()[name] for name in MATRIX})
+    assert_same(load_flight(tmp_path / "flight.mat"), ("position", "attitude"))
+
+
+def _hdf5(h5py: object, path: Path) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:  # type: ignore[attr-defined]
+        for name, fields in ways.structures().items():
+            group = file.create_group(name)
+            for field, values in fields.items():
+                group[field] = np.atleast_2d(np.asarray(values).T)
+        group["else"] = h5py.ExternalLink("/etc/passwd", "x")  # type: ignore[attr-defined]
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(512, b" "))
+
+
+def test_matlab_of_version_7_3(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    _hdf5(h5py, tmp_path / "flight.mat")
+    flight = load_flight(tmp_path / "flight.mat")
+    assert_same(flight, ("position", "attitude", "body_rate", "command"), 0.03)
+
+
+def test_matlab_of_version_7_3_without_h5py(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "flight.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512, b" "))
+    with pytest.raises(RecordingError, match=r"install multirotor-tune\[matlab\], or save"):
+        load_flight(tmp_path / "flight.mat")
+
+
+def _nested(depth: int) -> bytes:
+    """Return a MATLAB file of cells inside cells."""
+    header = struct.pack("<IIIIIIiiII", 6, 8, 1, 0, 5, 8, 1, 1, 1, 0)
+    size, parts = 0, []
+    for _ in range(depth):
+        size += len(header)
+        parts.append(struct.pack("<II", 14, size) + header)
+        size += 8
+    return MAGIC.ljust(124) + b"\0\1IM" + b"".join(reversed(parts))
+
+
+@pytest.mark.parametrize("content", [
+    _nested(30_000),
+    MAGIC.ljust(124) + b"\0\1IM" + struct.pack("<II", 15, 40) + b"x" * 40,
+    MAGIC.ljust(124) + b"\0\1IM",
+    MAGIC,
+])  # fmt: skip
+def test_hostile_matlab_files_are_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "flight.mat").write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        load_flight(tmp_path / "flight.mat")
+    assert "\n" not in str(caught.value)
+
+
+ORDERS = {"betaflight": (4, 1, 2, 3), "crazyflie": (1, 4, 2, 3), "[3, 1, 4, 2]": (2, 4, 1, 3)}
+"""How a motor order is written -> the rotor, in PX4's order, that each recorded motor drives."""
+
+
+def in_order(folder: Path, rotors: tuple[int, ...]) -> Path:
+    table = dict(ways.flown())
+    for name in ("command", "rotor_speed"):
+        held = [ways.flown()[f"{name}_{rotor}"] for rotor in rotors]
+        table |= {f"{name}_{i + 1}": column for i, column in enumerate(held)}
+    path = folder / "flight.csv"
+    path.write_text(ways.text(table))
+    return path
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_motor_order(order: str, tmp_path: Path) -> None:
+    path, vehicle = in_order(tmp_path, ORDERS[order]), read_vehicle(ways.VEHICLE)
+    (tmp_path / "own.yaml").write_text(
+        f"name: own\nformat: table\nextends: table\nmotor_order: {order}\nsignals: {{}}\n"
+    )
+    read_so = load_flight(path, topics=tmp_path / "own.yaml")
+    assert_same(read_so)
+    ordered = vehicle.replace(motor_order=yaml.safe_load(order))
+    (recording,) = read_recordings(settle(Options([str(path)], vehicle=ordered)))
+    assert_same(recording.flight)
+    path.with_suffix(".yaml").write_text(f"motor_order: {order}\n")
+    assert_same(load_flight(path))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_line_on_a_wrong_motor_order_says_which_fits(order: str) -> None:
+    vehicle, step = read_vehicle(ways.VEHICLE), 1 / 200
+    time = np.arange(0.0, 14.0, step)
+    noise = np.random.default_rng(4).normal(0.0, 0.6, (len(time), 4))
+    command = 0.6 + signal.lfilter([step / 0.1], [1, step / 0.1 - 1], noise, axis=0)
+    turning = np.square(100 + 950 * command) @ levers(vehicle) * [4e-4, 4e-4, 2e-3]
+    rate = np.cumsum(turning - turning.mean(axis=0), axis=0) * step
+    rate -= signal.lfilter([step], [1, step - 1], rate, axis=0)
+    recorded = command[:, [rotor - 1 for rotor in ORDERS[order]]]
+    series = {"body_rate": Series(time, rate), "command": Series(time, recorded)}
+    (wrong,) = order_findings("flight", series, vehicle, (0.0, 14.0))
+    assert f"Write motor_order: {order} into the topic map" in one_line(wrong)
+
+
+def test_a_motor_order_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = in_order(tmp_path, (1, 2, 3, 4))
+    for order in ("[1, 1, 2, 3]", "betaflite"):
+        path.with_suffix(".yaml").write_text(f"motor_order: {order}\n")
+        with pytest.raises(ConfigError, match="motor_order") as caught:
+            load_flight(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_pose_alone_is_said_to_be_that(tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.pose(*ways.POSE))
+    (note,) = [n for n in flight.notes if n.code is NoteCode.POSE_ALONE]
+    assert note.kind == "warning"
+    with pytest.raises(RecordingError, match="holds a pose alone, and neither a reference"):
+        as_fitted(tmp_path / "flight.csv")

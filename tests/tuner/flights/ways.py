@@ -272,3 +272,21 @@ NOT_READ: Mapping[str, tuple[Callable[[], str], str]] = {
     ),
 }  # fmt: skip
 """Way -> a table that is not read, and how the line that says why begins."""
+
+
+def structures() -> dict[str, dict[str, object]]:
+    """Return the flight as a lab's structures: the pose in s, the rest at half the rate in ms."""
+    f = flown()
+    half = slice(None, None, 2)
+    return {
+        "mocap": {
+            "t": f["time"],
+            "pos": np.column_stack([f[a] for a in XYZ]),
+            "quat": np.column_stack([f[f"q{a}"] for a in ("w", *XYZ)]),
+        },
+        "px4": {
+            "time": 1e3 * f["time"][half],
+            "gyro": np.column_stack([f[f"w{a}"] for a in XYZ])[half],
+            "motors": np.column_stack([f[c] for c in COMMANDS])[half],
+        },
+    }
