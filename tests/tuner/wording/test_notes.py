@@ -9,7 +9,7 @@ from tuner.wording.notes import PASSED_OVER, TEXTS, note_in_words
 
 NUMBERS = dict.fromkeys(
     ["seconds", "longest", "lower", "upper", "agreement", "upright", "left", "number", "drift"], 0.5
-) | {"times": 39.4}
+) | {"times": 39.4, "median": 1225.0}
 
 
 @pytest.mark.parametrize("code", NoteCode)
