@@ -32,6 +32,9 @@ class Code(StrEnum):
     CANNOT_HOVER = "cannot_hover"  # idle, full, weight (N), mass (kg)
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
     INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
+    PX4_LOOPS = "px4_loops"  # names: the inlet
+    LOGGED_GAINS = "logged_gains"  # names: what the log has otherwise, each as a clause
+    LOGS_DIFFER = "logs_differ"  # names: the parameters
     ATTITUDE_FOLLOWED = "attitude_followed"  # names: the inlet that it could have entered through
     MOTOR_ORDER = "motor_order"  # names: the recorded columns, from 1, in the vehicle's order
     SPINS_REVERSED = "spins_reversed"

@@ -44,3 +44,23 @@ def order_in_words(columns: Sequence[int]) -> str:
     """Return motors from 1 as a topic map has them: a stack's name, if it is one's, or numbers."""
     names = [name for name, order in MOTOR_ORDERS.items() if list(order) == list(columns)]
     return names[0] if names else f"[{', '.join(str(column) for column in columns)}]"
+
+
+def motor_order_of(parameters: Mapping[str, float]) -> tuple[int, ...] | None:
+    """Return the motor, from 1, of each rotor in PX4's order, by its geometry; None if it is usual.
+
+    ``CA_ROTORi_PX`` is forward and ``CA_ROTORi_PY`` right of the centre.
+    """
+    allocated = parameters.get("SYS_CTRL_ALLOC", 1.0) > 0  # from 1.14 on always
+    if not allocated or round(parameters.get("CA_ROTOR_COUNT", 0)) != 4:
+        return None
+    sits = {}
+    for motor in range(4):
+        ahead = parameters.get(f"CA_ROTOR{motor}_PX", 0.0)
+        right = parameters.get(f"CA_ROTOR{motor}_PY", 0.0)
+        sits[ahead > 0, right > 0] = motor + 1
+    rotors = ((True, True), (False, False), (True, False), (False, True))
+    if set(sits) != set(rotors):
+        return None
+    order = tuple(sits[rotor] for rotor in rotors)
+    return None if order == (1, 2, 3, 4) else order

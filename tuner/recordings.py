@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 from tuner.config import Settings, TrajectorySettings, check_mixer
 from tuner.config.job import InletName
+from tuner.config.px4_parameters import PLACES, with_parameters
 from tuner.disk import exists
 from tuner.errors import InputError, RecordingError, did_you_mean
 from tuner.findings import Code, Finding
@@ -18,6 +20,7 @@ from tuner.flights.contradiction import noted_contradiction
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
 from tuner.flights.stale import is_stale
+from tuner.flights.ulog import parameters_of
 from tuner.objective.allocation import with_commands
 from tuner.objective.choice import FED_BY, choose_inlet
 from tuner.objective.inlets import INLETS, window_seconds
@@ -57,6 +60,34 @@ class Recording:
     conditions: Mapping[str, float] = field(default_factory=dict)
     because: Finding | None = None
     input_late: float = 0.0
+
+
+def as_logged(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
+    """Return settings with the rate loop that PX4 logs among the flights tell by their parameters.
+
+    Returns
+    -------
+    tuple
+        The settings, and what the controller file had.
+    """
+    logs = {path: parameters for path in settings.flights if (parameters := parameters_of(path))}
+    if not logs:
+        return settings, ()
+    first, *others = logs.values()
+    controller, changes = with_parameters(settings.controller, first)
+    known = [name for name in PLACES.values() if name in first]
+    unlike = [name for name in known if any(other.get(name) != first[name] for other in others)]
+    findings = []
+    if changes:
+        named = not settings.origin.get("controller", "default").startswith("default")
+        names = tuple(str(change) for change in changes)
+        level: Literal["warning", "info"] = "warning" if named else "info"
+        findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=names))
+    if unlike:
+        findings.append(Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(unlike)))
+    origin = {**settings.origin, "controller": f"{settings.origin.get('controller', '')}, the log"}
+    changed = replace(settings, controller=controller, origin=origin) if changes else settings
+    return changed, tuple(findings)
 
 
 def read_recordings(

@@ -7,17 +7,18 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tuner.cli.options import Namespace, Switch, Topics
+from tuner.cli.options import Namespace, Switch, Topics, VehicleChoice
 
 
 def inspect(
     *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
     topics: Topics = None,
     namespace: Namespace = None,
+    vehicle: VehicleChoice = None,
     json: Switch = False,
     suggest: Switch = False,
 ) -> None:
-    """Report what recordings hold and what can be fitted to them, without simulating anything.
+    """Report whether recordings can be fitted, how, and what they hold; nothing is simulated.
 
     Parameters
     ----------
@@ -35,19 +36,27 @@ def inspect(
         for path in find_flights(flights):
             sys.stdout.write(suggested_map(Path(path)))
         return
+    from dataclasses import asdict
+
     from tuner.flights.inspection import as_json, inspect_recordings
     from tuner.recording_paths import find_flights
+    from tuner.verdict import in_words, verdict_of
 
     inspections, errors = inspect_recordings(
         find_flights(flights), topics=topics, namespace=namespace or ""
     )
+    verdicts = {
+        seen.path: verdict_of(seen, topics=topics, namespace=namespace, vehicle=vehicle)
+        for seen in inspections
+    }
     if json:
-        print(as_json(inspections, errors))
+        print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
     else:
         from tuner.cli.tables import console
         from tuner.flights.inspection_table import render
 
-        console().print(render(inspections))
+        words = {path: in_words(verdict) for path, verdict in verdicts.items()}
+        console().print(render(inspections, words))
     if errors:
         for error in errors[:-1]:
             sys.stderr.write(f"tune: {error}\n")

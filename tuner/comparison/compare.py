@@ -12,7 +12,7 @@ from tuner.comparison.errors import FlightErrors, rmse_of
 from tuner.comparison.table import Row, Table, check_table_file, write_table
 from tuner.config import Options, Settings, VehicleFile, find_config, read_vehicle, settle
 from tuner.errors import InputError
-from tuner.recordings import read_usable
+from tuner.recordings import as_logged, read_usable
 from tuner.result import RMSE_UNITS, AxesRmse
 from tuner.wording.findings import one_line
 
@@ -53,14 +53,14 @@ def compare(
     """
     for path in out:
         check_table_file(path)
-    settings = settle(options, fits=False)
+    settings, logged = as_logged(settle(options, fits=False))
     if not vehicles:
         raise InputError("--vehicle", "names no vehicle", "name the vehicles to compare")
     if not isinstance(vehicles, Mapping):
         vehicles = {name: name for name in vehicles}
     sets = {label: _vehicle(named) for label, named in vehicles.items()}
     recordings, noticed = read_usable(settings, fits=False)
-    for finding in noticed:
+    for finding in (*logged, *noticed):
         on_message(one_line(finding))
     comparison = Comparison(recordings, settings.controller, window=settings.job.search.window)
     table = table_of({label: comparison.fly(vehicle) for label, vehicle in sets.items()})

@@ -33,8 +33,10 @@ from tuner.flights.sync import align_pose
 from tuner.flights.topics import TopicMap, load_topic_map, shipped_maps
 from tuner.flights.units import to_si
 from tuner.flights.yardstick import Stamped, is_too_slow, scales_of, unit_of
-from tuner.motor_orders import columns_of, order_in_words
+from tuner.motor_orders import columns_of, motor_order_of, order_in_words
 
+PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
+"""Messages that ask PX4's own position control for something."""
 PER_MOTOR = ("command", "rotor_speed")
 """Signals with a column a motor."""
 
@@ -143,7 +145,9 @@ def read_signals(
     if with_pose:
         require_pose(recording, chosen, places, given=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
-    order = sidecar.motor_order or chosen.motor_order
+    of_map = None if given is None else given.motor_order
+    of_log = motor_order_of(getattr(recording, "parameters", {}))
+    order = sidecar.motor_order or of_map or of_log or chosen.motor_order
     notes = [
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
         *taken,
@@ -151,6 +155,7 @@ def read_signals(
         *unread(recording, chosen, places),
         *_open_unit(places),
         *_alone(places),
+        *_of_px4(places),
         *contents.notes,
         *noticed,
     ]
@@ -175,6 +180,14 @@ def _alone(places: Mapping[str, Place]) -> list[Note]:
     drives = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
     alone = {"position", "attitude"} <= set(places) and not set(drives) & set(places)
     return [Note(NoteCode.POSE_ALONE)] if alone else []
+
+
+def _of_px4(places: Mapping[str, Place]) -> list[Note]:
+    """Note that PX4's own position control flew the reference."""
+    place = places.get("reference_position")
+    if place is None or not place.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
+        return []
+    return [Note(NoteCode.PX4_REFERENCE, "info", place.topic)]
 
 
 def _open_unit(places: Mapping[str, Place]) -> list[Note]:

@@ -247,11 +247,27 @@ def _inspect(
     return result
 
 
-def as_json(inspections: Iterable[Inspection], errors: Iterable[InputError] = ()) -> str:
-    """Return inspections as JSON; numbers that are not finite become null."""
+def as_json(
+    inspections: Iterable[Inspection],
+    errors: Iterable[InputError] = (),
+    verdicts: Mapping[str, object] | None = None,
+) -> str:
+    """Return inspections as JSON; numbers that are not finite become null.
+
+    Parameters
+    ----------
+    inspections, errors
+        As of `inspect_recordings`.
+    verdicts
+        Path -> what `tune` would do with the recording, if that was asked.
+    """
     content = {
         "schema_version": SCHEMA_VERSION,
-        "recordings": [_finite(dataclasses.asdict(inspection)) for inspection in inspections],
+        "recordings": [
+            _finite(dataclasses.asdict(inspection))
+            | ({"verdict": _finite(verdicts.get(inspection.path))} if verdicts else {})
+            for inspection in inspections
+        ],
         "errors": [str(error) for error in errors],
     }
     return json.dumps(content, indent=2, allow_nan=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -14,18 +14,33 @@ from tuner.wording.notes import damage_sentence, note_in_words
 _COLOURS = {"yes": "green", "weakly": "yellow", "no": "red"}
 
 
-def render(inspections: Iterable[Inspection]) -> RenderableType:
-    """Return what was found in recordings, for rich to print."""
-    return Group(*(part for inspection in inspections for part in _tables(inspection)))
+def render(
+    inspections: Iterable[Inspection], verdicts: Mapping[str, Sequence[str]] | None = None
+) -> RenderableType:
+    """Return what was found in recordings, for rich to print.
+
+    Parameters
+    ----------
+    inspections
+        Of them.
+    verdicts
+        Path -> lines that say first whether and how it can be fitted.
+    """
+    verdicts = verdicts or {}
+    return Group(
+        *(part for each in inspections for part in _tables(each, verdicts.get(each.path, ())))
+    )
 
 
-def _tables(inspection: Inspection) -> list[RenderableType]:
+def _tables(inspection: Inspection, verdict: Sequence[str]) -> list[RenderableType]:
     size = f"{inspection.size / 1e6:.1f} MB"
     about = [inspection.format, size, f"{inspection.duration:.1f} s"]
     about += [inspection.started.replace("+00:00", " UTC")] if inspection.started else []
     about += [f"topic map {inspection.topic_map}"] if inspection.topic_map else []
     parts: list[RenderableType] = [Text(), Text(inspection.path, "bold"), Text(" · ".join(about))]
-    if inspection.problem:
+    colour = "red" if verdict and verdict[0].startswith("cannot") else "green"
+    parts += [Text(line, colour if not line.startswith(" ") else "") for line in verdict]
+    if inspection.problem and not verdict:
         parts.append(Text(inspection.problem, "red"))
     parts += [Text(f"warning: {damage_sentence(damage)}", "yellow") for damage in inspection.damage]
     parts.append(_topics(inspection))

@@ -51,6 +51,7 @@ class NoteCode(StrEnum):
     UNIT_READ = "unit_read"  # names: the signal, the unit that it is in
     SPEED_UNIT_OPEN = "speed_unit_open"  # names: the unit of `UNITS` that is assumed
     MOTOR_ORDER_GIVEN = "motor_order_given"  # names: the order of `MOTOR_ORDERS`, or the motors
+    PX4_REFERENCE = "px4_reference"
     POSE_ALONE = "pose_alone"
     TIME_READ = "time_read"
     UNIT_DOUBTED = "unit_doubted"  # times; names: the signal

@@ -36,6 +36,11 @@ class ULogRecording:
 
     A further instance of a message is the topic ``name[1]``.
 
+    Attributes
+    ----------
+    parameters
+        Name -> value at the log's beginning.
+
     Raises
     ------
     RecordingError
@@ -49,6 +54,7 @@ class ULogRecording:
         if path.stat().st_size > LARGEST:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
         self._formats, self._data_start = _formats(path)
+        self.parameters = dict(_parameters(path))
         counts, ids, self._behind = _count(path, self._data_start)
         self.topics = tuple(
             sorted(
@@ -156,6 +162,28 @@ def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
     return formats, start
+
+
+def parameters_of(path: Path) -> dict[str, float]:
+    """Return the parameters at the beginning of a PX4 log; none of what is no such log."""
+    if not path.is_file():
+        return {}
+    with path.open("rb") as stream:
+        if stream.read(7) != b"ULog\x01\x12\x35":
+            return {}
+    return dict(_parameters(path))
+
+
+def _parameters(path: Path) -> Iterator[tuple[str, float]]:
+    """Yield the parameters before the data, bounded by the size of the definitions."""
+    for kind, buffer, at, end in _records(path, 16):
+        if kind in (ord("A"), ord("L"), ord("C"), ord("D")):
+            return
+        length = buffer[at] if end > at else 0
+        word, _, name = buffer[at + 1 : at + 1 + length].decode(errors="replace").partition(" ")
+        form = {"float": "<f", "int32_t": "<i"}.get(word)
+        if kind == ord("P") and form is not None and end - at == 1 + length + 4:
+            yield name, float(struct.unpack_from(form, buffer, at + 1 + length)[0])
 
 
 def _has(formats: Mapping[str, list[tuple[str, int, str]]], kind: str, path: list[str]) -> bool:

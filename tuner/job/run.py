@@ -51,7 +51,7 @@ from tuner.job.search import OnProgress, parameters_of
 from tuner.job.selected import Selected
 from tuner.job.terms import search_with_terms
 from tuner.prediction.input_lag import with_inputs_on_time
-from tuner.recordings import read_usable
+from tuner.recordings import as_logged, read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
@@ -112,10 +112,11 @@ def run(
     """
     if refits is not None:
         check_bootstrap(refits)
-    settings = settle(options)
+    settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
     job, findings = _prepared(settings)
+    findings = (*logged, *findings)
     explanation = Explanation(listener)
     _check(findings, explanation, force=force)
     found, (selected, fitted, examination) = _fitted(

@@ -19,7 +19,7 @@ from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.prepare import Job, job_of
 from tuner.job.unfitted import unfitted
 from tuner.objective.alternatives import alternatives_of
-from tuner.recordings import read_usable
+from tuner.recordings import as_logged, read_usable
 from tuner.report import render
 from tuner.report.record import About, Recording, write_traces
 from tuner.search.fitted import Fitted
@@ -95,7 +95,7 @@ def examine_vehicle(
     InputError
         The input cannot be used; nothing was written.
     """
-    settings = settle(options, fits=False)
+    settings, logged = as_logged(settle(options, fits=False))
     arena = None if request.arena is None else Arena.of(request.arena)
     check_names(request.profiles, "--profile")
     if not 0 < request.span <= 10:
@@ -110,7 +110,7 @@ def examine_vehicle(
     job = job_of(settings, recordings)
     make_folder(out)
     fitted = unfitted(job)
-    fitted = replace(fitted, findings=(*noticed, *fitted.findings))
+    fitted = replace(fitted, findings=(*logged, *noticed, *fitted.findings))
     on_message("simulating, and differentiating by every coefficient")
     examination = examine(
         fitted, otherwise=alternatives_of(fitted.objective, fitted.point), at_minimum=False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from tuner.config import ControllerFile, VehicleFile
@@ -69,14 +70,17 @@ def choose_inlet(
         The recording does not hold what the inlet needs.
     """
     first = inlet_for(flight, requested)
+    if requested == "auto" and first == "reference" and _is_px4s(flight):
+        with suppress(RecordingError):
+            below = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
+            names = (below.inlet,)
+            return Choice(below.inlet, Finding(Code.PX4_LOOPS, "info", flight.name, names=names))
     if requested == "auto" and first == "reference":
         match = match_setpoints(flight, controller)
         if match is not None and not match.is_ours:
             (because,) = setpoint_findings(flight, controller)
-            below = replace(
-                flight, signals={n: s for n, s in flight.signals.items() if n not in REFERENCE}
-            )
-            return Choice(choose_inlet(below, "auto", vehicle, controller).inlet, because)
+            below = choose_inlet(_without_reference(flight), "auto", vehicle, controller)
+            return Choice(below.inlet, because)
     if requested != "auto" or first not in FED_BY:
         return Choice(first)
     doubt: Explained | None = None
@@ -91,6 +95,14 @@ def choose_inlet(
     if not INLETS["attitude"].can_be_fed(flight):
         return Choice(first)
     return Choice("attitude", _finding(flight, "attitude", doubt, vehicle))
+
+
+def _is_px4s(flight: Flight) -> bool:
+    return any(note.code is NoteCode.PX4_REFERENCE for note in flight.notes)
+
+
+def _without_reference(flight: Flight) -> Flight:
+    return replace(flight, signals={n: s for n, s in flight.signals.items() if n not in REFERENCE})
 
 
 def _finding(flight: Flight, inlet: InletName, doubt: Explained, vehicle: VehicleFile) -> Finding:

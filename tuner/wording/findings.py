@@ -300,6 +300,21 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     ),
     Code.INLET_CHOSEN: (composed.inlet_chosen, composed.inlet_remedy),
+    Code.PX4_LOOPS: (
+        (
+            "PX4's own position and attitude control flew it, other loops than the geometric ones "
+            "that are simulated: it enters below them, through the inlet {first}."
+        ),
+        "",
+    ),
+    Code.LOGGED_GAINS: (
+        "The rate loop is simulated with the log's own parameters: {coefficients}.",
+        "",
+    ),
+    Code.LOGS_DIFFER: (
+        "The logs have different values of {coefficients}; those of the first are simulated.",
+        "Fit them one by one.",
+    ),
     Code.ATTITUDE_FOLLOWED: (
         (
             "The recorded attitude of all fitted flights is followed, so that nothing is fitted of "

@@ -69,6 +69,9 @@ TEXTS: Mapping[NoteCode, str] = {
         "that the rotors carry"
     ),
     NoteCode.MOTOR_ORDER_GIVEN: "its motors are read in the order {first}",
+    NoteCode.PX4_REFERENCE: (
+        "is what PX4's own position control was asked for, another loop than the geometric one"
+    ),
     NoteCode.POSE_ALONE: (
         "a pose alone was recorded, and nothing that drives the vehicle: no motor commands, rotor "
         "speeds, set-points or reference"

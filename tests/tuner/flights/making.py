@@ -279,8 +279,14 @@ def px4_messages(bag: Path) -> dict[str, Column]:
     }
 
 
-def to_ulog(messages: Mapping[str, Column], path: Path, *, boot: int = 0) -> Path:
-    """Write PX4's messages as a log whose clock starts at `boot` ns."""
+def to_ulog(
+    messages: Mapping[str, Column],
+    path: Path,
+    *,
+    boot: int = 0,
+    parameters: Mapping[str, float] | None = None,
+) -> Path:
+    """Write PX4's messages as a log whose clock starts at `boot` ns, and its parameters."""
 
     def record(kind: str, content: bytes) -> bytes:
         return struct.pack("<HB", len(content), ord(kind)) + content
@@ -289,6 +295,11 @@ def to_ulog(messages: Mapping[str, Column], path: Path, *, boot: int = 0) -> Pat
     out.append(record("F", b"esc_report:double esc_rpm;"))
     for name, fields in ULOG_FORMATS.items():
         out.append(record("F", f"{name}:uint64_t timestamp;{fields}".encode()))
+    for name, value in (parameters or {}).items():
+        whole = isinstance(value, int)
+        key = f"{'int32_t' if whole else 'float'} {name}".encode()
+        number = struct.pack("<i" if whole else "<f", value)
+        out.append(record("P", struct.pack("<B", len(key)) + key + number))
     numbers = {name: i for i, name in enumerate(messages)}
     for name, i in numbers.items():
         out.append(record("A", struct.pack("<BH", 0, i) + name.encode()))

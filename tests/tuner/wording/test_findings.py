@@ -35,6 +35,11 @@ MADE = {
         "quad",
         {"idle": 0.34, "full": 41.0, "weight": 0.33, "mass": 0.034},
     ),
+    Code.PX4_LOOPS: Finding(Code.PX4_LOOPS, "info", "a", names=("body_rate",)),
+    Code.LOGGED_GAINS: Finding(
+        Code.LOGGED_GAINS, "info", "a", names=("rate.roll.p 0.15 (MC_ROLLRATE_P)", "rate.rate 800")
+    ),
+    Code.LOGS_DIFFER: Finding(Code.LOGS_DIFFER, "warning", "flights", names=("MC_ROLLRATE_P",)),
     Code.POSE_GAP: Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.4}),
     Code.SPARSE_INPUT: Finding(
         Code.SPARSE_INPUT, "warning", "a", {"recorded": 20.0, "needed": 400.0}, ("command",)
