@@ -18,8 +18,9 @@ from sim_jax.state import Setpoints
 from tuner.filter_error.recorded import SETPOINTS
 from tuner.flights.flight import Flight, Series
 from tuner.model import Model
+from tuner.objective.flight import Trace, beginning_of, trace_of
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import Trace, beginning_of, simulated_at_stamps, trace_of
+from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
 
 Array = NDArray[np.float64]
@@ -94,13 +95,16 @@ def recorded(
     trace, setpoints = _flown(model, flown, pushing)
     if bool(jnp.isfinite(trace.crash_time).any()):
         return None
-    still = jnp.zeros((len(OFFSETS), objective.segments.count))
+    still = np.zeros((len(OFFSETS), objective.segments.count))
     rate, measured = float(objective.schedule.log_rate), {}
+    reading = Reading(still, still[: len(CLOCKS)], rate, objective.samples)
     for channel, old in objective.segments.measured.items():
-        clean = simulated_at_stamps(trace, channel, old, still, still[: len(CLOCKS)], rate=rate)
+        logged = np.moveaxis(np.asarray(trace.channels[channel]), -1, 0)
+        read = at_stamps(logged, channel, np.asarray(old.time).T, reading)
+        clean = np.moveaxis(read, 0, -1)
         known = np.asarray(old.weight)
         noise = random.normal(size=known.shape) / np.where(known > 0.0, known, np.inf)
-        noisy = _turned(np.asarray(clean), noise) if channel == "attitude" else clean + noise
+        noisy = _turned(clean, noise) if channel == "attitude" else clean + noise
         measured[channel] = Measured(old.time, jnp.asarray(noisy), old.weight)
     segments = replace(objective.segments, measured=measured)
     return Flown(replace(objective, segments=segments), setpoints)

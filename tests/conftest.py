@@ -15,8 +15,10 @@ emitter of kernels two fifths of the rest are saved; `make test-all` has both as
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -29,6 +31,7 @@ if not os.environ.get("TUNE_TESTS_OPTIMISED"):
 
 from hypothesis import settings
 
+from lanes.machine import keep_code_in
 from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
@@ -39,6 +42,7 @@ __all__ = ["demo"]
 
 set_environment()
 collect_rarely()
+keep_code_in(cache_folder() / "kernels_of_tests")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
@@ -60,6 +64,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         folders[path in slow, path.parent].append(path)
     behind = {path: len(paths) - i for paths in folders.values() for i, path in enumerate(paths)}
     items.sort(key=lambda item: (item.path not in slow, -behind[item.path]))
+
+
+class _NoFallback(logging.Handler):
+    """Fails a test in which something runs through XLA for want of a rule."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        raise AssertionError(record.getMessage())
+
+
+@pytest.fixture(autouse=True)
+def kernels_alone(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Hold that every flight of every job runs as a kernel; `tests.lanes` tests what else does."""
+    if "tests/lanes" in request.node.path.as_posix():
+        yield
+        return
+    watched, handler = logging.getLogger("lanes.program"), _NoFallback(logging.DEBUG)
+    before = watched.level
+    watched.addHandler(handler)
+    watched.setLevel(logging.DEBUG)
+    yield
+    watched.removeHandler(handler)
+    watched.setLevel(before)
 
 
 @pytest.hookimpl(trylast=True)

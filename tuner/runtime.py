@@ -42,8 +42,6 @@ logger = logging.getLogger(__name__)
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
 """What `jax.monitoring` calls the end of compiling, or of reading compiled code from the cache."""
-AHEAD = "ahead"
-"""How the names of threads begin that compile what a run may need later."""
 
 #: Releases of jaxlib (major.minor) known to accept all flags below: an unknown one is fatal.
 _RELEASES_KNOWN = ("0.10",)
@@ -146,6 +144,10 @@ def configure(*, keep_compiled: bool = True) -> None:
     import jax  # noqa: PLC0415 (must come after the environment, and is slow)
 
     return_memory_after_compiling()
+    if keep_compiled:
+        from lanes import keep_code_in  # noqa: PLC0415 (imports jax)
+
+        keep_code_in(cache_folder() / "kernels")
     if "JAX_ENABLE_X64" not in os.environ:
         jax.config.update("jax_enable_x64", True)
     if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]

@@ -26,11 +26,11 @@ NOT_IMPORTED = {
 WHERE_INSTALLED = {"test": {"s3fs", "moto"}}
 TOOLS = {"dev", "docs"}
 """Extras of nothing but those."""
-OURS = {"sim_jax", "tuner", "tests", "benchmarks", "examples", "docs"}
+OURS = {"lanes", "sim_jax", "tuner", "tests", "benchmarks", "examples", "docs"}
 
 #: Folders -> the extra that they need beside what is always installed.
 USES = {
-    None: ("sim_jax", "tuner", "examples", "docs"),
+    None: ("lanes", "sim_jax", "tuner", "examples", "docs"),
     "test": ("tests",),
     "bench": ("benchmarks",),
     "cluster": ("tuner/engine",),

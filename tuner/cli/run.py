@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import errno
 import logging
-import os
 import shlex
 import sys
-import threading
 import traceback
 from collections.abc import Sequence
 from typing import NoReturn
@@ -17,7 +15,6 @@ from cyclopts import CycloptsError
 from tuner.cli.app import COMMANDS, app
 from tuner.cli.options import TYPED
 from tuner.errors import InputError, ServerFaultError, did_you_mean
-from tuner.runtime import AHEAD
 
 DONE = 0
 OUR_FAULT = 1
@@ -27,18 +24,8 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def program() -> NoReturn:
-    """Be the process `tune`: run it, and end with its exit status.
-
-    A run that was interrupted or refused may still be compiling, in another thread, what it will
-    not need; that cannot be told to stop, and Python would wait for it.
-    """
-    status = main()
-    if any(thread.name.startswith(AHEAD) for thread in threading.enumerate()):
-        logging.shutdown()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status)
-    sys.exit(status)
+    """Be the process `tune`: run it, and end with its exit status."""
+    sys.exit(main())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

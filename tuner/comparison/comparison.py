@@ -17,8 +17,6 @@ from dataclasses import replace
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array as JaxArray
-from jaxtyping import Float
 
 from sim_jax.crash import AIRBORNE, Limits
 from sim_jax.schedule import Schedule
@@ -37,15 +35,12 @@ from tuner.flights.flight import Array
 from tuner.model import Model, model_of, schedule_of, with_terms_computed
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
+from tuner.objective.flight import MOTION, TURNED
+from tuner.objective.flown import fly
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import (
-    environment_of,
-    simulate_segments,
-    simulated_at_stamps,
-    trace_of,
-)
+from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import (
     CLOCKS,
     OFFSETS,
@@ -55,7 +50,6 @@ from tuner.objective.segments import (
 )
 from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
-from tuner.parallel import padded_size
 from tuner.recordings import Recording
 from tuner.search.free_starts import FAR
 from tuner.search.progress import plain_criterion
@@ -216,18 +210,17 @@ class _Group:
         segments, states = self._segments, None
         if fitted_starts:
             segments = self._laid(free_starts=True)
-            states = jnp.asarray(self._likeliest_starts(model, segments))
+            states = self._likeliest_starts(model, segments)
         elif self.windowed:
             segments = self._spinning(vehicle)
         simulated, acted, crash_times = _flown(
             model,
             segments,
-            jnp.asarray(self._late),
-            {name: jnp.asarray(values[owner]) for name, values in self._conditions.items()},
+            self._late,
+            {name: values[owner] for name, values in self._conditions.items()},
             schedule=self._schedule,
             samples=self._samples,
             limits=self._limits,
-            windowed=self.windowed,
             states=states,
             stride=self._stride,
         )
@@ -237,7 +230,7 @@ class _Group:
             position, attitude = (
                 joined(
                     [
-                        self._errors(signal, np.asarray(simulated[signal]), first + number, window)
+                        self._errors(signal, simulated[signal], first + number, window)
                         for number, window in enumerate(windows)
                     ]
                 )
@@ -263,28 +256,28 @@ class _Group:
         if self.windowed:  # the next one begins where this one ends
             used &= time < window.flight.duration
         recorded = np.asarray(measured.values)[used, :, segment]
-        flown = simulated[used, :, segment]
+        flown = simulated[segment, used]
         if signal == "attitude":
             recorded, flown = roll_pitch_yaw(recorded), roll_pitch_yaw(flown)
             return SignalErrors(time[used] + window.begin, recorded, short_way(flown - recorded))
         return SignalErrors(time[used] + window.begin, recorded, flown - recorded)
 
     def _forces(
-        self, acted: Mapping[str, JaxArray], first: int, windows: Sequence[Window], end: float
+        self, acted: Mapping[str, Array], first: int, windows: Sequence[Window], end: float
     ) -> Forces:
         """Return what acted along the segments of a flight, behind each other, up to a time in s.
 
         A window's last instants, which the next one begins with, are left out.
         """
-        of_term = {name: np.asarray(values) for name, values in in_order(acted).items()}
-        count = len(next(iter(of_term.values())))
+        of_term = in_order(acted)
+        count = next(iter(of_term.values())).shape[1]
         time = np.arange(count) * self._stride / self._schedule.log_rate
         shown = time < (self._seconds if self.windowed else end)
         segments = range(first, first + len(windows))
         whole = Forces(
             np.concatenate([time[shown] + window.begin for window in windows]),
             {
-                name: np.concatenate([values[shown, :, segment] for segment in segments])
+                name: np.concatenate([values[segment, shown] for segment in segments])
                 for name, values in of_term.items()
             },
         )
@@ -338,61 +331,50 @@ class _Group:
         return best
 
 
-@eqx.filter_jit
 def _flown(
     model: Model,
     segments: Segments,
-    late: Float[JaxArray, " F"],
-    conditions: dict[str, Float[JaxArray, " F"]],
+    late: Array,
+    conditions: Mapping[str, Array],
     *,
     schedule: Schedule,
     samples: int,
     limits: Limits,
-    windowed: bool,
-    states: Float[JaxArray, "L F"] | None,
+    states: Array | None,
     stride: int,
-) -> tuple[
-    dict[str, Float[JaxArray, "n c F"]],
-    dict[str, Float[JaxArray, "m 6 F"]],
-    Float[JaxArray, " F"],
-]:
-    """Return signal -> what the simulation has at the recorded stamps, and when it crashed in s.
+) -> tuple[dict[str, Array], dict[str, Array], Array]:
+    """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
 
-    Between the two, term -> what acted at every ``stride``-th sample.
+    Between the two, term -> what acted at every ``stride``-th sample, (F, m, 6).
 
     A stamp that is so late that it was taken before the simulation begins, or so early that it was
     taken behind its end, is compared with the simulation's first or last sample.
     """
-    rollout = simulate_segments(
+    flown = fly(
         model,
         segments,
         schedule,
-        samples=padded_size(samples) if windowed else samples,
-        horizon=jnp.asarray(samples) if windowed else None,
+        samples=samples,
         limits=limits,
         states=states,
         conditions=conditions,
+        channels=(*POSE, "rotor_speed", MOTION, TURNED),
     )
-    trace = trace_of(rollout, model, segments, conditions)
-    rate = float(schedule.log_rate)
+    rate, calm = float(schedule.log_rate), np.zeros(segments.count)
     acted = acting(
         model.vehicle,
-        rollout.log.motion,
-        rollout.log.rotor_speed,
-        environment_of(model, segments, conditions),
+        flown.channels[MOTION],
+        flown.channels[TURNED],
+        flown.channels["rotor_speed"],
         rate=rate,
+        wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
+        stride=stride,
     )
-    on_time = jnp.zeros((len(OFFSETS), segments.count))
+    on_time = np.zeros((len(OFFSETS), segments.count))
+    reading = Reading(on_time, on_time[: len(CLOCKS)], rate, samples)
     simulated = {}
     for signal in POSE:
-        measured = segments.measured[signal]
-        taken = jnp.clip(measured.time - late, 0.0, (samples - 1) / rate)
-        simulated[signal] = simulated_at_stamps(
-            trace,
-            signal,
-            eqx.tree_at(lambda m: m.time, measured, taken),
-            on_time,
-            on_time[: len(CLOCKS)],
-            rate=rate,
-        )
-    return simulated, {n: values[::stride] for n, values in acted.items()}, trace.crash_time
+        time = np.asarray(segments.measured[signal].time)
+        taken = np.clip(time - late, 0.0, (samples - 1) / rate).T
+        simulated[signal] = at_stamps(flown.channels[signal], signal, taken, reading)
+    return simulated, acted, flown.crash_time

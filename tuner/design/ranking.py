@@ -66,7 +66,7 @@ def rank_next_flights(
             full_problem.objective, some, seconds=seconds, spin_channels=spin_channels
         )
         point, weights = candidate_point(full_problem.point, criterion, objective, seconds=seconds)
-        jacobian = objective.jacobian(point, weights, columns=full_problem.columns)
+        jacobian = objective.jacobian(point, weights)
         information = information_from_jacobian(
             objective, point, weights, jacobian, offsets_fitted=offsets_fitted
         )

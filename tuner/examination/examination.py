@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tuner.filter_error.information import with_hidden, with_strengths
 from tuner.filter_error.predictor import Predictor
 from tuner.numerics import scaled_solve
-from tuner.objective.alternatives import residuals_at
 from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.normal import Objective
@@ -104,13 +103,13 @@ def examine(
     residuals: list[Residual] = []
     for flights in portions(objective, point, criterion):
         batch = portion(objective, point, criterion, flights)
-        jacobian = batch[0].jacobian(*batch[1:], columns=full_problem.columns)
+        jacobian = batch[0].jacobian(*batch[1:])
         flight_names = [names[number] for number in flights]
         others = {
             name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
             for name, other in otherwise.items()
         }
-        moved = {name: residuals_at(other, *batch[1:]) for name, other in others.items()}
+        moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
         if predictor is not None and slopes is not None:
             of_flights = predictor.among(flights)
             by_strengths = slopes.moved[..., flights]

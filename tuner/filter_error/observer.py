@@ -31,7 +31,7 @@ from tuner.filter_error.disturbances import (
 )
 from tuner.filter_error.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
-from tuner.objective.residuals import beginning_of
+from tuner.objective.flight import beginning_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
 from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable

@@ -27,7 +27,7 @@ from tuner.filter_error.recorded import gathered
 from tuner.flights.flight import Flight
 from tuner.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.loss import gauss_newton, robust_loss
+from tuner.objective.loss import gauss_newton, robust
 from tuner.objective.normal import Objective
 from tuner.search.normal_equations import normal_equations
 
@@ -118,13 +118,20 @@ def _equations(
     jacobian = predictor.jacobian(objective, point, moved)
     slopes = predictor.slopes(objective, point)
     by_strengths = gathered(slopes.moved, predictor.feed.widths, predictor.rows)
-    columns = {
-        name: jnp.concatenate([jacobian.columns[name], jnp.asarray(more)])
-        for name, more in by_strengths.items()
-    }
-    gradient, hessian = gauss_newton(columns, jacobian.residuals, criterion.scale, criterion.huber)
+    segments, total = jacobian.crash_time.shape[0], size + len(slopes.slope)
+    gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
+    loss, huber = np.zeros(segments), float(criterion.huber)
+    for name, more in by_strengths.items():
+        columns = np.concatenate([jacobian.columns[name], more])
+        errors = np.moveaxis(np.asarray(jacobian.residuals[name]), -1, 0)
+        scale = np.asarray(criterion.scale[name])
+        along, bend = gauss_newton(np.moveaxis(columns, (0, -1), (-1, 0)), errors, scale, huber)
+        gradient += along
+        hessian += bend
+        loss += 0.5 * robust(errors, huber).sum(axis=(1, 2))
+    gradient, hessian = np.moveaxis(gradient, 0, -1), np.moveaxis(hessian, 0, -1)
     sums = SegmentSums(
-        loss=robust_loss(jacobian.residuals, criterion.huber),
+        loss=loss,
         gradient=gradient[:size],
         hessian=hessian[:size, :size],
         squares={},

@@ -22,7 +22,6 @@ from tuner.examination.examination import Examination
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
-from tuner.job.ahead import ProgramsAhead
 from tuner.job.balanced import with_inputs_balanced
 from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
@@ -242,34 +241,30 @@ def _fitted(
 
     What was found is written before it is examined.
     """
-    with ProgramsAhead(job) as ahead:
-        with span("check"):
-            at_start = tuple(check_information(job))
-        _check(at_start, explanation, force=force)
+    with span("check"):
+        at_start = tuple(check_information(job))
+    _check(at_start, explanation, force=force)
 
-        make_folder(folder)
-        on_progress = _keeping_best(folder, listener)
-        try:
-            selected = search_with_terms(
-                job,
-                folder,
-                resume=resume,
-                on_progress=on_progress,
-                on_message=listener.on_message,
-                on_estimates=listener.on_estimates,
-                findings=(*findings, *at_start),
-                before_selection=ahead.await_selection,
-            )
-        except (KeyboardInterrupt, OutputError, EngineError):
-            listener.on_message(
-                f"The best coefficients so far are in {folder}. "
-                f"Continue the search with --out {folder} --resume."
-            )
-            raise
-        found = _written_as_found(folder, selected, listener, command)
-        if selected.job is job:
-            ahead.await_examination()
-        return found, examined(selected, on_progress, listener.on_message, explanation)
+    make_folder(folder)
+    on_progress = _keeping_best(folder, listener)
+    try:
+        selected = search_with_terms(
+            job,
+            folder,
+            resume=resume,
+            on_progress=on_progress,
+            on_message=listener.on_message,
+            on_estimates=listener.on_estimates,
+            findings=(*findings, *at_start),
+        )
+    except (KeyboardInterrupt, OutputError, EngineError):
+        listener.on_message(
+            f"The best coefficients so far are in {folder}. "
+            f"Continue the search with --out {folder} --resume."
+        )
+        raise
+    found = _written_as_found(folder, selected, listener, command)
+    return found, examined(selected, on_progress, listener.on_message, explanation)
 
 
 def _written_as_found(folder: Path, selected: Selected, listener: Listener, command: str) -> _Found:

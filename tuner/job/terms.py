@@ -29,7 +29,6 @@ def search_with_terms(
     on_message: Callable[[str], None],
     on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None,
     findings: tuple[Finding, ...] = (),
-    before_selection: Callable[[], None] = lambda: None,
 ) -> Selected:
     """Look for the best coefficients of a job, and for the terms that its flights call for.
 
@@ -52,7 +51,6 @@ def search_with_terms(
         if fitted.polished:
             on_estimates(point_estimates(job, fitted))
         with span("selection of terms"):
-            before_selection()
             return with_terms_selected(job, fitted, on_progress, on_message)
 
     selected = searched(resume=resume, provisional=bool(candidates_of(job)))

@@ -33,18 +33,15 @@ from sim_jax.crash import AIRBORNE
 from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
-from sim_jax.schedule import Schedule
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
 from tuner.flights.flight import Flight
 from tuner.flights.states import states_at
-from tuner.model import Model
 from tuner.objective.criterion import Point
+from tuner.objective.flown import fly
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import simulate_segments
-from tuner.objective.segments import Segments
 from tuner.objective.tunable import Tunable
 
 STRETCH = 0.2
@@ -155,8 +152,15 @@ def balance_of(objective: Objective, point: Point, flights: Sequence[Flight]) ->
         jnp.moveaxis(jnp.asarray(table), 1, 0) for table in columns.values()
     )
     model = objective.tunable.at(jnp.asarray(point.coefficients))
-    logged = _rotor_speeds(model, segments, objective.schedule, objective.samples)
-    speeds = tuple(speed[::step] for speed in logged)
+    logged = fly(
+        model,
+        segments,
+        objective.schedule,
+        samples=objective.samples,
+        limits=AIRBORNE,
+        channels=("rotor_speed",),
+    ).channels["rotor_speed"]
+    speeds = tuple(jnp.asarray(speed) for speed in logged.T[:, ::step])
     weight, slope = _smooth(samples, rate)
     return Balance(
         Motion(Vec3.of(position), Vec3.of(velocity), Quaternion.of(attitude), Vec3.of(body_rate)),
@@ -165,20 +169,6 @@ def balance_of(objective: Objective, point: Point, flights: Sequence[Flight]) ->
         weight,
         slope,
     )
-
-
-@eqx.filter_jit
-def _rotor_speeds(model: Model, segments: Segments, schedule: Schedule, samples: int) -> PerRotor:
-    """Return the speeds (n, F) in rad/s that turn the rotors of simulated windows."""
-    rolled = simulate_segments(
-        model,
-        segments,
-        schedule,
-        samples=samples,
-        horizon=jnp.asarray(samples),
-        limits=AIRBORNE,
-    )
-    return rolled.log.rotor_speed
 
 
 def _smooth(samples: int, rate: float) -> tuple[Array, Array]:

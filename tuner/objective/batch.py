@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.engine import Report, current
 from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.loss import robust_loss
+from tuner.objective.loss import robust
 from tuner.objective.normal import Objective
-from tuner.objective.simulator import Simulator
-from tuner.objective.tunable import Tunable
-from tuner.parallel import in_pieces, over_devices, piece_that_fits
+from tuner.objective.residuals import residuals
 
 CHUNK = 16
 """Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
@@ -38,15 +33,15 @@ class Batch(eqx.Module):
         (S, F) s, infinite for a segment that flew.
     """
 
-    loss: Float[Array, "S F"]
-    squares: dict[str, Float[Array, "S k F"]]
-    crash_time: Float[Array, "S F"]
+    loss: Float[NDArray[np.float64], "S F"]
+    squares: dict[str, Float[NDArray[np.float64], "S k F"]]
+    crash_time: Float[NDArray[np.float64], "S F"]
 
 
 def evaluate(
     objective: Objective, vectors: NDArray[np.float64], point: Point, criterion: Criterion
 ) -> Batch:
-    """Fly all segments with every vector, in chunks of one compiled shape.
+    """Fly all segments with every vector, in chunks that fit the memory.
 
     The engine in force computes them.
 
@@ -71,37 +66,23 @@ def _evaluated(
     task: tuple[Callable[[], tuple[Objective, Point, Criterion]], NDArray[np.float64]],
     _report: Report,
 ) -> Batch:
-    """Return what some vectors give, filled up to a whole chunk on the way."""
-    (objective, point, criterion), chunk = task[0](), task[1]
-    padded = np.concatenate([chunk, np.repeat(chunk[-1:], CHUNK - len(chunk), axis=0)])
-    batch = _shared(objective.simulator)(
-        objective.data(point.offsets, criterion),
-        objective.tunable,
-        padded,
-        np.asarray(criterion.horizon),
-        np.asarray(criterion.huber),
+    """Return what some vectors give: all segments of all vectors fly side by side."""
+    (objective, point, criterion), vectors = task[0](), task[1]
+    simulator, count = objective.simulator, len(vectors)
+    segments = objective.segments.count
+    data: SegmentData = jax.tree.map(
+        lambda leaf: np.tile(leaf, count), objective.data(point.offsets, criterion)
     )
-    return _first(batch, len(chunk))
-
-
-def _first(batch: Batch, count: int) -> Batch:
-    kept: Batch = jax.tree.map(lambda leaf: np.asarray(leaf)[:count], batch)
-    return kept
-
-
-@lru_cache(maxsize=16)
-def _shared(simulator: Simulator) -> Callable[..., Batch]:
-    def segmentwise(
-        data: SegmentData, model: Tunable, vectors: Array, horizon: Array, huber: Array
-    ) -> Batch:
-        def at(vector: Array) -> Batch:
-            trace, errors = simulator.compared(data, model, vector, horizon)
-            scaled = {name: error / data.scale[name] for name, error in errors.items()}
-            squares = {name: jnp.sum(e * e, axis=0) for name, e in errors.items()}
-            return Batch(robust_loss(scaled, huber), squares, trace.crash_time)
-
-        batch: Batch = jax.vmap(at)(vectors)
-        return batch
-
-    pieces = in_pieces(segmentwise, max(1, piece_that_fits(8) // CHUNK))
-    return over_devices(pieces, name=("many points", simulator))
+    horizon, together = int(criterion.horizon), count * segments
+    flown = simulator.fly(data, objective.tunable, np.repeat(vectors, segments, axis=0), horizon)
+    reading = simulator.reading(data, horizon)
+    loss, squares = np.zeros(together), {}
+    for name, measured in data.segments.measured.items():
+        scale = np.asarray(data.scale[name])
+        by_axis = np.zeros((together, np.shape(measured.weight)[1]))
+        for block in residuals(flown, data.segments, name, reading):
+            scaled = block.errors / scale[block.segments, None, None]
+            loss[block.segments] += 0.5 * robust(scaled, float(criterion.huber)).sum(axis=(1, 2))
+            by_axis[block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
+        squares[name] = np.moveaxis(by_axis.reshape(count, segments, -1), -1, 1)
+    return Batch(loss.reshape(count, segments), squares, flown.crash_time.reshape(count, segments))

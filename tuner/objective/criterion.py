@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 
 from tuner.coefficients import REGISTRY, recording_offsets
 from tuner.objective.segments import OFFSETS, Segments
+
+Either: TypeAlias = Any
+"""An array of NumPy, or, in a compiled step of the search, of jax."""
 
 OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
@@ -92,13 +96,13 @@ class SegmentSums(eqx.Module):
         (L, F) best start, in the segments' standard deviations; None where starts are known.
     """
 
-    loss: Float[Array, " F"]
-    gradient: Float[Array, "P F"]
-    hessian: Float[Array, "P P F"]
-    squares: dict[str, Float[Array, " F"]]
-    counts: dict[str, Float[Array, " F"]]
-    crash_time: Float[Array, " F"]
-    states: Float[Array, "L F"] | None
+    loss: Float[Either, " F"]
+    gradient: Float[Either, "P F"]
+    hessian: Float[Either, "P P F"]
+    squares: dict[str, Float[Either, " F"]]
+    counts: dict[str, Float[Either, " F"]]
+    crash_time: Float[Either, " F"]
+    states: Float[Either, "L F"] | None
 
 
 class Jacobian(eqx.Module):
@@ -117,9 +121,9 @@ class Jacobian(eqx.Module):
         (F,) s.
     """
 
-    residuals: dict[str, Float[Array, "n k F"]]
-    columns: dict[str, Float[Array, "Q n k F"]]
-    crash_time: Float[Array, " F"]
+    residuals: dict[str, Float[Either, "n k F"]]
+    columns: dict[str, Float[Either, "Q n k F"]]
+    crash_time: Float[Either, " F"]
 
     def of(self, channels: Iterable[str]) -> Jacobian:
         """Return the part that concerns some channels."""
@@ -135,7 +139,7 @@ class SegmentData(eqx.Module):
     """Recordings and the part of a point and a criterion that concerns them, segment by segment."""
 
     segments: Segments
-    offsets: Float[Array, "*starts offsets F"]
-    scale: dict[str, Float[Array, " F"]]
-    reference_offset: Float[Array, "clocks F"]
-    states: Float[Array, "L F"] | None
+    offsets: Float[Either, "*starts offsets F"]
+    scale: dict[str, Float[Either, " F"]]
+    reference_offset: Float[Either, "clocks F"]
+    states: Float[Either, "L F"] | None

@@ -151,44 +151,37 @@ def spun_up(start: Start, vehicle: Vehicle, turning: Float[Array, "4 F"]) -> Sta
 
 
 def eliminated(
-    loss: Float[Array, " F"],
-    gradient: Float[Array, "Q F"],
-    hessian: Float[Array, "Q Q F"],
-    states: Float[Array, "L F"],
-) -> tuple[Array, Array, Array, Array]:
+    loss: NDArray[np.float64],
+    gradient: NDArray[np.float64],
+    hessian: NDArray[np.float64],
+    states: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], ...]:
     """Minimise every segment's quadratic model over its own start, whose prior is 0 ± 1.
 
     Parameters
     ----------
     loss, gradient, hessian
-        Of the data at ``states``; the last L of the Q parameters are the start's, in standard
-        deviations.
+        (F,), (F, Q) and (F, Q, Q) of the data at ``states``; the last L of the Q parameters are the
+        start's, in standard deviations.
     states
-        The start around which was linearised.
+        (L, F) the start around which was linearised.
 
     Returns
     -------
     tuple
-        Loss, gradient (P, F) and Hessian (P, P, F) of the others, and the best start (L, F).
+        Loss, gradient (F, P) and Hessian (F, P, P) of the others, and the best start (L, F).
     """
-    kept = gradient.shape[0] - states.shape[0]
-    gradient = gradient.at[kept:].add(states)
-    hessian = hessian + jnp.diag(jnp.arange(len(gradient)) >= kept).astype(hessian.dtype)[..., None]
-    loss = loss + 0.5 * jnp.sum(states**2, axis=0)
-    # One at a time, for all segments at once. A library's solver would take one segment at a
-    # time, and a blocking call inside a program of several devices can wait for ever for
-    # their single thread.
-    rows = []
-    while len(gradient) > kept:
-        row, pull = hessian[-1], gradient[-1]
-        rows.append((row[kept:-1], pull, row[-1]))
-        follow = row[:-1] / row[-1]
-        loss = loss - 0.5 * pull * pull / row[-1]
-        gradient = gradient[:-1] - follow * pull
-        hessian = hessian[:-1, :-1] - follow[:, None] * row[None, :-1]
-    step: list[Array] = []
-    for row, pull, curvature in reversed(rows):
-        across = sum((h * s for h, s in zip(row, step, strict=True)), jnp.zeros_like(pull))
-        step.append(-(pull + across) / curvature)
-    best = states + jnp.stack(step)
-    return jnp.maximum(loss, 0.0), gradient, hessian, best
+    begun = states.T
+    kept = gradient.shape[1] - begun.shape[1]
+    pull = gradient[:, kept:] + begun
+    own = hessian[:, kept:, kept:] + np.eye(begun.shape[1])
+    across = hessian[:, kept:, :kept]
+    finite = np.isfinite(own).all(axis=(1, 2))  # a flight that crashed may give none
+    follow = np.full((*across.shape[:2], kept + 1), np.nan)
+    together = np.concatenate([across, pull[..., None]], axis=-1)
+    follow[finite] = np.linalg.solve(own[finite], together[finite])
+    step = -follow[..., -1]
+    lower = loss + 0.5 * np.sum(begun**2, axis=1) + 0.5 * np.einsum("fl,fl->f", pull, step)
+    gradient = gradient[:, :kept] + np.einsum("flp,fl->fp", across, step)
+    reduced = hessian[:, :kept, :kept] - np.swapaxes(across, 1, 2) @ follow[..., :-1]
+    return np.maximum(lower, 0.0), gradient, reduced, (begun + step).T

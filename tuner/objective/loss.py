@@ -2,52 +2,52 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from numpy.typing import NDArray
 
-from tuner.objective.segments import Segments
+Array = NDArray[np.float64]
+
+ROWS_AT_ONCE = 1024
+"""Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that
+sums do not depend on how many there are."""
 
 
-def robust(error: Array, limit: Array) -> Array:
+def robust(error: Array, limit: float) -> Array:
     """Return Huber's loss of an error: its square, growing linearly beyond a limit."""
-    size = jnp.abs(error)
-    return jnp.where(size > limit, 2.0 * limit * size - limit * limit, error * error)
+    size = np.abs(error)
+    beyond = size > limit
+    if not beyond.any():
+        return error * error
+    return np.where(beyond, 2.0 * limit * size - limit * limit, error * error)
 
 
-def robust_loss(scaled: dict[str, Array], huber: Array) -> Array:
-    """Return half the robust sum of squares (F,) of channel -> (n, k, F) scaled residuals."""
-    sums = (jnp.sum(robust(error, huber), axis=(0, 1)) for error in scaled.values())
-    return 0.5 * sum(sums, jnp.zeros(()))
+def weights_of(error: Array, limit: float) -> Array:
+    """Return the weights by which least squares has the slope of Huber's loss."""
+    size = np.abs(error)
+    return np.where(size > limit, limit / np.where(size > 0.0, size, 1.0), 1.0)
 
 
-def gauss_newton(
-    columns: dict[str, Array], scaled: dict[str, Array], scale: dict[str, Array], huber: Array
-) -> tuple[Array, Array]:
-    """Return gradient (Q, F) and Gauss-Newton Hessian (Q, Q, F) of the robust loss.
+def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> tuple[Array, Array]:
+    """Return gradient (F, Q) and Gauss-Newton Hessian (F, Q, Q) of one channel's robust loss.
 
     Parameters
     ----------
     columns
-        Channel -> (Q, n, k, F) derivatives of the unscaled residuals.
+        (F, n, k, Q) derivatives of the unscaled residuals.
     scaled, scale
-        Channel -> (n, k, F) residuals, and the (F,) by which they were divided.
+        (F, n, k) residuals, and the (F,) by which they were divided.
     huber
         As for `robust`.
     """
-    gradient: Array = jnp.zeros(())
-    hessian: Array = jnp.zeros(())
-    for name, error in scaled.items():
-        size = jnp.abs(error)
-        weight = jnp.where(size > huber, huber / jnp.where(size > 0, size, 1.0), 1.0)
-        column = columns[name] / scale[name]
-        weighted = column * weight
-        gradient = gradient + jnp.einsum("pnkf,nkf->pf", weighted, error)
-        hessian = hessian + jnp.einsum("pnkf,qnkf->pqf", weighted, column)
+    segments, size = columns.shape[0], columns.shape[-1]
+    root = np.sqrt(weights_of(scaled, huber))
+    rows = columns.reshape(segments, -1, size) * (
+        root.reshape(segments, -1, 1) / scale[:, None, None]
+    )
+    error = (scaled * root).reshape(segments, -1)
+    gradient, hessian = np.zeros((segments, size)), np.zeros((segments, size, size))
+    for first in range(0, rows.shape[1], ROWS_AT_ONCE):
+        some = rows[:, first : first + ROWS_AT_ONCE]
+        gradient += np.einsum("fr,frq->fq", error[:, first : first + ROWS_AT_ONCE], some)
+        hessian += np.swapaxes(some, 1, 2) @ some
     return gradient, hessian
-
-
-def count(segments: Segments, name: str, rate: float, horizon: Array) -> Array:
-    """Return how many values (F,) of a channel are compared up to a horizon in samples."""
-    measured = segments.measured[name]
-    flown = measured.time * rate < horizon - 1
-    return jnp.sum((measured.weight > 0) & flown[:, None], axis=(0, 1)).astype(float)

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array, lax
+from jax import Array
 from jaxtyping import Float
+from numpy.typing import NDArray
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
 from tuner.coefficients.space import Space
-from tuner.model import Model, with_coefficients
+from tuner.model import Model
 from tuner.objective.criterion import (
     Criterion,
     Jacobian,
@@ -28,11 +28,10 @@ from tuner.objective.criterion import (
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulator import MEMORY, Simulator
 from tuner.objective.tunable import Tunable, tunable_of
-from tuner.parallel import in_pieces, over_devices, padded_size
 
 
 class Objective(eqx.Module):
-    """A fit as a function of a point: data and model are leaves, so that it compiles once a shape.
+    """A fit as a function of a point.
 
     Attributes
     ----------
@@ -75,14 +74,8 @@ class Objective(eqx.Module):
 
     @property
     def simulator(self) -> Simulator:
-        """The static half, by which compiled functions are kept."""
-        return Simulator(
-            self.schedule,
-            padded_size(self.samples),
-            self.limits,
-            self.memory,
-            self.conditions,
-        )
+        """The static half."""
+        return Simulator(self.schedule, self.samples, self.limits, self.memory, self.conditions)
 
     @property
     def tunable(self) -> Tunable:
@@ -90,23 +83,14 @@ class Objective(eqx.Module):
         return tunable_of(self.model, self.space)
 
     def sums(self, point: Point, criterion: Criterion, *, derivatives: bool = True) -> SegmentSums:
-        """Return every segment's contribution at a point, computed on all devices."""
-        alone = jax.tree.map(lambda leaf: np.asarray(leaf)[None], point)
-        sums: SegmentSums = jax.tree.map(
-            lambda leaf: leaf[0], self.sums_of(alone, criterion, derivatives=derivatives)
-        )
-        return sums
-
-    def sums_of(
-        self, points: Point, criterion: Criterion, *, derivatives: bool = True
-    ) -> SegmentSums:
-        """Return every segment's contribution at S points; all leaves have S first."""
-        sums: SegmentSums = _shared_sums(self.simulator, derivatives)(
-            self.data(points.offsets, criterion),
+        """Return every segment's contribution at a point."""
+        sums = self.simulator.sums(
+            self.data(point.offsets, criterion),
             self.tunable,
-            np.asarray(points.coefficients),
-            np.asarray(criterion.horizon),
-            np.asarray(criterion.huber),
+            np.asarray(point.coefficients),
+            int(criterion.horizon),
+            float(criterion.huber),
+            derivatives=derivatives,
         )
         if self.multiplicity is None:
             return sums
@@ -118,25 +102,35 @@ class Objective(eqx.Module):
             hessian=sums.hessian * often,
         )
 
-    def jacobian(
-        self, point: Point, criterion: Criterion, *, columns: int | None = None
-    ) -> Jacobian:
-        """Return every residual's derivatives, computed on all devices.
+    def sums_of(
+        self, points: Point, criterion: Criterion, *, derivatives: bool = True
+    ) -> SegmentSums:
+        """Return every segment's contribution at S points; all leaves have S first."""
+        coefficients, offsets = np.asarray(points.coefficients), np.asarray(points.offsets)
+        parts = [
+            self.sums(Point(vector, late), criterion, derivatives=derivatives)
+            for vector, late in zip(coefficients, offsets, strict=True)
+        ]
+        together: SegmentSums = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
+        return together
 
-        They are computed for ``columns`` parameters at a time, or all of them.
-        """
-        vector, data = np.asarray(point.coefficients), self.data(point.offsets, criterion)
-        model = with_coefficients(self.model, self.space.values(jnp.asarray(vector)))
-        count = len(self.space) if columns is None else columns
-        parts = []
-        for first in range(0, len(vector), count):
-            some = Space(self.space.parameters[first : first + count], {})
-            moved = np.pad(vector[first : first + count], (0, count - len(some)))
-            jacobian = _shared_jacobian(self.simulator)(
-                data, tunable_of(model, some, count=count), moved, np.asarray(criterion.horizon)
-            )
-            parts.append((len(some), jacobian))
-        return _beside(count, parts)
+    def jacobian(self, point: Point, criterion: Criterion) -> Jacobian:
+        """Return every residual's derivatives."""
+        return self.simulator.jacobian(
+            self.data(point.offsets, criterion),
+            self.tunable,
+            np.asarray(point.coefficients),
+            int(criterion.horizon),
+        )
+
+    def residuals(self, point: Point, criterion: Criterion) -> dict[str, NDArray[np.float64]]:
+        """Return channel -> (n, k, F) residuals, without derivatives."""
+        return self.simulator.errors(
+            self.data(point.offsets, criterion),
+            self.tunable,
+            np.asarray(point.coefficients),
+            int(criterion.horizon),
+        )[1]
 
     def data(self, offsets: Array, criterion: Criterion) -> SegmentData:
         """Return what each device needs of its segments; offsets are (\\*starts, offsets, N)."""
@@ -170,52 +164,3 @@ def with_conditions(
     wider = replace(objective, conditions=(*objective.conditions, *added))
     nothing = jnp.zeros((len(added), objective.flights))
     return wider, Point(point.coefficients, jnp.concatenate([point.offsets, nothing]))
-
-
-def _beside(count: int, parts: Sequence[tuple[int, Jacobian]]) -> Jacobian:
-    """Return as one the Jacobians by some parameters each, all followed by the flights' offsets."""
-    moved, first = parts[0]
-    if moved == count and len(parts) == 1:
-        return first
-    columns: dict[str, Any] = {
-        name: np.concatenate(
-            [part.columns[name][:moved] for moved, part in parts] + [column[count:]]
-        )
-        for name, column in first.columns.items()
-    }
-    return Jacobian(first.residuals, columns, first.crash_time)
-
-
-@lru_cache(maxsize=16)
-def _shared_jacobian(simulator: Simulator) -> Callable[..., Jacobian]:
-    def segmentwise(data: SegmentData, *rest: Any) -> Jacobian:
-        pieces = in_pieces(
-            simulator.jacobian, simulator.segments_at_once(data, len(rest[0].coordinates))
-        )
-        jacobian: Jacobian = pieces(data, *rest)
-        return jacobian
-
-    return over_devices(segmentwise, name=("jacobian", simulator))
-
-
-@lru_cache(maxsize=16)
-def _shared_sums(simulator: Simulator, derivatives: bool) -> Callable[..., SegmentSums]:
-    """Return the sums over all devices for S points, compiled once however often used."""
-
-    def some(data: SegmentData, model: Tunable, coefficients: Array, *rest: Any) -> SegmentSums:
-        def at(point: tuple[Array, Array]) -> SegmentSums:
-            vector, offsets = point
-            at_offsets = eqx.tree_at(lambda d: d.offsets, data, offsets)
-            return simulator.sums(at_offsets, model, vector, *rest, derivatives=derivatives)
-
-        # one start after the other: segments and columns fill the processor already
-        sums: SegmentSums = lax.map(at, (coefficients, data.offsets))
-        return sums
-
-    def segmentwise(data: SegmentData, *rest: Any) -> SegmentSums:
-        moving = len(rest[0].coordinates) if derivatives else 0
-        pieces = in_pieces(some, simulator.segments_at_once(data, moving))
-        sums: SegmentSums = pieces(data, *rest)
-        return sums
-
-    return over_devices(segmentwise, name=("sums", simulator, derivatives))

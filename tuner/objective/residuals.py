@@ -2,309 +2,259 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
-from jax import Array, lax
-from jaxtyping import Float, Int
+import jax
+import numpy as np
+from numpy.typing import NDArray
 
-from sim_jax.crash import Limits
-from sim_jax.environment import Environment
-from sim_jax.inlet import Inlet
-from sim_jax.markers import markers_of
-from sim_jax.rigid_body import Motion
-from sim_jax.rollout import Rollout, rollout
+from lanes import Argument, Program, joined
 from sim_jax.rotation import Quaternion
-from sim_jax.schedule import Schedule
-from sim_jax.state import Start
-from sim_jax.terms.air import Air
-from sim_jax.terms.total import total_wrench
-from sim_jax.trim import in_trim
-from sim_jax.vector import Vec3
-from sim_jax.vehicle import PerRotor, Vehicle
-from tuner.model import Model
-from tuner.objective.battery import relative_log_voltage
-from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole
-from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured, Segments
+from tuner.objective.flown import Flown
+from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
 
 RAMP = 0.25
 """Share of the time between two jumps of a zero-order hold that the ramp to the next takes."""
 
 
-class Trace(eqx.Module):
-    """What a rollout is compared by, logged at ``schedule.log_rate``; its pose is the markers'.
+BLOCK = 1024
+"""Stamps of segments that are compared at a time: what is computed of them stays in the cache."""
+
+
+class Block(NamedTuple):
+    """Simulated minus recorded of some stamps of some segments, in standard deviations.
 
     Attributes
     ----------
-    channels
-        Channel -> (samples, columns, F).
-    crash_time
-        (F,) s, infinite for a segment that flew.
+    segments
+        Which of the F segments: G of them.
+    stamps
+        (G, m) numbers of the stamps; where a segment has fewer, some stand for nothing: their
+        errors and columns are zero.
+    counts
+        (G, m, k) whether something was measured.
+    errors
+        (G, m, k).
+    columns
+        (G, m, k, Q) derivatives, those by coefficients first, then those by the flights' offsets,
+        then all others; Q is zero where nothing moved.
     """
 
-    channels: dict[str, Float[Array, "samples c F"]]
-    crash_time: Float[Array, " F"]
+    segments: slice
+    stamps: NDArray[np.intp]
+    counts: NDArray[np.bool_]
+    errors: NDArray[np.float64]
+    columns: NDArray[np.float64]
 
 
-def trace_of(
-    flown: Rollout,
-    model: Model,
-    segments: Segments,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> Trace:
-    """Return what simulated segments are compared by; ``conditions`` as of `simulate_segments`."""
-    motion, markers = flown.log.motion, markers_of(model.vehicle)
-    position, attitude = motion.position, motion.attitude
-    if markers is not None:
-        position, attitude = markers.recorded(motion)
-    logged = {
-        "position": (position.x, position.y, position.z),
-        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
-        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
-        "rotor_speed": flown.log.rotor_speed,
-        "command": flown.log.command,
-    }
-    if "acceleration" in segments.measured:
-        environment = environment_of(model, segments, conditions)
-        logged["acceleration"] = accelerometer(
-            model.vehicle, motion, flown.log.rotor_speed, environment, conditions
-        )
-    return Trace(
-        {name: jnp.stack(logged[name], axis=1) for name in segments.measured}, flown.crash_time
-    )
+@dataclass(frozen=True)
+class Reading:
+    """How a simulation is read, to be compared.
 
-
-def simulate_segments(
-    model: Model,
-    segments: Segments,
-    schedule: Schedule,
-    *,
-    samples: int,
-    horizon: Int[Array, ""] | None,
-    limits: Limits,
-    states: Float[Array, "L F"] | None = None,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> Rollout:
-    """Simulate every segment up to a horizon in samples.
-
-    Parameters
+    Attributes
     ----------
-    model, segments, schedule, samples, horizon, limits
-        As of `sim_jax.rollout.rollout`.
-    states
-        How far the starts lie from the recorded ones, in the segments' standard deviations.
-    conditions
-        Name, of `tuner.coefficients.conditions` -> what surrounds each segment, in its unit.
+    offsets
+        (offsets, F) s by which each clock's stamps are late: a sample stamped t was taken at
+        t - offset; then rad/s by which the gyro reads too much about each axis.
+    reference_offset
+        (clocks, F) s of clock offset at which signals that jump between samples are read exactly;
+        from there to ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
+    rate
+        Hz of the log.
+    horizon
+        Samples that are compared.
+    columns
+        How many columns the simulation's derivatives have.
+    coefficients
+        How many of them stand before those by the offsets; None for no columns of offsets.
+    offset_unit
+        s, or rad/s, in which the columns of offsets count.
     """
-    start, inlet, environment = beginning_of(
-        model, segments, schedule, states=states, conditions=conditions
-    )
-    return rollout(
-        model.vehicle,
-        model.controller,
-        schedule,
-        inlet,
-        start,
-        samples=samples,
-        environment=environment,
-        horizon=horizon,
-        limits=limits,
-    )
 
+    offsets: NDArray[np.float64]
+    reference_offset: NDArray[np.float64]
+    rate: float
+    horizon: int
+    columns: int = 0
+    coefficients: int | None = None
+    offset_unit: float = 1.0
 
-def beginning_of(
-    model: Model,
-    segments: Segments,
-    schedule: Schedule,
-    *,
-    states: Float[Array, "L F"] | None = None,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> tuple[Start, Inlet, Environment]:
-    """Return what segments start from, what is fed in and what surrounds them.
-
-    The arguments are those of `simulate_segments`.
-    """
-    start, inlet = segments.start, segments.inlet
-    markers = markers_of(model.vehicle)
-    if markers is not None:
-        start = markers.start(start, segments.resting, model.controller.sees_markers)
-    environment = environment_of(model, segments, conditions)
-    if segments.resting is not None:
-        exponent = model.vehicle.effects.get("battery_exponent")
-        factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
-        start = in_trim(
-            model.vehicle, model.controller, start, segments.resting, speed_factor=factor
-        )
-    if segments.wander is not None:
-        start = moved(start, segments.wander)
-    if segments.turning is not None:
-        start = spun_up(start, model.vehicle, segments.turning)
-    if states is not None and segments.freedom is not None:
-        change = whole(states * segments.freedom, segments.freed)
-        start = moved(start, change)
-        if ROWS["trim"].start in segments.freed:
-            inlet = trimmed(inlet, model.vehicle, change)
-    return start, inlet, environment
-
-
-def accelerometer(
-    vehicle: Vehicle,
-    motion: Motion,
-    rotor_speed: PerRotor,
-    environment: Environment,
-    biases: Mapping[str, Float[Array, " F"]],
-) -> tuple[Array, Array, Array]:
-    """Return what an accelerometer at the centre of mass reads, m/s² along the body's axes.
-
-    That is the specific force: all that acts but gravity, over the mass; plus its bias.
-    """
-    air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
-    pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
-    x, y, z = (getattr(pull, axis) + biases.get(f"accelerometer_{axis}", 0.0) for axis in "xyz")
-    return x, y, z
-
-
-def environment_of(
-    model: Model, segments: Segments, conditions: Mapping[str, Float[Array, " F"]]
-) -> Environment:
-    """Return what surrounds the segments, as far as it acts on a model."""
-    log_voltage = None
-    volts, reference = segments.log_voltage, model.reference_voltage
-    acts = "battery_exponent" in model.vehicle.effects
-    if acts and volts is not None and reference is not None:
-        log_voltage = relative_log_voltage(volts, reference)
-    decline = conditions.get("battery_decline")
-    return Environment(
-        wind=_wind(conditions),
-        log_voltage=log_voltage,
-        battery_decline=decline,
-        begin=None if decline is None else segments.begin,
-    )
-
-
-def _wind(conditions: Mapping[str, Float[Array, " F"]]) -> Vec3 | None:
-    known = [conditions[name] for name in ("wind_x", "wind_y") if name in conditions]
-    if not known:
-        return None
-    calm = jnp.zeros_like(known[0])
-    return Vec3(conditions.get("wind_x", calm), conditions.get("wind_y", calm), calm)
+    @property
+    def total(self) -> int:
+        """How many columns residuals have."""
+        return self.columns + (0 if self.coefficients is None else len(self.offsets))
 
 
 def residuals(
-    trace: Trace,
-    segments: Segments,
-    offsets: Float[Array, "offsets F"],
-    reference_offset: Float[Array, "clocks F"],
-    *,
-    rate: float,
-    horizon: Int[Array, ""],
-) -> dict[str, Float[Array, "n k F"]]:
-    """Return channel -> (simulated - recorded)/σ, zero beyond the horizon.
+    flown: Flown, segments: Segments, name: str, reading: Reading, *, block: int = BLOCK
+) -> Iterator[Block]:
+    """Return one channel's residuals up to the horizon, some stamps at a time."""
+    measured = segments.measured[name]
+    time, values, weight = (
+        np.ascontiguousarray(np.moveaxis(np.asarray(part), -1, 0))
+        for part in (measured.time, measured.values, measured.weight)
+    )
+    used = (time * reading.rate < reading.horizon - 1) & (weight != 0.0).any(axis=-1)
+    most = int(used.sum(axis=1).max(initial=0))
+    order = np.argsort(~used, axis=1, kind="stable")[:, :most]
+    log, moved_log = _Series(flown.channels[name]), flown.columns[name]
+    columns = None if moved_log is None else _Series(moved_log)
+    together = max(block // max(most, 1), 1)
+    for first in range(0, len(time), together):
+        some = slice(first, first + together)
+        for begin in range(0, most, block):
+            stamps = order[some, begin : begin + block]
+            real = np.take_along_axis(used[some], stamps, axis=1)
 
-    Parameters
-    ----------
-    trace, offsets, reference_offset, rate
-        As of `simulated_at_stamps`.
-    segments
-        The recording.
-    horizon
-        Samples of the trace that were flown.
-    """
-    weighted = {}
-    for name, measured in segments.measured.items():
-        simulated = simulated_at_stamps(trace, name, measured, offsets, reference_offset, rate=rate)
-        flown = measured.time * rate < horizon - 1
-        if name == "attitude":
-            error = _attitude_error(measured, simulated)
-        else:
-            error = simulated - measured.values
-        weighted[name] = error * measured.weight * flown[:, None]
-    return weighted
+            def at(rows: NDArray[Any], stamps: NDArray[np.intp] = stamps) -> NDArray[Any]:
+                return rows[np.arange(first, first + len(stamps))[:, None], stamps]  # noqa: B023
 
-
-def simulated_at_stamps(
-    trace: Trace,
-    channel: str,
-    measured: Measured,
-    offsets: Float[Array, "offsets F"],
-    reference_offset: Float[Array, "clocks F"],
-    *,
-    rate: float,
-) -> Float[Array, "n c F"]:
-    """Return what a recording of the simulation would hold at the recorded stamps.
-
-    Parameters
-    ----------
-    trace
-        The simulation.
-    channel
-        Which signal.
-    measured
-        Its recorded samples.
-    offsets
-        s by which each clock's stamps are late: a sample stamped t was taken at t - offset; then
-        rad/s by which the gyro reads too much about each axis.
-    reference_offset
-        s of clock offset at which signals that jump between samples are read exactly; from there to
-        ``offsets`` they move smoothly, for a loss that jumps cannot be minimised.
-    rate
-        Hz of the trace.
-    """
-    clock = CLOCK_OF[channel]
-    place = (measured.time - offsets[clock]) * rate
-    if channel == "command":
-        before = (measured.time - reference_offset[clock]) * rate
-        return _zero_order_hold_moved(trace.channels[channel], before, place)
-    simulated = _linear_interpolation(trace.channels[channel], place)
-    return simulated + offsets[len(CLOCKS) :] if channel == "body_rate" else simulated
+            weights = at(weight) * real[..., None]
+            place = _Place(np.arange(first, first + len(stamps)), at(time), name, reading)
+            errors, moved = _compared(name, log, columns, place, at(values))
+            errors = errors * weights
+            moved *= weights[..., None]
+            yield Block(some, stamps, weights != 0.0, errors, moved)
 
 
-def _below(series: Array, place: Float[Array, "n F"]) -> Int[Array, "n 1 F"]:
-    last = series.shape[0] - 2
-    below = jnp.floor(lax.stop_gradient(place) + 1e-6).astype(jnp.int32)
-    return jnp.clip(below, 0, last)[:, None]
+def _compared(
+    name: str,
+    log: _Series,
+    columns: _Series | None,
+    place: _Place,
+    recorded: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return errors (G, m, k) of a channel in its unit, and their columns (G, m, k, Q)."""
+    reading = place.reading
+    values = place.read(log)
+    by_column = np.empty((*values.shape, reading.total))
+    before = reading.columns if reading.coefficients is None else reading.coefficients
+    after = before + reading.total - reading.columns
+    if columns is not None:
+        moved = joined(place.read(columns), reading.columns, axis=2)
+        by_column[..., :before] = moved[..., :before]
+        by_column[..., after:] = moved[..., before:]
+    if reading.coefficients is not None:
+        by_column[..., before:after] = place.by_offset(log) * reading.offset_unit
+    values = values + place.bias
+    if name != "attitude":
+        return values - recorded, by_column
+    errors, turns = _attitude_error(recorded, values)
+    return errors, np.matmul(turns, by_column)
 
 
-def _linear_interpolation(
-    series: Float[Array, "samples c F"], place: Float[Array, "n F"]
-) -> Float[Array, "n c F"]:
-    """Read a series at fractional sample numbers by linear interpolation."""
-    first, second, share = _around(series, place)
-    return first + share * (second - first)
+class _Place:
+    """Where stamps lie in a log, and how it is read there."""
+
+    def __init__(
+        self,
+        segments: NDArray[np.intp],
+        time: NDArray[np.float64],
+        name: str,
+        reading: Reading,
+    ) -> None:
+        self.reading, self.name, self.segments = reading, name, segments[:, None]
+        self.clock = CLOCK_OF[name]
+        rate = reading.rate
+        self.place = (time - reading.offsets[self.clock, segments][:, None]) * rate
+        self.before = (time - reading.reference_offset[self.clock, segments][:, None]) * rate
+        self.bias: NDArray[np.float64] | float = 0.0
+        if name == "body_rate":
+            self.bias = reading.offsets[len(CLOCKS) :, segments].T[:, None]
+
+    def read(self, series: _Series) -> NDArray[np.float64]:
+        """Return what the log of a simulation holds at the stamps, (G, m, *rest)."""
+        if self.name != "command":
+            return series.mixed(self.segments, self.place, lambda share: share)
+        # A zero-order hold, moved a little along a ramp into each of its next values. A sample
+        # whose stamp falls well between two jumps does not move: samples that were taken in step
+        # with the jumps say nothing of a clock but where it passes one.
+        held = series.at(self.segments, series.below(self.before))
+        held += series.mixed(self.segments, self.place, _risen)
+        held -= series.mixed(self.segments, self.before, _risen)
+        return held
+
+    def by_offset(self, series: _Series) -> NDArray[np.float64]:
+        """Return the derivatives (G, m, c, offsets) by the offsets, in s and rad/s."""
+        below = series.below(self.place)
+        slope = series.at(self.segments, below + 1) - series.at(self.segments, below)
+        if self.name == "command":
+            risen = 1.0 - (1.0 - (self.place - below)) / RAMP
+            slope = slope * (((risen > 0.0) & (risen < 1.0)) / RAMP)[..., None]
+        moved = np.zeros((*slope.shape, len(self.reading.offsets)))
+        moved[..., self.clock] = -self.reading.rate * slope
+        if self.name == "body_rate":
+            axes = np.arange(slope.shape[-1])
+            moved[..., axes, len(CLOCKS) + axes] = 1.0
+        return moved
 
 
-def _around(series: Float[Array, "samples c F"], place: Float[Array, "n F"]) -> tuple[Array, ...]:
-    """Return the samples (n, c, F) before and after places, and the share (n, 1, F) between."""
-    below = _below(series, place)
-    first = jnp.take_along_axis(series, below, axis=0)
-    second = jnp.take_along_axis(series, below + 1, axis=0)
-    return first, second, place[:, None] - below
+def _risen(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far the ramp into the next value has risen."""
+    return np.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
 
 
-def _zero_order_hold_moved(
-    series: Float[Array, "samples c F"], before: Float[Array, "n F"], place: Float[Array, "n F"]
-) -> Float[Array, "n c F"]:
-    """Read a zero-order hold, moved a little along a ramp into each of its next values.
+class _Series:
+    """A log (F, samples, *rest), read at fractional sample numbers (G, m)."""
 
-    A sample whose stamp falls well between two jumps does not move: samples that were taken in
-    step with the jumps say nothing of a clock but where it passes one. Those of any other times
-    are on a ramp so often that their mean moves as the signal does.
-    """
-    step = jnp.take_along_axis(series, _below(series, before), axis=0)
-    return step + _ramps(series, place) - _ramps(series, before)
+    def __init__(self, rows: NDArray[np.float64]) -> None:
+        self.samples, self.rest = rows.shape[1], rows.shape[2:]
+        self.flat = rows.reshape(rows.shape[0] * self.samples, -1)
+
+    def below(self, place: NDArray[np.float64]) -> NDArray[np.intp]:
+        return np.clip(np.floor(place + 1e-6).astype(np.intp), 0, self.samples - 2)
+
+    def at(self, segments: NDArray[np.intp], number: NDArray[np.intp]) -> NDArray[np.float64]:
+        rows: NDArray[np.float64] = np.take(
+            self.flat, (segments * self.samples + number).ravel(), axis=0
+        )
+        return rows.reshape(*number.shape, *self.rest)
+
+    def mixed(
+        self,
+        segments: NDArray[np.intp],
+        place: NDArray[np.float64],
+        share_of: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    ) -> NDArray[np.float64]:
+        """Return what lies between the samples before and after places."""
+        below = self.below(place)
+        first, second = self.at(segments, below), self.at(segments, below + 1)
+        share = share_of(place - below)
+        second -= first
+        second *= share.reshape(*share.shape, *[1] * (second.ndim - share.ndim))
+        second += first
+        return second
 
 
-def _ramps(
-    series: Float[Array, "samples c F"], place: Float[Array, "n F"]
-) -> Float[Array, "n c F"]:
-    first, second, share = _around(series, place)
-    risen = jnp.clip(1.0 - (1.0 - share) / RAMP, 0.0, 1.0)
-    return first + risen * (second - first)
+def at_stamps(
+    channel: NDArray[np.float64],
+    name: str,
+    time: NDArray[np.float64],
+    reading: Reading,
+) -> NDArray[np.float64]:
+    """Return what a recording of a simulation (F, samples, c) would hold at stamps (F, n)."""
+    place = _Place(np.arange(len(time)), time, name, reading)
+    return place.read(_Series(channel)) + place.bias
 
 
-def _attitude_error(measured: Measured, simulated: Float[Array, "n 4 F"]) -> Float[Array, "n 3 F"]:
-    recorded = Quaternion.of(jnp.moveaxis(measured.values, 1, 0))
-    flown = Quaternion.of(jnp.moveaxis(simulated, 1, 0))
-    return jnp.moveaxis(recorded.rotation_vector_to(flown).stacked(), 0, 1)
+def _attitude_error(
+    recorded: NDArray[np.float64], flown: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rotation vectors (F, n, 3) from recorded to flown, and (F, n, 3, 4) slopes."""
+    shape, lanes = flown.shape[:-1], int(np.prod(flown.shape[:-1]))
+    given = (recorded.reshape(lanes, 4).T, flown.reshape(lanes, 4).T)
+    run = _rotation_program()(given, [np.eye(4)], lanes=lanes)
+    return run.values.reshape(*shape, 3), run.columns.reshape(*shape, 3, 4)
+
+
+@cache
+def _rotation_program() -> Program:
+    def error(given: tuple[jax.Array, jax.Array], _: Mapping[str, int]) -> jax.Array:
+        recorded, flown = map(Quaternion.of, given)
+        return recorded.rotation_vector_to(flown).stacked()
+
+    either = Argument((4,), float, lanes=True)
+    return Program(error, (either, replace(either, moves=True)), at_once=4, name="attitude error")

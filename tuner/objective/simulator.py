@@ -1,18 +1,19 @@
 """A simulation of some segments, compared with their recordings and differentiated forwards.
 
-Everything here is a function of arrays, to be compiled; `tuner.objective.normal` gives it a fit's
-data, on all devices.
+Flying is a kernel's (`tuner.objective.flown`); reading a simulation at the recorded stamps and
+summing up is linear, and NumPy's. Segments come first in every array here, columns of derivatives
+last.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import jax
-import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from numpy.typing import NDArray
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
@@ -23,115 +24,106 @@ from tuner.objective.criterion import (
     SegmentSums,
     units_of,
 )
+from tuner.objective.flown import Flown, fly
 from tuner.objective.initial_conditions import eliminated
-from tuner.objective.loss import count, gauss_newton, robust_loss
-from tuner.objective.residuals import Trace, residuals, simulate_segments, trace_of
-from tuner.objective.segments import OFFSETS, Segments
+from tuner.objective.loss import gauss_newton, robust
+from tuner.objective.residuals import Reading, residuals
+from tuner.objective.segments import OFFSETS
 from tuner.objective.tunable import Tunable
-from tuner.parallel import piece_that_fits
 
-MEMORY = 2**30
-"""bytes that derivatives take at most by default while they are computed, on all devices."""
-FEW = 4
-"""Segments of a device below which they fly one at a time, if they are differentiated: nothing lies
-between a segment's columns then, and these fill the vector registers, which so few segments do not.
-On the four reference flights a Jacobian by twelve columns takes 0.23 s of processor time so, and
-0.42 s with a device's two segments at once; of eight flights 0.44 s, and 0.39 s with four."""
+Array = NDArray[np.float64]
+
+MEMORY = 2**29
+"""bytes that derivatives take at most by default while they are computed."""
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """The static half of an objective: its methods are functions of arrays alone."""
+    """The static half of an objective."""
 
     schedule: Schedule
-    capacity: int
-    """Samples of a log, those that pad it included."""
+    samples: int
+    """Of a log, at most."""
     limits: Limits
     memory: int = MEMORY
     conditions: tuple[str, ...] = ()
-    """What surrounds each flight and enters its simulation, behind the offsets."""
-
-    def segments_at_once(self, data: SegmentData, moving: int) -> int:
-        """Return how many of a device's segments fly at a time: what fits its cache and the memory.
-
-        ``moving`` is how many parameters it differentiates by; zero if only by free starts.
-        """
-        starts = 0 if data.states is None else len(data.states)
-        columns = moving + len(self.conditions) + starts if moving else 1 + starts
-        recorded = sum(
-            m.values.shape[0] * m.values.shape[1] for m in data.segments.measured.values()
-        )
-        logged = self.capacity * sum(m.values.shape[1] for m in data.segments.measured.values())
-        # the flown derivatives twice, those of the residuals as such and weighted
-        bytes_of_segment = 8 * (columns + 1) * (2 * logged + 2 * recorded)
-        share = self.memory // len(jax.devices())
-        if moving and data.segments.count < FEW:
-            return 1
-        return max(1, min(piece_that_fits(8, columns), share // bytes_of_segment))
+    """Per-flight conditions that enter a simulation, behind the offsets."""
 
     def fly(
         self,
+        data: SegmentData,
         model: Tunable,
-        segments: Segments,
         coefficients: Array,
-        horizon: Array | None,
+        horizon: int,
         *,
-        states: Array | None = None,
-        conditions: Array | None = None,
-    ) -> Trace:
-        """Simulate some segments with a search vector (K,) up to a horizon in samples, or whole.
+        moving: Sequence[str] = (),
+    ) -> Flown:
+        """Fly segments with a search vector (K,) up to a horizon in samples.
 
-        What surrounds them are (conditions, F) in the units of `units_of`.
+        Parameters
+        ----------
+        data, model, coefficients, horizon
+            What is flown.
+        moving
+            By what is differentiated, in this order of columns: ``coefficients``, ``conditions``,
+            ``states``.
         """
-        surroundings = {}
-        if conditions is not None:
-            units = units_of(self.conditions)
-            surroundings = {
-                name: conditions[row] * units[row] for row, name in enumerate(self.conditions)
-            }
-        moved = model.at(coefficients)
-        flown = simulate_segments(
-            moved,
-            segments,
+        offsets = np.asarray(data.offsets)
+        units = units_of(self.conditions)
+        rows = offsets[len(OFFSETS) :]
+        conditions = {name: rows[row] * units[row] for row, name in enumerate(self.conditions)}
+        return fly(
+            model.model,
+            data.segments,
             self.schedule,
-            samples=self.capacity,
-            horizon=horizon,
+            samples=min(horizon, self.samples),
             limits=self.limits,
-            states=states,
-            conditions=surroundings,
-        )
-        return trace_of(flown, moved, segments, surroundings)
-
-    def conditions_in(self, offsets: Array) -> Array | None:
-        """Return what surrounds the segments, (conditions, F), of their rows of a point."""
-        return offsets[len(OFFSETS) :] if self.conditions else None
-
-    def compared(
-        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
-    ) -> tuple[Trace, dict[str, Array]]:
-        """Return the simulation and channel -> (n, k, F) residuals in standard deviations."""
-        conditions = self.conditions_in(data.offsets)
-        trace = self.fly(
-            model,
-            data.segments,
-            coefficients,
-            horizon,
-            states=data.states,
+            coefficients=model.values(coefficients),
+            states=None if data.states is None else np.asarray(data.states),
             conditions=conditions,
+            tangents=self._directions(data, model, coefficients, moving) if moving else None,
         )
-        return trace, self.residuals(data, horizon, trace, data.offsets)
 
-    def residuals(
-        self, data: SegmentData, horizon: Array, trace: Trace, offsets: Array
+    def _directions(
+        self, data: SegmentData, model: Tunable, coefficients: Array, moving: Sequence[str]
     ) -> dict[str, Array]:
-        """Return channel -> (n, k, F) residuals of a simulation at some offsets (offsets, F)."""
-        return residuals(
-            trace,
-            data.segments,
-            offsets[: len(OFFSETS)] * OFFSET_UNIT,
-            data.reference_offset,
-            rate=float(self.schedule.log_rate),
-            horizon=horizon,
+        """Return the directions of all columns: of coefficients, conditions and starts."""
+        blocks = {
+            "coefficients": len(coefficients),
+            "conditions": len(self.conditions),
+            "states": 0 if data.states is None else len(data.states),
+        }
+        total, first, directions = sum(blocks[name] for name in moving), 0, {}
+        for name in moving:
+            rows = slice(first, first + blocks[name])
+            first += blocks[name]
+            if name == "coefficients":
+                for coefficient, slope in model.slopes(coefficients).items():
+                    directions[coefficient] = np.zeros(total)
+                    directions[coefficient][rows] = slope
+            elif name == "conditions":
+                for row, (condition, unit) in enumerate(
+                    zip(self.conditions, units_of(self.conditions), strict=True)
+                ):
+                    directions[condition] = np.zeros(total)
+                    directions[condition][rows.start + row] = unit
+            elif blocks[name]:
+                directions["states"] = np.zeros((total, blocks[name]))
+                directions["states"][rows] = np.eye(blocks[name])
+        return directions
+
+    def reading(
+        self, data: SegmentData, horizon: int, columns: int = 0, coefficients: int | None = None
+    ) -> Reading:
+        """Return how a simulation is read to be compared; the arguments are those of `Reading`."""
+        return Reading(
+            np.asarray(data.offsets)[: len(OFFSETS)] * OFFSET_UNIT,
+            np.asarray(data.reference_offset),
+            float(self.schedule.log_rate),
+            horizon,
+            columns,
+            coefficients,
+            OFFSET_UNIT,
         )
 
     def sums(
@@ -139,131 +131,148 @@ class Simulator:
         data: SegmentData,
         model: Tunable,
         coefficients: Array,
-        horizon: Array,
-        huber: Array,
+        horizon: int,
+        huber: float,
         *,
         derivatives: bool,
     ) -> SegmentSums:
         """Return what some segments contribute; see `Objective.sums`."""
-        if derivatives or data.states is not None:
-            trace, errors, columns = self._with_columns(
-                data, model, coefficients, horizon, starts_only=not derivatives
-            )
-        else:
-            trace, errors = self.compared(data, model, coefficients, horizon)
-            columns = None
-        squares = {name: jnp.sum(e * e, axis=(0, 1)) for name, e in errors.items()}
-        rate = float(self.schedule.log_rate)
-        counts = {name: count(data.segments, name, rate, horizon) for name in errors}
-        scaled = {name: e / data.scale[name] for name, e in errors.items()}
-        loss = robust_loss(scaled, huber)
-        segments = jnp.shape(data.offsets)[-1]
-        size = len(coefficients) + len(data.offsets)
-        gradient, hessian, states = (
-            jnp.zeros((size, segments)),
-            jnp.zeros((size, size, segments)),
-            None,
-        )
-        if columns is not None:
-            slope, square = gauss_newton(columns, scaled, data.scale, huber)
-            if data.states is not None:
-                loss, slope, square, states = eliminated(loss, slope, square, data.states)
-                for name, column in columns.items():
-                    by_start = column[len(column) - len(states) :]
-                    change = jnp.einsum("lnkf,lf->nkf", by_start, states - data.states)
-                    squares[name] = jnp.sum((errors[name] + change) ** 2, axis=(0, 1))
-            if derivatives:
-                gradient, hessian = slope, square
-        return SegmentSums(loss, gradient, hessian, squares, counts, trace.crash_time, states)
+        moving = self._moving(data, derivatives=derivatives)
+        parts = [
+            self._sums_of(part, model, coefficients, (horizon, huber), moving)
+            for part in self._in_turn(data, horizon, self._columns(data, coefficients, moving))
+        ]
+        return _joined(parts)
 
-    def jacobian(
-        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: Array
-    ) -> Jacobian:
-        """Return every residual of some segments and its derivatives."""
-        trace, errors, columns = self._with_columns(data, model, coefficients, horizon)
-        return Jacobian(errors, columns, trace.crash_time)
+    def _moving(self, data: SegmentData, *, derivatives: bool) -> tuple[str, ...]:
+        states = () if data.states is None else ("states",)
+        return ("coefficients", "conditions", *states) if derivatives else states
 
-    @partial(jax.jit, static_argnums=0, static_argnames="starts_only")
-    def _with_columns(
+    def _columns(self, data: SegmentData, coefficients: Array, moving: Sequence[str]) -> int:
+        """Return how many columns a simulation's derivatives have."""
+        sizes = {
+            "coefficients": len(coefficients),
+            "conditions": len(self.conditions),
+            "states": 0 if data.states is None else len(data.states),
+        }
+        return sum(sizes[name] for name in moving)
+
+    def _in_turn(self, data: SegmentData, horizon: int, columns: int) -> list[SegmentData]:
+        """Return the segments in parts whose derivatives fit the memory."""
+        measured = data.segments.measured.values()
+        logged = min(horizon, self.samples) * sum(np.shape(m.values)[1] for m in measured)
+        segments = np.shape(data.offsets)[-1]
+        size = max(int(self.memory // max(8 * (columns + 1) * logged, 1)), 1)
+        if size >= segments:
+            return [data]
+        return [
+            jax.tree.map(partial(_some, first=first, size=size), data)
+            for first in range(0, segments, size)
+        ]
+
+    def _sums_of(
         self,
         data: SegmentData,
         model: Tunable,
         coefficients: Array,
-        horizon: Array,
-        *,
-        starts_only: bool = False,
-    ) -> tuple[Trace, dict[str, Array], dict[str, Array]]:
-        """Return simulation, residuals and channel -> (Q, n, k, F) derivatives.
-
-        By coefficients, offsets, what surrounds a flight, and starts; or by the last alone, which
-        is all that a loss without them needs. An offset does not enter the simulation, so that its
-        column costs an interpolation; what surrounds a flight does. Compiled by name, so that what
-        builds on it is traced only once.
-        """
-        offsets = data.offsets[: len(OFFSETS)]
-        trace, moved = _jacobian_forward(
-            lambda vector, states, conditions: self.fly(
-                model, data.segments, vector, horizon, states=states, conditions=conditions
-            ),
-            coefficients,
-            data.states,
-            self.conditions_in(data.offsets),
-            starts_only=starts_only,
+        criterion: tuple[int, float],
+        moving: Sequence[str],
+    ) -> SegmentSums:
+        horizon, huber = criterion
+        flown = self.fly(data, model, coefficients, horizon, moving=moving)
+        derivatives, segments = "coefficients" in moving, len(flown.crash_time)
+        size = len(coefficients) + len(np.asarray(data.offsets))
+        reading = self.reading(
+            data,
+            horizon,
+            self._columns(data, coefficients, moving),
+            len(coefficients) if derivatives else None,
+        )
+        total = reading.total
+        gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
+        loss, squares, counts, by_start = np.zeros(segments), {}, {}, {}
+        starts = 0 if data.states is None else len(data.states)
+        for name in data.segments.measured:
+            scale = np.asarray(data.scale[name])
+            square, count = np.zeros(segments), np.zeros(segments)
+            slope, bend = np.zeros((segments, starts)), np.zeros((segments, starts, starts))
+            for block in residuals(flown, data.segments, name, reading):
+                some = block.segments
+                square[some] += np.einsum("fnk,fnk->f", block.errors, block.errors)
+                count[some] += block.counts.sum(axis=(1, 2))
+                scaled = block.errors / scale[some, None, None]
+                loss[some] += 0.5 * robust(scaled, huber).sum(axis=(1, 2))
+                if total:
+                    along, across = gauss_newton(block.columns, scaled, scale[some], huber)
+                    gradient[some] += along
+                    hessian[some] += across
+                if starts:
+                    own = block.columns[..., -starts:]
+                    slope[some] += np.einsum("fnk,fnkl->fl", block.errors, own)
+                    bend[some] += np.einsum("fnkl,fnkm->flm", own, own)
+            squares[name], counts[name], by_start[name] = square, count, (slope, bend)
+        best = None
+        if data.states is not None:
+            states = np.asarray(data.states)
+            loss, gradient, hessian, best = eliminated(loss, gradient, hessian, states)
+            change = (best - states).T
+            for name, (slope, bend) in by_start.items():
+                squares[name] = squares[name] + np.einsum(
+                    "fl,fl->f", change, 2.0 * slope + np.einsum("flm,fm->fl", bend, change)
+                )
+        if not derivatives:
+            gradient, hessian = np.zeros((segments, size)), np.zeros((segments, size, size))
+        return SegmentSums(
+            loss,
+            np.moveaxis(gradient, 0, -1),
+            np.moveaxis(hessian, 0, -1),
+            squares,
+            counts,
+            flown.crash_time,
+            best,
         )
 
-        def compare(flown: Trace, late: Array) -> dict[str, Array]:
-            return self.residuals(data, horizon, flown, late)
-
-        by_flight = jax.vmap(
-            lambda change: jax.jvp(lambda flown: compare(flown, offsets), (trace,), (change,))[1]
-        )(moved)
-        if starts_only:
-            return trace, compare(trace, offsets), by_flight
-        each = jnp.eye(len(offsets), dtype=offsets.dtype)[:, :, None] * jnp.ones_like(offsets)
-        by_offset = jax.vmap(
-            lambda change: jax.jvp(lambda late: compare(trace, late), (offsets,), (change,))[1]
-        )(each)
-        count = len(coefficients)
-        columns = {
-            name: jnp.concatenate([flown[:count], by_offset[name], flown[count:]])
-            for name, flown in by_flight.items()
-        }
-        return trace, compare(trace, offsets), columns
-
-
-def _jacobian_forward(
-    simulate: Callable[[Array, Array | None, Array | None], Trace],
-    vector: Array,
-    states: Array | None,
-    conditions: Array | None,
-    *,
-    starts_only: bool,
-) -> tuple[Trace, Trace]:
-    """Return a simulation and its derivatives by a vector (K,), conditions and starts (rows, F).
-
-    Or by the starts alone. All segments' starts, or conditions, move at once: a segment depends on
-    its own alone.
-    """
-    count, rows = len(vector), 0 if conditions is None else len(conditions)
-    basis = jnp.eye(count + rows + (0 if states is None else len(states)), dtype=vector.dtype)
-    basis = basis[count + rows :] if starts_only else basis
-
-    def push(direction: Array) -> tuple[Trace, Trace]:
-        if states is None and conditions is None:
-            flown, moved = jax.jvp(lambda v: simulate(v, None, None), (vector,), (direction,))
-            return flown, moved
-
-        def turned(values: Array | None, first: int) -> Array | None:
-            if values is None:
-                return None
-            return direction[first : first + len(values), None] * jnp.ones_like(values)
-
-        flown, moved = jax.jvp(
-            simulate,
-            (vector, states, conditions),
-            (direction[:count], turned(states, count + rows), turned(conditions, count)),
+    def jacobian(
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: int
+    ) -> Jacobian:
+        """Return every residual of some segments and its derivatives."""
+        moving = self._moving(data, derivatives=True)
+        flown = self.fly(data, model, coefficients, horizon, moving=moving)
+        reading = self.reading(
+            data, horizon, self._columns(data, coefficients, moving), len(coefficients)
         )
-        return flown, moved
+        errors, columns = self._laid_out(data, flown, reading)
+        return Jacobian(errors, columns, flown.crash_time)
 
-    pushed: tuple[Trace, Trace] = jax.vmap(push, out_axes=(None, 0))(basis)
-    return pushed
+    def errors(
+        self, data: SegmentData, model: Tunable, coefficients: Array, horizon: int
+    ) -> tuple[Flown, dict[str, Array]]:
+        """Return a simulation, and channel -> (n, k, F) residuals, without derivatives."""
+        flown = self.fly(data, model, coefficients, horizon)
+        return flown, self._laid_out(data, flown, self.reading(data, horizon))[0]
+
+    def _laid_out(
+        self, data: SegmentData, flown: Flown, reading: Reading
+    ) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Return channel -> (n, k, F) residuals, and channel -> (Q, n, k, F) columns."""
+        errors, columns = {}, {}
+        for name, measured in data.segments.measured.items():
+            n, k, segments = np.shape(measured.weight)
+            error, column = np.zeros((segments, n, k)), np.zeros((segments, n, k, reading.total))
+            for block in residuals(flown, data.segments, name, reading):
+                place = np.arange(segments)[block.segments, None], block.stamps
+                error[place], column[place] = block.errors, block.columns
+            errors[name] = np.moveaxis(error, 0, -1)
+            columns[name] = np.moveaxis(column, (-1, 0), (0, -1))
+        return errors, columns
+
+
+def _some(leaf: Array, first: int, size: int) -> Array:
+    return np.asarray(leaf)[..., first : first + size]
+
+
+def _joined(parts: Sequence[SegmentSums]) -> SegmentSums:
+    if len(parts) == 1:
+        return parts[0]
+    joined: SegmentSums = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=-1), *parts)
+    return joined

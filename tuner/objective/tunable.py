@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from scipy.special import expit
 
 from tuner.coefficients.space import Coordinates, Space
 from tuner.model import Model, coefficients_in, with_coefficients
@@ -40,6 +42,33 @@ class Tunable(eqx.Module):
     ratios: Float[Array, "C K"]
     moves: Bool[Array, " C"]
     names: tuple[str, ...] = eqx.field(static=True)
+
+    def values(self, vector: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return coefficient -> value at search vectors (*S, K), on the host."""
+        moved = self._numbers(vector) @ np.asarray(self.ratios).T
+        given = coefficients_in(self.model)
+        return {
+            name: moved[..., i]
+            if self.moves[i]
+            else np.broadcast_to(np.asarray(given[name], float), np.shape(vector)[:-1])
+            for i, name in enumerate(self.names)
+        }
+
+    def slopes(self, vector: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+        """Return moved coefficient -> its derivatives (K,) at a search vector, on the host."""
+        c = self.coordinates
+        share = expit(vector / np.asarray(c.stretch))
+        slope = np.asarray(c.width) * share * (1.0 - share) / np.asarray(c.stretch)
+        slope = np.where(np.asarray(c.is_log), self._numbers(vector), 1.0) * slope
+        rows = np.asarray(self.ratios) * slope
+        return {name: rows[i] for i, name in enumerate(self.names) if self.moves[i]}
+
+    def _numbers(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what `Coordinates.numbers` does."""
+        c = self.coordinates
+        is_log = np.asarray(c.is_log)
+        scaled = np.asarray(c.lower) + np.asarray(c.width) * expit(vector / np.asarray(c.stretch))
+        return np.where(is_log, np.exp(np.where(is_log, scaled, 0.0)), scaled)
 
     def at(self, vector: Float[Array, " K"]) -> Model:
         """Return the model with the coefficients of a search vector."""

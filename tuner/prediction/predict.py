@@ -9,15 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.crash import AIRBORNE
-from sim_jax.markers import markers_of
-from sim_jax.rigid_body import Motion
 from sim_jax.schedule import Schedule
 from tuner.config import ControllerFile, VehicleFile
 from tuner.config.job import InletName
@@ -25,10 +21,10 @@ from tuner.flights.flight import Array, Flight
 from tuner.flights.states import States, states_at
 from tuner.model import Model, model_of, schedule_of
 from tuner.objective.battery import with_reference_voltage
+from tuner.objective.flight import MOTION
+from tuner.objective.flown import fly
 from tuner.objective.inlets import INLETS
-from tuner.objective.residuals import simulate_segments
 from tuner.objective.segments import Segments, window_segments
-from tuner.parallel import padded_size
 
 UNITS: Mapping[str, str] = {
     "position": "m",
@@ -37,7 +33,7 @@ UNITS: Mapping[str, str] = {
     "body_rate": "rad/s",
 }
 """What is predicted, with its unit."""
-AT_ONCE = 256
+AT_ONCE = 4096
 """Predictions that are simulated side by side."""
 
 
@@ -165,48 +161,34 @@ def _simulated(
 ) -> dict[str, Array]:
     """Return quantity -> (S, n, k) that the simulations reach so many s (S,) ahead."""
     samples = int(np.ceil(ahead[-1] * schedule.log_rate - 1e-6)) + 2
-    count, parts = segments.count, []
-    size = AT_ONCE
-    for first in range(0, count, size):
-        chosen = np.minimum(np.arange(first, first + size), count - 1)
-        part = _reached(model, _taken(segments, chosen), jnp.asarray(ahead), schedule, samples)
-        kept = min(size, count - first)
-        parts.append({name: np.asarray(values)[:, :kept] for name, values in part.items()})
+    parts = []
+    for first in range(0, segments.count, AT_ONCE):
+        chosen = np.arange(first, min(first + AT_ONCE, segments.count))
+        parts.append(_reached(model, _taken(segments, chosen), ahead, schedule, samples))
     return {name: np.concatenate([part[name] for part in parts], axis=1) for name in UNITS}
 
 
-@eqx.filter_jit
 def _reached(
-    model: Model, segments: Segments, ahead: jax.Array, schedule: Schedule, samples: int
-) -> dict[str, jax.Array]:
-    rolled = simulate_segments(
-        model,
-        segments,
-        schedule,
-        samples=padded_size(samples),
-        horizon=jnp.asarray(samples),
-        limits=AIRBORNE,
-    )
+    model: Model, segments: Segments, ahead: Array, schedule: Schedule, samples: int
+) -> dict[str, Array]:
+    channels = ("position", "attitude", MOTION)
+    flown = fly(
+        model, segments, schedule, samples=samples, limits=AIRBORNE, channels=channels
+    ).channels
     place = ahead * schedule.log_rate
-    below = jnp.floor(place + 1e-6).astype(int)
+    below = np.floor(place + 1e-6).astype(int)
     share = (place - below)[:, None, None]
 
-    def at(columns: tuple[jax.Array, ...]) -> jax.Array:
-        logged = jnp.stack(columns, axis=-1)
-        return logged[below] + share * (logged[below + 1] - logged[below])
+    def at(logged: Array) -> Array:
+        before, after = np.moveaxis(logged[:, below], 0, 1), np.moveaxis(logged[:, below + 1], 0, 1)
+        return np.asarray(before + share * (after - before))
 
-    motion: Motion = rolled.log.motion
-    markers = markers_of(model.vehicle)
-    position, attitude = motion.position, motion.attitude
-    if markers is not None:
-        position, attitude = markers.recorded(motion)
-    turned = at((attitude.w, attitude.x, attitude.y, attitude.z))
-    velocity, rate = motion.velocity, motion.body_rate
+    turned = at(flown["attitude"])
     return {
-        "position": at((position.x, position.y, position.z)),
-        "velocity": at((velocity.x, velocity.y, velocity.z)),
-        "attitude": turned / jnp.linalg.norm(turned, axis=-1, keepdims=True),
-        "body_rate": at((rate.x, rate.y, rate.z)),
+        "position": at(flown["position"]),
+        "velocity": at(flown[MOTION][..., 3:6]),
+        "attitude": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "body_rate": at(flown[MOTION][..., 6:9]),
     }
 
 

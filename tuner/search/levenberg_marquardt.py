@@ -221,27 +221,6 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     return cast(Step, on_host(after))
 
 
-def make_ready(objective: Objective, points: Point, criterion: Criterion) -> None:
-    """Compile what `begin` and `advance` compute beside simulations, for such points (S)."""
-    starts, flights = len(points.coefficients), np.asarray(objective.segments.flight)
-    count = points.coefficients.shape[-1] + points.offsets.shape[-2]
-    nothing = jnp.zeros((starts, len(flights)))
-    channels = dict.fromkeys(objective.segments.measured, nothing)
-    sums = SegmentSums(
-        loss=nothing,
-        gradient=jnp.zeros((starts, count, len(flights))),
-        hessian=jnp.zeros((starts, count, count, len(flights))),
-        squares=channels,
-        counts=channels,
-        crash_time=nothing,
-        states=None if criterion.states is None else jnp.stack([criterion.states] * starts),
-    )
-    sums = cast(SegmentSums, on_host(sums))
-    step = replace(begin(cast(Point, on_host(points))), sums=sums, best=sums)
-    free = np.ones(step.solver.y_eval.shape[-1])
-    _step(objective.space.coordinates, flights, step, criterion, free)
-
-
 def proposed(step: Step) -> Point:
     """Return the points (S) that are to be tried next."""
     return cast(Point, on_host(jax.vmap(_unpack)(jnp.asarray(step.solver.y_eval), step.point)))

@@ -193,7 +193,7 @@ def linear_at(
     parts, loss = [], 0.0
     for flights in portions(replace(objective, memory=objective.memory // 2), point, criterion):
         batch = portion(objective, point, criterion, flights)
-        jacobian = batch[0].jacobian(*batch[1:], columns=COLUMNS)
+        jacobian = batch[0].jacobian(*batch[1:])
         fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
         parts.append(
             information_from_jacobian(

@@ -7,22 +7,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from functools import lru_cache
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array as JaxArray
-from jaxtyping import Float
 
-from sim_jax.environment import NOTHING_AROUND, Environment
+from lanes import Argument, Program
+from sim_jax.environment import Environment
 from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import TERMS, wrench_of_each_term
 from sim_jax.vector import Vec3
-from sim_jax.vehicle import PerRotor, Vehicle
+from sim_jax.vehicle import Vehicle
 from tuner.flights.flight import Array
 
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -57,29 +58,65 @@ class Forces:
 
 def acting(
     vehicle: Vehicle,
-    motion: Motion,
-    rotor_speed: PerRotor,
-    environment: Environment = NOTHING_AROUND,
+    motion: Array,
+    attitude: Array,
+    rotor_speed: Array,
     *,
     rate: float,
-) -> dict[str, Float[JaxArray, "n 6 *batch"]]:
-    """Return term -> what acted at each sample of a log, as in `Forces`.
+    wind: tuple[Array, Array] | None = None,
+    stride: int = 1,
+) -> dict[str, Array]:
+    """Return term -> (F, m, 6) of what acted at every ``stride``-th sample, as in `Forces`.
 
     Parameters
     ----------
     vehicle
         What flew.
-    motion, rotor_speed
-        The log, leaves (n, \\*batch).
-    environment
-        What surrounded the flight.
+    motion
+        (F, n, 9) logged position, velocity (world) and body rate.
+    attitude
+        (F, n, 4) quaternion, body to world.
+    rotor_speed
+        (F, n, rotors) rad/s. A rotor's acceleration is the central difference of its logged speed.
     rate
-        Hz of the log. A rotor's acceleration is the central difference of its logged speed.
+        Hz of the log.
+    wind
+        (F,) m/s each, world x and y; None in still air.
     """
-    accelerations = tuple(rate * jnp.asarray(jnp.gradient(s, axis=0)) for s in rotor_speed)
-    air = Air.around(vehicle, motion, environment, accelerations)
-    shape = jnp.broadcast_shapes(motion.velocity.x.shape, jnp.shape(vehicle.body.mass))
-    wrenches = wrench_of_each_term(vehicle, motion, rotor_speed, air)
+    accelerations = rate * np.gradient(rotor_speed, axis=1)
+    logged = (motion, attitude, rotor_speed, accelerations)
+    flights, samples = motion[:, ::stride].shape[:2]
+    rows = [part[:, ::stride].reshape(flights * samples, -1).T for part in logged]
+    calm = np.zeros(flights)
+    air = [np.repeat(along, samples) for along in (*(wind or (calm, calm)), calm)]
+    given = (jax.tree.map(np.asarray, vehicle), *rows, np.stack(air))
+    leaves, structure = jax.tree.flatten(given)
+    shapes = [
+        Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
+        for leaf in jax.tree.leaves(given[0])
+    ]
+    by_lane = [Argument(np.shape(leaf)[:-1], float, lanes=True) for leaf in leaves[len(shapes) :]]
+    program = _program((*shapes, *by_lane), structure)
+    acted: dict[str, Array] = program(given, lanes=flights * samples).values
+    return {name: values.reshape(flights, samples, 6) for name, values in acted.items()}
+
+
+@lru_cache(maxsize=16)
+def _program(arguments: tuple[Argument, ...], structure: Any) -> Program:
+    return Program(_acting, jax.tree.unflatten(structure, arguments), name="forces")
+
+
+def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
+    """Return term -> (6,) of what acts at one sample."""
+    vehicle, motion, attitude, speeds, accelerations, wind = given
+    rotors = len(vehicle.rotors)
+    moves = Motion(
+        Vec3.of(motion[0:3]), Vec3.of(motion[3:6]), Quaternion.of(attitude), Vec3.of(motion[6:9])
+    )
+    around = Environment(wind=Vec3.of(wind))
+    turning = tuple(speeds[i] for i in range(rotors))
+    air = Air.around(vehicle, moves, around, tuple(accelerations[i] for i in range(rotors)))
+    wrenches = wrench_of_each_term(vehicle, moves, turning, air)
     parts = {
         name: (*_components(wrench.force), *_components(wrench.moment))
         for name, wrench in wrenches.items()
@@ -88,7 +125,7 @@ def acting(
     none = jnp.zeros(())
     parts[WEIGHT] = (*_components(pull), none, none, none)
     return {
-        name: jnp.stack([jnp.broadcast_to(value, shape) for value in values], axis=1)
+        name: jnp.stack([jnp.broadcast_to(value, ()) for value in values])
         for name, values in parts.items()
     }
 
@@ -103,32 +140,18 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
     time, signals
         Of a `tuner.simulation.simulate.Simulation`.
     """
-    columns = {
-        name: tuple(jnp.asarray(column) for column in np.asarray(signals[name]).T)
-        for name in ("position", "velocity", "attitude", "body_rate", "rotor_speed")
-    }
-    motion = Motion(
-        position=Vec3(*columns["position"]),
-        velocity=Vec3(*columns["velocity"]),
-        attitude=Quaternion(*columns["attitude"]),
-        body_rate=Vec3(*columns["body_rate"]),
-    )
     rate = (len(time) - 1) / (time[-1] - time[0])
-    parts = _acting_alone(vehicle, motion, columns["rotor_speed"], rate)
-    return Forces(time, in_order({name: np.asarray(part) for name, part in parts.items()}))
+    names = ("position", "velocity", "body_rate")
+    motion = np.concatenate([signals[name] for name in names], axis=1)
+    logged = (motion, signals["attitude"], signals["rotor_speed"])
+    parts = acting(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
+    return Forces(time, in_order({name: part[0] for name, part in parts.items()}))
 
 
 def in_order(parts: Mapping[str, T]) -> dict[str, T]:
     """Return term -> what belongs to it, in the order of the simulator's terms, gravity last."""
     names = (*(term.__name__ for term in TERMS), WEIGHT)
     return {name: parts[name] for name in names if name in parts}
-
-
-@jax.jit
-def _acting_alone(
-    vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, rate: float
-) -> dict[str, JaxArray]:
-    return acting(vehicle, motion, rotor_speed, rate=rate)
 
 
 def _components(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:

@@ -3,27 +3,31 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
+from lanes import Argument, Program
+from sim_jax.environment import NOTHING_AROUND
 from sim_jax.inlet import Inlet
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.numeric import GRAVITY
 from sim_jax.precision import Precision
-from sim_jax.rollout import Rollout, rollout
+from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
-from sim_jax.state import hover
+from sim_jax.state import State, hover
 from sim_jax.vector import Vec3
 from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, check_mixer
 from tuner.engine import Here, Report, current
 from tuner.flights.flight import Array, Series
 from tuner.flights.resample import resample
 from tuner.model import Model, model_of, schedule_of, with_coefficients
-from tuner.parallel import in_pieces, over_devices, piece_that_fits
+from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
 from tuner.simulation.forces import Forces, forces_of
 from tuner.simulation.trajectory import Published, published
 
@@ -137,13 +141,11 @@ def _flights(piece: _Piece) -> Iterator[Simulation]:
     samples = math.ceil(asked.duration * schedule.log_rate) + 1
     log_time = np.arange(samples) / schedule.log_rate
     model = model_of(asked.vehicle, controller)
-    fly = _flier(schedule, samples, asked.precision)
-    flown = fly(columns, model, reference.inlet, reference.start)
-    logged = _logged(flown)
-    crashes = np.asarray(flown.crash_time).reshape(-1)
+    fed = reference.inlet, reference.start
+    logged, crashes = _logged((columns, model, *fed), schedule, samples, asked.precision)
     for segment in range(wanted):
         signals = {
-            name: resample(name, Series(log_time, values[..., segment]), clock)
+            name: resample(name, Series(log_time, values[segment]), clock)
             for name, values in logged.items()
         }
         signals["acceleration"] = _specific_force(clock, signals)
@@ -170,52 +172,74 @@ def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]
         )
 
 
+def _logged(
+    flown: tuple[Mapping[str, Array], Model, Inlet, Vec3],
+    schedule: Schedule,
+    samples: int,
+    precision: Precision,
+) -> tuple[dict[str, Array], Array]:
+    """Return signal -> (segments, samples, k), and the times (segments,) in s of crashes."""
+    given = jax.tree.map(np.asarray, flown)
+    columns, *shared = given
+    real = np.dtype(precision)
+
+    def kind(leaf: Array, *, lanes: bool, table: bool = False) -> Argument:
+        dtype = real if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
+        if lanes:
+            return Argument((), dtype, lanes=True)
+        return Argument(
+            ("ticks", *leaf.shape[1:]) if table and leaf.ndim else leaf.shape, dtype, False
+        )
+
+    arguments = (
+        jax.tree.map(lambda leaf: kind(leaf, lanes=True), columns),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[0]),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False, table=True), shared[1]),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[2]),
+    )
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    program = _program(tuple(leaves), structure, schedule, precision)
+    lanes = len(next(iter(columns.values()))) if columns else 1
+    rows_of, crash_time = program(given, lanes=lanes, turns=samples).values
+    motion, setpoints = rows_of[MOTION], rows_of[SETPOINTS]
+    logged = {
+        "position": motion[..., 0:3],
+        "velocity": motion[..., 3:6],
+        "attitude": rows_of[TURNED],
+        "body_rate": motion[..., 6:9],
+        "rotor_speed": rows_of["rotor_speed"],
+        "command": rows_of["command"],
+        "rate_setpoint": setpoints[..., 0:3],
+        "thrust_setpoint": setpoints[..., 3:],
+    }
+    return {name: np.asarray(rows, np.float64) for name, rows in logged.items()}, crash_time
+
+
 @lru_cache(maxsize=16)
-def _flier(schedule: Schedule, samples: int, precision: Precision) -> Callable[..., Rollout]:
-    """Return the function that flies a piece of a grid, on all devices where there is a grid.
-
-    It is kept, so that a flight like the last is not compiled again.
-    """
-
-    def fly(columns: dict[str, Scalar], model: Model, inlet: Inlet, start: Vec3) -> Rollout:
+def _program(
+    leaves: tuple[Argument, ...], structure: Any, schedule: Schedule, precision: Precision
+) -> Program:
+    def fly(given: Any, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
+        columns, model, inlet, start = given
         flown = with_coefficients(model, columns)
-        return rollout(
+        plant, first = begun(
             flown.vehicle,
             flown.controller,
             schedule,
             inlet,
             hover(flown.vehicle, start),
-            samples=samples,
             precision=precision,
         )
 
-    segments = piece_that_fits(np.dtype(precision).itemsize)
-    alone, side_by_side = jax.jit(fly), over_devices(in_pieces(fly, segments))
-    return lambda columns, *rest: (side_by_side if columns else alone)(columns, *rest)
+        def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
+            after, row = plant.sample(state, number)
+            channels = ("rotor_speed", "command", MOTION, TURNED, SETPOINTS)
+            return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
 
+        last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
+        return logged, last.crash_time
 
-def _logged(flown: Rollout) -> dict[str, Array]:
-    """Return signal -> (samples, k, segments)."""
-    log = flown.log
-    motion, setpoints = log.motion, log.setpoints
-    attitude = motion.attitude
-    parts = {
-        "position": (motion.position.x, motion.position.y, motion.position.z),
-        "velocity": (motion.velocity.x, motion.velocity.y, motion.velocity.z),
-        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
-        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
-        "rotor_speed": log.rotor_speed,
-        "command": log.command,
-        "rate_setpoint": (setpoints.rate.x, setpoints.rate.y, setpoints.rate.z),
-        "thrust_setpoint": (setpoints.thrust,),
-    }
-    segments = flown.crash_time.size
-    return {
-        name: np.stack(
-            [np.asarray(leaf, dtype=np.float64).reshape(-1, segments) for leaf in leaves], axis=1
-        )
-        for name, leaves in parts.items()
-    }
+    return Program(fly, jax.tree.unflatten(structure, leaves), name="simulated flight")
 
 
 def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:

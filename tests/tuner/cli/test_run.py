@@ -79,30 +79,6 @@ def test_ctrl_c_is_one_line_and_status_130(failing, capsys):
     assert capsys.readouterr().err == "tune: interrupted\n"
 
 
-def test_a_process_that_ends_early_does_not_wait_for_what_it_compiles():
-    script = (
-        "import threading, time\n"
-        "from tuner.cli import program, run\n"
-        "from tuner.runtime import AHEAD\n"
-        "threading.Thread(target=time.sleep, args=(600,), name=f'{AHEAD}_0').start()\n"
-        "def refuse(_):\n"
-        "    print('half a line', end='')\n"
-        "    raise run.InputError('circle.bag', 'is empty', 'record it again')\n"
-        "run.app = refuse\n"
-        "program()\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script, "simulate"],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert (done.returncode, done.stdout) == (2, "half a line")
-    assert done.stderr.startswith("tune: circle.bag")
-
-
 def test_help_loads_nothing_heavy():
     script = (
         "import sys\nfrom tuner.cli import main\nmain(['--help'])\n"

@@ -19,8 +19,8 @@ from tuner.design.next_flight_json import (
 from tuner.design.ranking import rank_next_flights
 from tuner.errors import InputError
 from tuner.examination.examination import Examination, examine
+from tuner.objective import flown
 from tuner.objective.normal import Objective
-from tuner.objective.simulator import Simulator
 from tuner.search.fitted import Fitted
 from tuner.wording.proposals import proposals_in_words
 
@@ -75,10 +75,10 @@ def test_candidates_are_flown_by_the_program_of_the_examination(
 ) -> None:
     examination = examine(fitted, names=("swing",))
 
-    def trace(*_: object) -> None:
-        raise AssertionError("a program was traced for the candidates")
+    def build(*_: object) -> None:
+        raise AssertionError("a program was built for the candidates")
 
-    monkeypatch.setattr(Simulator, "jacobian", trace)
+    monkeypatch.setattr(flown, "Program", build)
     assert ranked(examination, fitted).flights
 
 

@@ -34,8 +34,8 @@ from tuner.filter_error.strengths import Likelihood, slopes_of, steps_from
 from tuner.flights.flight import Flight, InitialState, Series
 from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
+from tuner.objective.flight import beginning_of, trace_of
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import beginning_of, trace_of
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.information import information_at, information_from_jacobian
 

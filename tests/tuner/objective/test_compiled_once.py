@@ -1,4 +1,4 @@
-"""Other recordings, bounds and free coefficients find the code that was compiled for the first."""
+"""Other recordings, lengths, bounds and free coefficients find the program built for the first."""
 
 from __future__ import annotations
 
@@ -12,17 +12,15 @@ from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
 from tuner.flights.flight import Series
 from tuner.job.prepare import job_of
-from tuner.objective import simulator
-from tuner.objective.normal import Objective
+from tuner.objective import flown
 from tuner.recordings import recordings_of
 
 
-def program(objective: Objective) -> object:
-    """Return what compiled code belongs to: statics, structure, shapes and types."""
-    point = objective.start(objective.space.initial)
-    arguments = objective.data(point.offsets, criterion_of(objective)), objective.tunable
-    leaves = [jax.typeof(np.asarray(leaf)) for leaf in jax.tree.leaves(arguments)]
-    return objective.simulator, jax.tree.structure(arguments), leaves
+def built(objective):
+    """Return how many programs a Jacobian of a problem has built."""
+    before = flown._program.cache_info().misses
+    objective.sums(objective.start(objective.space.initial), criterion_of(objective))
+    return flown._program.cache_info().misses - before
 
 
 def shortened(flight, seconds):
@@ -40,39 +38,32 @@ def shortened(flight, seconds):
     )
 
 
-@pytest.mark.parametrize("free", [("inertia_zz", "mass"), ("estimate_latency", "quadratic")])
+@pytest.mark.parametrize("free", [("inertia_zz", "mass", "moment_constant"), ("estimate_latency",)])
 def test_other_coefficients_and_bounds_are_the_same_program(free):
-    first = problem(("inertia_xx", "motor_constant"))
-    second = problem(free, job={"coefficients": {free[0]: {"prior": {"mean": 0.03, "sd": 0.01}}}})
-    assert program(first) == program(second)
+    built(problem(("inertia_xx", "motor_constant")))
+    prior = {"coefficients": {free[0]: {"prior": {"mean": 0.03, "sd": 0.01}}}}
+    assert built(problem(free, job=prior)) == 0
 
 
-def test_a_flight_a_little_shorter_is_the_same_program(flight, updated):
+def test_a_flight_of_another_length_is_the_same_program(flight, updated):
     settings = settle(Options(flights=(str(flight.path),), vehicle=updated))
-    jobs = [
-        job_of(settings, recordings_of(settings, [part]))
-        for part in (flight, shortened(flight, 0.4))
-    ]
-    assert jobs[0].objective.samples != jobs[1].objective.samples
-    assert program(jobs[0].objective) == program(jobs[1].objective)
+    whole, part = (
+        job_of(settings, recordings_of(settings, [each])).objective
+        for each in (flight, shortened(flight, 7.3))
+    )
+    assert whole.samples != part.samples
+    built(whole)
+    assert built(part) == 0
 
 
-def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypatch):
+def test_columns_do_not_depend_on_what_else_is_free():
     groups = ("inertia_xx", "inertia_zz", "mass"), ("motor_constant", "moment_constant")
     fit = problem((*groups[0], *groups[1]))
     names, criterion = list(fit.space.names), criterion_of(fit)
-    traced = []
-    forward = simulator._jacobian_forward
-
-    def counted(*arguments, **options):
-        traced.append(1)
-        return forward(*arguments, **options)
-
-    monkeypatch.setattr(simulator, "_jacobian_forward", counted)
-    together = fit.jacobian(fit.start(fit.space.initial), criterion, columns=3)
+    together = fit.jacobian(fit.start(fit.space.initial), criterion)
     for group in groups:
         part = problem(group)
-        alone = part.jacobian(part.start(part.space.initial), criterion, columns=3)
+        alone = part.jacobian(part.start(part.space.initial), criterion)
         for channel, columns in alone.columns.items():
             for number, name in enumerate(part.space.names):
                 np.testing.assert_allclose(
@@ -83,4 +74,17 @@ def test_columns_three_at_a_time_are_those_of_each_fit_and_one_program(monkeypat
                 )
             offsets = together.columns[channel][len(names) :]
             np.testing.assert_allclose(offsets, columns[len(group) :], rtol=1e-9, atol=1e-9)
-    assert len(traced) <= 1  # by none, if another test was here before
+
+
+def test_segments_give_the_same_sums_one_at_a_time_as_many_at_once():
+    """Those that the memory does not hold at once take turns."""
+    fit = problem(("inertia_xx", "time_constant_up"))
+    which = np.arange(11) % fit.segments.count
+    segments = jax.tree.map(lambda leaf: np.asarray(leaf)[..., which], fit.segments)
+    many = replace(fit, segments=replace(segments, flight=np.arange(len(which))))
+    small = replace(many, memory=1)
+    point = many.start(np.asarray(many.space.initial))
+    want = many.sums(point, criterion_of(many))
+    got = small.sums(point, criterion_of(small))
+    np.testing.assert_allclose(got.hessian, want.hessian, rtol=1e-12)
+    np.testing.assert_allclose(got.loss, want.loss, rtol=1e-12)

@@ -45,7 +45,7 @@ def test_elimination_is_the_minimum_over_the_start():
     centre = rng.normal(size=(states, segments))
     loss = 50.0 + rng.random(segments)
     least, left, information, best = eliminated(
-        jnp.asarray(loss), jnp.asarray(gradient), jnp.asarray(hessian), jnp.asarray(centre)
+        loss, gradient.T, np.moveaxis(hessian, -1, 0), centre
     )
     for segment in range(segments):
         curvature = hessian[kept:, kept:, segment] + np.eye(states)
@@ -55,9 +55,9 @@ def test_elimination_is_the_minimum_over_the_start():
         want = loss[segment] + 0.5 * centre[:, segment] @ centre[:, segment] + 0.5 * pull @ step
         assert float(least[segment]) == pytest.approx(want)
         across = hessian[:kept, kept:, segment]
-        np.testing.assert_allclose(left[:, segment], gradient[:kept, segment] + across @ step)
+        np.testing.assert_allclose(left[segment], gradient[:kept, segment] + across @ step)
         np.testing.assert_allclose(
-            information[..., segment],
+            information[segment],
             hessian[:kept, :kept, segment] - across @ np.linalg.solve(curvature, across.T),
             rtol=1e-9,
         )

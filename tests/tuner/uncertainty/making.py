@@ -25,7 +25,6 @@ from tuner.model import model_of, schedule_of
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
-from tuner.objective.simulator import Simulator
 from tuner.search.fitted import Fitted
 from tuner.yaml_files.shipped import find_config
 
@@ -114,19 +113,15 @@ def with_data(
     return eqx.tree_at(lambda o: o.segments.measured, objective, measured)
 
 
-_fly = eqx.filter_jit(Simulator.fly)
-
-
 def fly_at(objective: Objective, point: Point) -> Mapping[str, np.ndarray]:
-    trace = _fly(
-        objective.simulator,
+    """Return channel -> (samples, c, F)."""
+    flown = objective.simulator.fly(
+        objective.data(point.offsets, criterion_of(objective)),
         objective.tunable,
-        objective.segments,
-        point.coefficients,
-        jnp.asarray(objective.samples),
-        conditions=objective.simulator.conditions_in(jnp.asarray(point.offsets)),
+        np.asarray(point.coefficients),
+        objective.samples,
     )
-    return {name: np.asarray(series) for name, series in trace.channels.items()}
+    return {name: np.moveaxis(series, 0, -1) for name, series in flown.channels.items()}
 
 
 def _turned(quaternion: np.ndarray, half: np.ndarray) -> np.ndarray:

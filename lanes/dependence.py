@@ -1,0 +1,87 @@
+"""Which variables of a jaxpr depend on some of its inputs: on a lane's own, or on a tangent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from jax.extend.core import Jaxpr, Literal
+
+CALLS = frozenset(
+    {
+        "jit",
+        "pjit",
+        "closed_call",
+        "core_call",
+        "remat2",
+        "remat",
+        "checkpoint",
+        "custom_jvp_call",
+        "custom_vjp_call",
+        "custom_vmap_call",
+    }
+)
+"""Primitives that call a jaxpr once, with their own operands."""
+
+
+def called(params: Any) -> tuple[Jaxpr, Sequence[Any]]:
+    """Return the jaxpr that a primitive of `CALLS` calls, and its constants."""
+    inner = next(
+        params[key] for key in ("jaxpr", "call_jaxpr", "call", "fun_jaxpr") if key in params
+    )
+    return (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
+
+
+def dependent(jaxpr: Jaxpr, flags: Sequence[bool]) -> list[bool]:
+    """Return for each output whether it depends on a flagged input.
+
+    What decides a branch or the length of a loop counts too.
+    """
+    known = {var for var, flag in zip(jaxpr.invars, flags, strict=True) if flag}
+    for eqn in jaxpr.eqns:
+        ins = [not isinstance(v, Literal) and v in known for v in eqn.invars]
+        if not any(ins):
+            continue
+        name = eqn.primitive.name
+        if name == "cond":
+            outs = [ins[0]] * len(eqn.outvars)
+            for branch in eqn.params["branches"]:
+                inner = dependent(branch.jaxpr, ins[1:])
+                outs = [a or b for a, b in zip(outs, inner, strict=True)]
+        elif name == "scan":
+            outs = dependent_in_scan(eqn.params, ins)
+        elif name == "while":
+            outs = dependent_in_while(eqn.params, ins)
+        elif name in CALLS:
+            outs = dependent(called(eqn.params)[0], ins)
+        else:
+            outs = [True] * len(eqn.outvars)
+        known.update(var for var, out in zip(eqn.outvars, outs, strict=True) if out)
+    return [not isinstance(v, Literal) and v in known for v in jaxpr.outvars]
+
+
+def dependent_in_scan(params: Any, flags: Sequence[bool]) -> list[bool]:
+    """Return for each output of a scan, carry first, whether it depends on a flagged operand."""
+    body, consts, carried = params["jaxpr"].jaxpr, params["num_consts"], params["num_carry"]
+    now = list(flags)
+    while True:
+        outs = dependent(body, now)
+        carry = now[consts : consts + carried]
+        after = [a or b for a, b in zip(carry, outs[:carried], strict=True)]
+        if after == carry:
+            return after + outs[carried:]
+        now[consts : consts + carried] = after
+
+
+def dependent_in_while(params: Any, flags: Sequence[bool]) -> list[bool]:
+    """Return for each carried value of a while loop whether it depends on a flagged operand."""
+    conds, consts = params["cond_nconsts"], params["body_nconsts"]
+    of_cond, of_body = list(flags[:conds]), list(flags[conds : conds + consts])
+    carry = list(flags[conds + consts :])
+    while True:
+        ends = dependent(params["cond_jaxpr"].jaxpr, of_cond + carry)[0]
+        outs = dependent(params["body_jaxpr"].jaxpr, of_body + carry)
+        after = [a or b or ends for a, b in zip(carry, outs, strict=True)]
+        if after == carry:
+            return after
+        carry = after

@@ -1,0 +1,242 @@
+"""The function around a jaxpr: where its arguments lie, and where each lane's results belong."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import prod
+from typing import Any, NamedTuple, TypeAlias
+
+from jax.extend.core import Literal
+from llvmlite import ir
+
+from lanes.lowering import I64, Lowering
+from lanes.rules import BOOL, Emitter, constant, type_of
+from lanes.values import Memory, Storage, Value
+
+Length: TypeAlias = "int | str"
+Lengths: TypeAlias = Mapping[str, int]
+
+IN_REGISTERS = 64
+"""Numbers up to which an argument is read before anything is computed."""
+
+
+@dataclass(frozen=True)
+class Argument:
+    """An array that a function takes, as one lane has it.
+
+    Attributes
+    ----------
+    shape
+        Its lengths; a name stands for one that is known when the program runs.
+    dtype
+        Of its numbers.
+    lanes
+        Whether each lane has its own: then it is given with the lanes along a last axis.
+    moves
+        Whether the function is differentiated by it: tangents are then given with the columns along
+        a first axis, the same for all lanes.
+    """
+
+    shape: tuple[Length, ...]
+    dtype: Any
+    lanes: bool
+    moves: bool = False
+
+
+class _Frame(NamedTuple):
+    """What the function is called with, and what holds for the block of lanes under way.
+
+    A block takes one pass of columns for each of its lanes. ``segment`` is whose results a lane
+    computes, ``turn`` which pass of columns.
+    """
+
+    given: list[ir.Value]
+    taken: list[ir.Value]
+    lanes: ir.Value
+    own_lanes: ir.Value
+    passes: ir.Value
+    first_lane: ir.Value
+    own_lane: ir.Value
+    segment: list[ir.Value]
+    turn: list[ir.Value]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a kernel takes and returns.
+
+    Attributes
+    ----------
+    arguments, moving, columns
+        Of the program; which arguments have tangents; columns in a pass.
+    lengths
+        Name -> stand-in of each length that is an argument.
+    outputs, moved
+        Shapes of the results, those of the tangents behind the values', and which are tangents.
+    """
+
+    arguments: Sequence[Argument]
+    moving: Sequence[int]
+    columns: int
+    lengths: Lengths
+    outputs: Sequence[Any]
+    moved: Sequence[bool]
+
+    def written(self, closed: Any, width: int) -> str:
+        """Return the module of a traced function, as text, for so many lanes at a time.
+
+        Its function ``run`` takes tables of the addresses of arguments and results, the lengths,
+        the segment and the turn of each lane, how many lanes there are, after how many blocks the
+        arguments begin again, how many passes, and from which block to which it is to compute.
+
+        Raises
+        ------
+        UnsupportedError
+            Something has no rule.
+        """
+        module = ir.Module("lanes")
+        emitter = Emitter(module, width)
+        b = emitter.b
+        bytes_of, whole = ir.IntType(8).as_pointer().as_pointer(), I64.as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [bytes_of, bytes_of, whole, whole, whole, *[I64] * 5])
+        function = ir.Function(module, kind, "run")
+        ins, outs, lengths, segments, turns, lanes, blocks, passes, begin, end = function.args
+        entry, body, head, inside, after = (
+            function.append_basic_block(name)
+            for name in ("entry", "begin", "head", "block", "done")
+        )
+        stack = ir.IRBuilder(entry)
+
+        def allocate(stored: ir.Type, count: int) -> ir.Value:
+            memory = stack.alloca(stored, ir.Constant(ir.IntType(32), count))
+            memory.align = 64
+            return memory
+
+        b.position_at_end(body)
+        known = {
+            stand_in: b.load(b.gep(lengths, [constant(I64, number)]))
+            for number, stand_in in enumerate(self.lengths.values())
+        }
+        lower = Lowering(emitter, self.columns, known, allocate)
+        given = [
+            _pointer_in(b, ins, number, var.aval.dtype)
+            for number, var in enumerate(closed.jaxpr.invars)
+        ]
+        taken = [
+            _pointer_in(b, outs, number, shape.dtype) for number, shape in enumerate(self.outputs)
+        ]
+        b.branch(head)
+        b.position_at_end(head)
+        block = b.phi(I64)
+        block.add_incoming(begin, body)
+        b.cbranch(b.icmp_signed("<", block, end), inside, after)
+        b.position_at_end(inside)
+        at_once = constant(I64, width)
+        first_lane = b.mul(block, at_once)
+
+        def of_lanes(table: ir.Value) -> list[ir.Value]:
+            places = (b.add(first_lane, constant(I64, lane)) for lane in range(width))
+            return [b.load(b.gep(table, [place])) for place in places]
+
+        frame = _Frame(
+            given,
+            taken,
+            lanes,
+            b.mul(blocks, at_once),
+            passes,
+            first_lane,
+            b.mul(b.srem(block, blocks), at_once),
+            of_lanes(segments),
+            of_lanes(turns),
+        )
+        memories = self._results(lower, frame)
+        bound = {
+            var: memory
+            for var, memory in zip(closed.jaxpr.outvars, memories, strict=True)
+            if not isinstance(var, Literal)
+        }
+        taking = self._taken(lower, frame, closed.jaxpr.invars)
+        results = lower.run(closed.jaxpr, closed.consts, taking, bound)
+        for result, memory in zip(results, memories, strict=True):
+            if isinstance(result, Memory) and result.storage is memory.storage:
+                continue  # a loop has laid it there
+            lower.store_rows(memory, None, result)
+        block.add_incoming(b.add(block, constant(I64, 1)), b.block)
+        b.branch(head)
+        b.position_at_end(after)
+        b.ret_void()
+        stack.branch(body)
+        return str(module)
+
+    def _taken(self, lower: Lowering, frame: _Frame, variables: Sequence[Any]) -> list[Value]:
+        """Return the arguments, and the tangents behind them: short ones in registers."""
+        count = len(self.arguments)
+        taking = [*self.arguments, *(self.arguments[number] for number in self.moving)]
+        values: list[Value] = []
+        for number, (argument, var) in enumerate(zip(taking, variables, strict=True)):
+            shape, tangent = tuple(var.aval.shape), number >= count
+            by_lane = argument.lanes or tangent
+            row = (frame.lanes if tangent else frame.own_lanes) if by_lane else None
+            column, *strides = lower.row_major((0, *shape), row)
+            storage = Storage(
+                frame.given[number],
+                type_of(var.aval.dtype),
+                tuple(strides),
+                constant(I64, 1) if by_lane else None,
+                (frame.first_lane if tangent else frame.own_lane) if by_lane else None,
+                column_stride=column if tangent else None,
+            )
+            memory = Memory(storage, shape)
+            values.append(lower.elements(memory) if prod(shape) <= IN_REGISTERS else memory)
+        return values
+
+    def _results(self, lower: Lowering, frame: _Frame) -> list[Memory]:
+        """Return the memory of each result, where each lane writes its own part."""
+        b = lower.b
+        is_first = constant(BOOL, 0)
+        for turn in frame.turn:
+            is_first = b.or_(is_first, b.icmp_signed("==", turn, constant(I64, 0)))
+        memories = []
+        for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
+            if moved:
+                in_loop = is_laid_by_loop(shape, self.lengths)
+                inner = tuple(shape.shape)[1 if in_loop else 0 :]
+                of_pass, *rest = lower.row_major((0, *inner), constant(I64, self.columns))
+                stride = b.mul(frame.passes, of_pass)
+                strides = (stride, *rest) if in_loop else tuple(rest)
+                if in_loop:
+                    stride = b.mul(stride, lower.size(shape.shape[0]))
+                begins = [
+                    b.add(b.mul(segment, stride), b.mul(turn, of_pass))
+                    for segment, turn in zip(frame.segment, frame.turn, strict=True)
+                ]
+            else:
+                stride, *rest = lower.row_major((0, *shape.shape))
+                strides = tuple(rest)
+                begins = [b.mul(segment, stride) for segment in frame.segment]
+            storage = Storage(
+                pointer,
+                type_of(shape.dtype),
+                strides,
+                stride,
+                None,
+                column_stride=constant(I64, 1) if moved else None,
+                scattered=begins,
+                writable=True,
+                guard=None if moved else is_first,
+            )
+            memories.append(Memory(storage, tuple(shape.shape)))
+        return memories
+
+
+def is_laid_by_loop(shape: Any, lengths: Lengths) -> bool:
+    """Return whether an output's first axis is a loop's, whose length is an argument."""
+    return bool(shape.shape) and shape.shape[0] in lengths.values()
+
+
+def _pointer_in(b: ir.IRBuilder, table: ir.Value, number: int, dtype: Any) -> ir.Value:
+    """Return an address out of a table, as that of numbers."""
+    kind = type_of(dtype)
+    stored = ir.IntType(8) if kind == BOOL else kind
+    return b.bitcast(b.load(b.gep(table, [constant(I64, number)])), stored.as_pointer())

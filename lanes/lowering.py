@@ -1,0 +1,705 @@
+"""A jaxpr written as instructions: what moves elements about, and what reads and writes memory.
+
+`lanes.rules` has the elementwise primitives, `lanes.control` loops and conditions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from functools import reduce
+from itertools import product
+from math import prod
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import Jaxpr, JaxprEqn, Literal
+from llvmlite import ir
+
+from lanes.dependence import CALLS, called
+from lanes.rules import BOOL, ELEMENTWISE, Emitter, constant, converted, type_of
+from lanes.values import (
+    Deferred,
+    Element,
+    Elements,
+    Index,
+    Memory,
+    Storage,
+    UnsupportedError,
+    Value,
+    array_of,
+    base,
+    is_vector,
+)
+
+I64 = ir.IntType(64)
+FEW = 512
+"""Elements up to which an array may lie in registers."""
+SPILLED = 24
+"""Elements above which an array that enters a loop is laid in memory."""
+
+
+class Lowering:
+    """Writes one function; holds what all its primitives need.
+
+    Parameters
+    ----------
+    emitter
+        Writes instructions.
+    columns
+        How many columns tangents have.
+    lengths
+        Stand-in of a length -> the length, an argument of the function.
+    allocate
+        Returns memory on the stack for so many numbers of every lane.
+    """
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        columns: int,
+        lengths: Mapping[int, ir.Value],
+        allocate: Callable[[ir.Type, int], ir.Value],
+    ) -> None:
+        self.e, self.columns, self.lengths, self._allocate = emitter, columns, lengths, allocate
+        self.storages: list[Storage] = []
+        """All that is written to."""
+
+    @property
+    def b(self) -> ir.IRBuilder:
+        """Where instructions are written."""
+        return self.e.b
+
+    # jaxprs
+
+    def run(
+        self,
+        jaxpr: Jaxpr,
+        consts: Sequence[Any],
+        arguments: Sequence[Value],
+        bound: Mapping[Any, Memory] | None = None,
+    ) -> list[Value]:
+        """Write a jaxpr; return its outputs.
+
+        ``bound``: variable -> the memory in which a loop is to lay its rows for it.
+        """
+        bound = bound or {}
+        values: dict[Any, Value] = dict(
+            zip(jaxpr.constvars, map(self.literal, consts), strict=True)
+        )
+        values.update(zip(jaxpr.invars, arguments, strict=True))
+        for eqn in jaxpr.eqns:
+            operands = [self._read(values, var) for var in eqn.invars]
+            outs = self._equation(eqn, operands, bound)
+            values.update(zip(eqn.outvars, outs, strict=True))
+        return [self._read(values, var) for var in jaxpr.outvars]
+
+    def _read(self, values: Mapping[Any, Value], var: Any) -> Value:
+        return self.literal(var.val) if isinstance(var, Literal) else values[var]
+
+    def literal(self, number: Any) -> Value:
+        """Return a constant; the stand-in of a length is that length."""
+        if isinstance(number, np.ndarray) and number.dtype == object:
+            return number
+        if isinstance(number, Memory | Deferred):
+            return number
+        array = np.asarray(number)
+        kind = type_of(array.dtype)
+        if array.dtype == jax.dtypes.float0:
+            array = np.zeros(array.shape, bool)
+        if array.size > FEW:
+            return self._laid_out(array, kind)
+        return array_of([self._number(kind, x) for x in array.ravel().tolist()], array.shape)
+
+    def _number(self, kind: ir.Type, number: Any) -> ir.Value:
+        if isinstance(kind, ir.IntType) and kind != BOOL and number in self.lengths:
+            return converted(self.e, self.lengths[number], kind)
+        return constant(kind, number)
+
+    def _laid_out(self, array: np.ndarray[Any, Any], kind: ir.Type) -> Memory:
+        """Return a long constant as a part of the program."""
+        if kind == BOOL:
+            raise UnsupportedError("a long constant of truth values")
+        laid = ir.ArrayType(kind, array.size)
+        name = f"constant.{len(self.e.module.globals)}"
+        variable = ir.GlobalVariable(self.e.module, laid, name)
+        variable.initializer, variable.global_constant = (
+            ir.Constant(laid, array.ravel().tolist()),
+            True,
+        )
+        pointer = self.b.bitcast(variable, kind.as_pointer())
+        return Memory(Storage(pointer, kind, self.row_major(array.shape), None, None), array.shape)
+
+    def _equation(
+        self, eqn: JaxprEqn, operands: list[Value], bound: Mapping[Any, Memory]
+    ) -> list[Value]:
+        name = eqn.primitive.name
+        if name in CALLS:
+            jaxpr, consts = called(eqn.params)
+            inner = {
+                into: bound[outer]
+                for into, outer in zip(jaxpr.outvars, eqn.outvars, strict=True)
+                if outer in bound and not isinstance(into, Literal)
+            }
+            return self.run(jaxpr, consts, operands, inner)
+        if name in CONTROL:
+            return CONTROL[name](self, eqn, operands, bound)
+        if name == "optimization_barrier":
+            return operands
+        if name in ELEMENTWISE:
+            return [self.elementwise(name, eqn.params, operands, shape_of(eqn.outvars[0]))]
+        if name in STRUCTURAL:
+            out = STRUCTURAL[name](self, eqn, operands)
+            return out if isinstance(out, list) else [out]
+        raise UnsupportedError(f"primitive {name}")
+
+    # elements
+
+    def elementwise(
+        self, name: str, params: Mapping[str, Any], operands: Sequence[Value], shape: Sequence[int]
+    ) -> Value:
+        """Apply a rule to arrays, whose elements are computed now or when they are read."""
+
+        def of(*elements: Element) -> Element:
+            return self.apply(name, params, *elements)
+
+        if self._is_long(shape):
+            arrays = [self.elements(o)[()] if not o.shape else o for o in operands]
+
+            def at(index: Index) -> Element:
+                return of(*(self.at(a, index) if hasattr(a, "shape") else a for a in arrays))
+
+            return Deferred(tuple(shape), at, tuple(operands))
+        given = [self.elements(o) for o in operands]
+        spread = np.broadcast_arrays(*given, np.empty(tuple(shape), object))[:-1]
+        flat = [o.ravel() for o in spread]
+        return array_of([of(*(o[i] for o in flat)) for i in range(prod(shape))], shape)
+
+    def apply(self, name: str, params: Mapping[str, Any], *elements: Element) -> Element:
+        """Apply a rule to elements, column by column where one is a tangent."""
+        rule = ELEMENTWISE[name]
+        if any(isinstance(x, tuple) for x in elements):
+            return tuple(
+                self.apply(name, params, *(x[k] if isinstance(x, tuple) else x for x in elements))
+                for k in range(self.columns)
+            )
+        return rule(self.e, params, *self._alike(name, elements))
+
+    def _alike(self, name: str, elements: Sequence[ir.Value]) -> tuple[ir.Value, ...]:
+        if name == "select_n":
+            return (elements[0], *self.e.alike(*elements[1:]))
+        return self.e.alike(*elements)
+
+    def _is_long(self, shape: Sequence[int]) -> bool:
+        return prod(shape) > FEW
+
+    def elements(self, value: Value) -> Elements:
+        """Return an array in registers, read now."""
+        if isinstance(value, np.ndarray):
+            return value
+        if self._is_long(value.shape):
+            raise UnsupportedError(f"an array of shape {value.shape} as a whole")
+        places = product(*map(range, value.shape))
+        found = [self.at(value, [constant(I64, i) for i in place]) for place in places]
+        return array_of(found, value.shape)
+
+    def size(self, length: int) -> ir.Value:
+        """Return a length, that of a stand-in if it is one."""
+        return self.lengths.get(length) or constant(I64, length)
+
+    def as_index(self, number: ir.Value) -> ir.Value:
+        """Return a whole number as an index."""
+        return converted(self.e, number, I64)
+
+    def promoted(self, element: Element, *, lane: bool, column: bool) -> Element:
+        """Return an element of every lane, or every column, if it is to be."""
+        if column and not isinstance(element, tuple):
+            element = (element,) * self.columns
+        if isinstance(element, tuple):
+            return tuple(self.promoted(x, lane=lane, column=False) for x in element)
+        return self.e.splat(element) if lane else element
+
+    # memory
+
+    def row_major(self, shape: Sequence[int], unit: ir.Value | None = None) -> tuple[ir.Value, ...]:
+        """Return the strides of an array whose last axis has a stride of ``unit``, or one."""
+        stride = constant(I64, 1) if unit is None else unit
+        strides: list[ir.Value] = []
+        for length in reversed(shape):
+            strides.insert(0, stride)
+            stride = self._product(stride, self.size(length))
+        return tuple(strides)
+
+    def _product(self, first: ir.Value, second: ir.Value) -> ir.Value:
+        if isinstance(first, ir.Constant) and isinstance(second, ir.Constant):
+            return constant(I64, first.constant * second.constant)
+        return self.b.mul(first, second)
+
+    def at(self, array: Value, index: Index) -> Element:
+        """Return one element of an array."""
+        if isinstance(array, Deferred):
+            return array.at(index)
+        if isinstance(array, Memory):
+            return self._load(array, index)
+        if all(isinstance(i, ir.Constant) for i in index):
+            return array[tuple(i.constant for i in index)]
+        return self._load(self.spilled(array), index)
+
+    def _load(self, memory: Memory, index: Index) -> Element:
+        storage = memory.storage
+        if memory.version != storage.version:
+            raise UnsupportedError("an array that is read after it was changed in place")
+        if storage.column_stride is None:
+            return self._load_column(storage, index, None)
+        return tuple(self._load_column(storage, index, k) for k in range(self.columns))
+
+    def _load_column(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+        if any(map(is_vector, index)):
+            return self._gathered(storage, index, column)
+        place = self._place(storage, index, column)
+        wide = storage.lane_stride is not None
+        if storage.scattered:
+            raise UnsupportedError("reading an array whose lanes lie apart")
+        return self._read_at(storage, place, wide=wide)
+
+    def _gathered(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+        """Read at an index of each lane's own; where all are the same, at once."""
+        index = [self.e.splat(i) for i in index]
+        first = [self.b.extract_element(i, constant(ir.IntType(32), 0)) for i in index]
+        differ = None
+        for each, one in zip(index, first, strict=True):
+            apart = self.b.icmp_signed("!=", each, self.e.splat(one))
+            differ = apart if differ is None else self.b.or_(differ, apart)
+        assert differ is not None
+
+        def one_by_one() -> ir.Value:
+            result = ir.Constant(self.e.vector(storage.kind), ir.Undefined)
+            for lane in range(self.e.width):
+                number = constant(ir.IntType(32), lane)
+                own = [self.b.extract_element(i, number) for i in index]
+                place = self._place(storage, own, column)
+                if storage.lane_stride is not None:
+                    step = self._product(storage.lane_stride, constant(I64, lane))
+                    place = self.b.add(place, step)
+                one = self._read_at(storage, place, wide=False)
+                result = self.b.insert_element(result, one, number)
+            return result
+
+        def together() -> ir.Value:
+            return self.e.splat(self._load_column(storage, first, column))
+
+        return self.either(self.e.any_lane(differ), one_by_one, together)
+
+    def either(
+        self, flag: ir.Value, yes: Callable[[], ir.Value], no: Callable[[], ir.Value]
+    ) -> ir.Value:
+        """Compute one of two values, by a branch."""
+        function = self.b.function
+        branches = [function.append_basic_block(n) for n in ("yes", "no", "end")]
+        self.b.cbranch(flag, *branches[:2])
+        found = []
+        for block, compute in zip(branches[:2], (yes, no), strict=True):
+            self.b.position_at_end(block)
+            found.append((compute(), self.b.block))
+            self.b.branch(branches[2])
+        self.b.position_at_end(branches[2])
+        phi = self.b.phi(found[0][0].type)
+        for value, block in found:
+            phi.add_incoming(value, block)
+        return phi
+
+    def _place(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
+        place = constant(I64, 0)
+        for i, stride in zip(index, storage.strides, strict=True):
+            place = self._sum(place, self._product(self.as_index(i), stride))
+        if storage.lane_stride is not None and storage.first_lane is not None:
+            place = self._sum(place, self._product(storage.first_lane, storage.lane_stride))
+        if column and storage.column_stride is not None:
+            step = self._product(storage.column_stride, constant(I64, column))
+            place = self._sum(place, step)
+        return place
+
+    def _sum(self, first: ir.Value, second: ir.Value) -> ir.Value:
+        if isinstance(first, ir.Constant):
+            if first.constant == 0:
+                return second
+            if isinstance(second, ir.Constant):
+                return constant(I64, first.constant + second.constant)
+        return self.b.add(first, second)
+
+    def _read_at(self, storage: Storage, place: ir.Value, *, wide: bool) -> ir.Value:
+        pointer = self.b.gep(storage.pointer, [place])
+        stored = storage.pointer.type.pointee
+        if wide:
+            pointer = self.b.bitcast(pointer, self.e.vector(stored).as_pointer())
+        value = self.b.load(pointer)
+        value.align = _bytes(stored)
+        if storage.kind != BOOL:
+            return value
+        return self.b.icmp_unsigned("!=", value, self.e.number(value, 0))
+
+    def store(self, memory: Memory, index: Index, element: Element) -> None:
+        """Write one element."""
+        storage = memory.storage
+        assert storage.writable
+        if storage.column_stride is None:
+            if isinstance(element, tuple):
+                raise UnsupportedError("a tangent where none is expected")
+            self._store_column(storage, index, None, element)
+            return
+        for k in range(self.columns):
+            value = element[k] if isinstance(element, tuple) else element
+            self._store_column(storage, index, k, value)
+
+    def _store_column(
+        self, storage: Storage, index: Index, column: int | None, value: ir.Value
+    ) -> None:
+        place = self._place(storage, index, column)
+        stored = storage.pointer.type.pointee
+        if storage.kind == BOOL:
+            value = self.b.zext(value, self.e.vector(stored) if is_vector(value) else stored)
+        if storage.lane_stride is None:
+            if is_vector(value):
+                raise UnsupportedError("lanes' own values where all are to share one")
+            self.b.store(value, self.b.gep(storage.pointer, [place])).align = _bytes(stored)
+            return
+        value = self.e.splat(value)
+        pointer = self.b.bitcast(self.b.gep(storage.pointer, [place]), value.type.as_pointer())
+        self.b.store(value, pointer).align = _bytes(stored)
+
+    def store_rows(self, memory: Memory, number: ir.Value | None, rows: Value) -> None:
+        """Write an array, or one row of it, if the memory's guard says so."""
+        storage, given = memory.storage, self.elements(rows)
+        guard = storage.guard
+        with nullcontext() if guard is None else self.b.if_then(guard):
+            if storage.scattered:
+                self._scatter(storage, number, given)
+                return
+            for place in np.ndindex(given.shape):
+                index = [constant(I64, i) for i in place]
+                self.store(memory, index if number is None else [number, *index], given[place])
+
+    def _scatter(self, storage: Storage, number: ir.Value | None, given: Elements) -> None:
+        """Write a row of an output, whose numbers lie side by side in each lane's own part."""
+        parts: list[ir.Value] = []
+        for element in given.ravel():
+            if storage.column_stride is None and isinstance(element, tuple):
+                raise UnsupportedError("a tangent where none is expected")
+            count = 1 if storage.column_stride is None else self.columns
+            parts += element if isinstance(element, tuple) else (element,) * count
+        first = constant(I64, 0) if number is None else self._product(number, storage.strides[0])
+        stored, width = storage.pointer.type.pointee, self.e.width
+        if storage.kind == BOOL:
+            parts = [self.b.zext(p, self.e.vector(stored)) for p in map(self.e.splat, parts)]
+        vectors = [self.e.splat(part) for part in parts]
+        lanes = [self.b.gep(storage.pointer, [self._sum(own, first)]) for own in storage.scattered]
+        whole = len(vectors) // width * width
+        for begin in range(0, whole, width):
+            turned = self._transposed(vectors[begin : begin + width])
+            for lane, row in zip(lanes, turned, strict=True):
+                pointer = self.b.gep(lane, [constant(I64, begin)])
+                pointer = self.b.bitcast(pointer, row.type.as_pointer())
+                self.b.store(row, pointer).align = _bytes(stored)
+        for place in range(whole, len(vectors)):
+            for number_of, lane in enumerate(lanes):
+                one = self.b.extract_element(vectors[place], constant(ir.IntType(32), number_of))
+                self.b.store(one, self.b.gep(lane, [constant(I64, place)])).align = _bytes(stored)
+
+    def _transposed(self, rows: list[ir.Value]) -> list[ir.Value]:
+        """Return as many vectors as they have lanes, turned about their diagonal."""
+        width, half = len(rows), len(rows) // 2
+        while half:
+            turned = list(rows)
+            for i in range(width):
+                if i & half:
+                    continue
+                # lanes whose number has this bit change places between the two
+                low = [j if not j & half else width + j - half for j in range(width)]
+                high = [j + half if not j & half else width + j for j in range(width)]
+                for to, mask in ((i, low), (i + half, high)):
+                    lanes = ir.Constant(ir.VectorType(ir.IntType(32), width), mask)
+                    turned[to] = self.b.shuffle_vector(rows[i], rows[i + half], lanes)
+            rows, half = turned, half // 2
+        return rows
+
+    def local(self, shape: tuple[int, ...], kind: ir.Type, *, lane: bool, column: bool) -> Memory:
+        """Return memory on the stack, uninitialised."""
+        if any(length in self.lengths for length in shape):
+            raise UnsupportedError(f"an array of shape {shape} that is no output")
+        count, stored = prod(shape), ir.IntType(8) if kind == BOOL else kind
+        width = self.e.width if lane else 1
+        total = count * width * (self.columns if column else 1)
+        unit = constant(I64, width)
+        storage = Storage(
+            pointer=self._allocate(stored, total),
+            kind=kind,
+            strides=self.row_major(shape, unit),
+            lane_stride=constant(I64, 1) if lane else None,
+            first_lane=None,
+            column_stride=constant(I64, count * width) if column else None,
+            writable=True,
+        )
+        self.storages.append(storage)
+        return Memory(storage, shape)
+
+    def spilled(self, value: Value, *, lane: bool = False, column: bool = False) -> Memory:
+        """Return an array as memory of this lowering's own."""
+        given = self.elements(value)
+        flat = [x for e in given.ravel() for x in (e if isinstance(e, tuple) else (e,))]
+        lane = lane or any(map(is_vector, flat))
+        column = column or any(isinstance(e, tuple) for e in given.ravel())
+        memory = self.local(given.shape, base(flat[0].type), lane=lane, column=column)
+        self.store_rows(memory, None, given)
+        return memory
+
+    def start_within(self, start: ir.Value, length: int, size: int) -> ir.Value:
+        """Return where a slice begins, moved so that it lies in its array."""
+        start = self.as_index(start)
+        if isinstance(start, ir.Constant) and length not in self.lengths:
+            return constant(I64, min(max(start.constant, 0), length - size))
+        last = self.b.sub(self.size(length), constant(I64, size))
+        lowest = self.e.number(start, 0)
+        start = self.e.select(self.b.icmp_signed("<", start, lowest), lowest, start)
+        start, last = self.e.alike(start, last)
+        return self.e.select(self.b.icmp_signed(">", start, last), last, start)
+
+
+def shape_of(var: Any) -> tuple[int, ...]:
+    """Return the shape of a variable of a jaxpr."""
+    return tuple(var.aval.shape)
+
+
+def dtype_of(var: Any) -> Any:
+    """Return the type of a variable's numbers."""
+    return var.aval.dtype
+
+
+def _bytes(kind: ir.Type) -> int:
+    if isinstance(kind, ir.IntType):
+        return int(kind.width) // 8
+    return 8 if isinstance(kind, ir.DoubleType) else 4
+
+
+# primitives that move elements
+
+Structural = Callable[[Lowering, JaxprEqn, list[Value]], "Value | list[Value]"]
+
+
+def _broadcast_in_dim(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    (value,) = operands
+    shape, kept = eqn.params["shape"], eqn.params["broadcast_dimensions"]
+    if lower._is_long(shape):
+        if isinstance(value, np.ndarray) and value.shape == ():
+            single = value[()]
+            return Deferred(tuple(shape), lambda _: single, (value,))
+
+        def at(index: Index) -> Element:
+            zero = constant(I64, 0)
+            own = [
+                index[axis] if length != 1 else zero
+                for axis, length in zip(kept, value.shape, strict=True)
+            ]
+            return lower.at(value, own)
+
+        return Deferred(tuple(shape), at, (value,))
+    given = lower.elements(value)
+    lengths = [1] * len(shape)
+    for axis, length in zip(kept, given.shape, strict=True):
+        lengths[axis] = length
+    return np.broadcast_to(given.reshape(lengths), shape)
+
+
+def _reshape(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    (value,), shape = operands, shape_of(eqn.outvars[0])
+    if not lower._is_long(shape):
+        return lower.elements(value).reshape(shape)
+    if [n for n in shape if n != 1] != [n for n in value.shape if n != 1]:
+        raise UnsupportedError(f"reshape of {value.shape} to {shape}")
+
+    def at(index: Index) -> Element:
+        own = iter([i for i, n in zip(index, shape, strict=True) if n != 1])
+        return lower.at(value, [constant(I64, 0) if n == 1 else next(own) for n in value.shape])
+
+    return Deferred(tuple(shape), at, (value,))
+
+
+def _transpose(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    return lower.elements(operands[0]).transpose(eqn.params["permutation"])
+
+
+def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    return np.concatenate([lower.elements(o) for o in operands], axis=eqn.params["dimension"])
+
+
+def _stack(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    return np.stack([lower.elements(o) for o in operands], axis=eqn.params.get("axis", 0))
+
+
+def _slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    (value,), p = operands, eqn.params
+    strides = p["strides"] or (1,) * len(value.shape)
+    if isinstance(value, np.ndarray):
+        limits = zip(p["start_indices"], p["limit_indices"], strides, strict=True)
+        return np.asarray(value[tuple(slice(*each) for each in limits)], object)
+    shape = shape_of(eqn.outvars[0])
+
+    def at(index: Index) -> Element:
+        moved = [
+            lower._sum(
+                constant(I64, start), lower._product(lower.as_index(i), constant(I64, stride))
+            )
+            for i, start, stride in zip(index, p["start_indices"], strides, strict=True)
+        ]
+        return lower.at(value, moved)
+
+    cut = Deferred(tuple(shape), at, (value,))
+    return cut if lower._is_long(shape) else lower.elements(cut)
+
+
+def _split(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> list[Value]:
+    ends = np.cumsum(eqn.params["sizes"])[:-1]
+    return list(np.split(lower.elements(operands[0]), ends, axis=eqn.params["axis"]))
+
+
+def _reverse(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    return np.flip(lower.elements(operands[0]), eqn.params["dimensions"])
+
+
+def _pad(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    given, filling = lower.elements(operands[0]), lower.elements(operands[1])[()]
+    shape = shape_of(eqn.outvars[0])
+    padded = array_of([filling] * prod(shape), shape)
+    for place in np.ndindex(given.shape):
+        to = [
+            low + i * (interior + 1)
+            for i, (low, _, interior) in zip(place, eqn.params["padding_config"], strict=True)
+        ]
+        if all(0 <= i < n for i, n in zip(to, shape, strict=True)):
+            padded[tuple(to)] = given[place]
+    return padded
+
+
+def _iota(lower: Lowering, eqn: JaxprEqn, _: list[Value]) -> Value:
+    shape, axis = eqn.params["shape"], eqn.params["dimension"]
+    kind = type_of(eqn.params["dtype"])
+
+    def at(index: Index) -> Element:
+        return converted(lower.e, lower.as_index(index[axis]), kind)
+
+    if lower._is_long(shape):
+        return Deferred(tuple(shape), at)
+    numbers = [constant(kind, place[axis]) for place in np.ndindex(*shape)]
+    return array_of(numbers, shape)
+
+
+def _reduce(name: str) -> Structural:
+    def rule(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+        given, axes = lower.elements(operands[0]), eqn.params["axes"]
+        kept = [axis for axis in range(given.ndim) if axis not in axes]
+        shape = [given.shape[axis] for axis in kept]
+        rows = given.transpose([*kept, *axes]).reshape(prod(shape), -1)
+        if rows.shape[1] == 0:
+            raise UnsupportedError(f"{eqn.primitive.name} over nothing")
+        return array_of(
+            [reduce(lambda x, y: lower.apply(name, {}, x, y), list(row)) for row in rows], shape
+        )
+
+    return rule
+
+
+def _dot_general(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    (left_sum, right_sum), (left_batch, right_batch) = eqn.params["dimension_numbers"]
+    left, right = map(lower.elements, operands)
+
+    def rows(array: Elements, batch: Sequence[int], summed: Sequence[int]) -> Elements:
+        free = [a for a in range(array.ndim) if a not in (*batch, *summed)]
+        lengths = [prod(array.shape[a] for a in group) for group in (batch, free, summed)]
+        return array.transpose([*batch, *free, *summed]).reshape(lengths)
+
+    first, second = rows(left, left_batch, left_sum), rows(right, right_batch, right_sum)
+
+    def dot(x: Elements, y: Elements) -> Element:
+        products = [lower.apply("mul", {}, a, b) for a, b in zip(x, y, strict=True)]
+        return reduce(lambda a, b: lower.apply("add", {}, a, b), products)
+
+    found = [dot(x, y) for xs, ys in zip(first, second, strict=True) for x in xs for y in ys]
+    return array_of(found, shape_of(eqn.outvars[0]))
+
+
+def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
+    value, sizes = operands[0], eqn.params["slice_sizes"]
+    starts = [
+        lower.start_within(lower.elements(s)[()], length, size)
+        for s, length, size in zip(operands[1:], value.shape, sizes, strict=True)
+    ]
+    if isinstance(value, np.ndarray) and not all(isinstance(s, ir.Constant) for s in starts):
+        value = lower.spilled(value)
+    found = [
+        lower.at(
+            value, [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
+        )
+        for place in np.ndindex(*sizes)
+    ]
+    return array_of(found, sizes)
+
+
+def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -> Value:
+    value, update = operands[0], lower.elements(operands[1])
+    starts = [
+        lower.start_within(lower.elements(s)[()], length, size)
+        for s, length, size in zip(operands[2:], value.shape, update.shape, strict=True)
+    ]
+    if isinstance(value, np.ndarray):
+        if all(isinstance(s, ir.Constant) for s in starts):
+            changed = value.copy()
+            for place in np.ndindex(update.shape):
+                to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
+                changed[to] = update[place]
+            return changed
+        flat = [x for e in update.ravel() for x in (e if isinstance(e, tuple) else (e,))]
+        value = lower.spilled(
+            value,
+            lane=any(map(is_vector, flat)),
+            column=any(isinstance(e, tuple) for e in update.ravel()),
+        )
+    if not isinstance(value, Memory) or not value.storage.writable:
+        raise UnsupportedError("a change in place of what belongs to the caller")
+    if any(map(is_vector, starts)):
+        raise UnsupportedError("a change in place at an index of each lane's own")
+    if value.version != value.storage.version:
+        raise UnsupportedError("an array that is changed after it was changed in place")
+    for place in np.ndindex(update.shape):
+        at = [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]
+        lower.store(value, at, update[place])
+    value.storage.version += 1
+    return Memory(value.storage, value.shape, value.storage.version)
+
+
+STRUCTURAL: dict[str, Structural] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "reshape": _reshape,
+    "squeeze": _reshape,
+    "expand_dims": _reshape,
+    "transpose": _transpose,
+    "concatenate": _concatenate,
+    "stack": _stack,
+    "slice": _slice,
+    "split": _split,
+    "rev": _reverse,
+    "pad": _pad,
+    "iota": _iota,
+    "reduce_sum": _reduce("add"),
+    "reduce_max": _reduce("max"),
+    "reduce_min": _reduce("min"),
+    "reduce_prod": _reduce("mul"),
+    "reduce_or": _reduce("or"),
+    "reduce_and": _reduce("and"),
+    "dot_general": _dot_general,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+}
+"""Primitive -> rule, for those that move elements or gather them."""
+
+CONTROL: dict[str, Callable[..., list[Value]]] = {}
+"""Loops and conditions, which `lanes.control` fills in."""

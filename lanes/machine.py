@@ -1,0 +1,158 @@
+"""LLVM on this machine: modules into object code, kept on disk by what they are made of."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import llvmlite
+import llvmlite.binding as llvm
+
+logger = logging.getLogger(__name__)
+
+MOST = 256 * 2**20
+"""bytes of object code that are kept; the longest unused goes first."""
+_BYTES_OF_DIGEST = 32
+
+_lock = Lock()
+_folder: list[Path] = []
+
+
+def keep_code_in(folder: Path | None) -> None:
+    """Keep object code in a folder; None keeps none.
+
+    Whoever can write there can run code as this user: it must be the user's own.
+    """
+    _folder[:] = [] if folder is None else [folder]
+
+
+@cache
+def _target_machine() -> Any:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    features = llvm.get_host_cpu_features()
+    flat = features.flatten() + (",-prefer-256-bit" if features.get("avx512f") else "")
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=flat, opt=2, reloc="pic"
+    )
+
+
+@cache
+def register_bytes() -> int:
+    """Return how wide this processor's vector registers are."""
+    features = llvm.get_host_cpu_features()
+    if features.get("avx512f"):
+        return 64
+    return 32 if features.get("avx2") else 16
+
+
+def _machine_name() -> str:
+    machine = _target_machine()
+    features = sorted(name for name, has in llvm.get_host_cpu_features().items() if has)
+    versions = (llvmlite.__version__, *llvm.llvm_version_info)
+    return repr((versions, machine.triple, llvm.get_host_cpu_name(), features))
+
+
+def _compiled(text: str) -> bytes:
+    machine = _target_machine()
+    module = llvm.parse_assembly(text)
+    options = llvm.create_pipeline_tuning_options(speed_level=2)
+    # lanes are vectors already; loops are long and gain nothing from being unrolled
+    options.loop_unrolling = options.loop_vectorization = options.slp_vectorization = False
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    code: bytes = machine.emit_object(module)
+    return code
+
+
+def object_code(text: str) -> bytes:
+    """Return the object code of a module's text, compiled or as it is kept."""
+    if not _folder:
+        return _compiled(text)
+    key = hashlib.sha256(f"{_machine_name()}\n{text}".encode()).hexdigest()
+    path = _folder[0] / f"{key}.o"
+    code = _read(path)
+    if code is None:
+        code = _compiled(text)
+        _write(path, code)
+    return code
+
+
+def _read(path: Path) -> bytes | None:
+    """Return what a file holds behind its digest; None if there is none or it is damaged."""
+    try:
+        held = path.read_bytes()
+        os.utime(path)
+    except OSError:
+        return None
+    digest, code = held[:_BYTES_OF_DIGEST], held[_BYTES_OF_DIGEST:]
+    if hashlib.sha256(code).digest() != digest:
+        logger.debug("%s is damaged and is compiled again", path)
+        return None
+    return code
+
+
+def _write(path: Path, code: bytes) -> None:
+    """Keep code behind its digest, whole or not at all; a full disk is no reason to fail."""
+    with suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".code-")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(code).digest() + code)
+            Path(name).replace(path)
+        except OSError:
+            Path(name).unlink(missing_ok=True)
+            raise
+        _bound(path.parent)
+
+
+def _bound(folder: Path) -> None:
+    """Remove what was not used for longest, down to `MOST` bytes."""
+    found = []
+    for path in folder.glob("*.o"):
+        with suppress(OSError):
+            state = path.stat()
+            found.append((state.st_mtime, state.st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= MOST:
+            break
+        with suppress(OSError):
+            path.unlink()
+            total -= size
+
+
+@cache
+def _linker() -> Any:
+    _target_machine()
+    return llvm.create_lljit_compiler(_target_machine())
+
+
+class Code:
+    """A function in memory, there as long as this is."""
+
+    def __init__(self, text: str, function: str) -> None:
+        code = object_code(text)
+        with _lock:
+            number = hashlib.sha256(code).hexdigest() + f"-{id(self):x}"
+            self._library = (
+                llvm.JITLibraryBuilder()
+                .add_object_img(code)
+                .add_current_process()
+                .export_symbol(function)
+                .link(_linker(), number)
+            )
+        self.address: int = self._library[function]
+
+    def __call__(self, kind: Callable[..., Any]) -> Any:
+        """Return the function as one of ctypes' kinds."""
+        return kind(self.address)

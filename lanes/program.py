@@ -1,0 +1,348 @@
+"""A function of one lane as a program for many: built once, run in blocks on several threads."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import pairwise
+from typing import Any, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+import lanes.control  # noqa: F401 (fills in the rules of loops)
+from lanes.dependence import dependent
+from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
+from lanes.machine import Code, keep_code_in, register_bytes
+from lanes.values import UnsupportedError
+
+__all__ = ["Argument", "Program", "Run", "joined", "keep_code_in"]
+
+logger = logging.getLogger(__name__)
+
+_STAND_INS = (
+    1_000_003, 1_000_033, 1_000_037, 1_000_039, 1_000_081, 1_000_099, 1_000_117, 1_000_121,
+    1_000_133, 1_000_151, 1_000_159, 1_000_171, 1_000_183, 1_000_187, 1_000_193, 1_000_199,
+)  # fmt: skip
+"""Lengths under which a function is traced; no number of a program is likely to be one of them."""
+TASKS_A_CORE = 4
+"""Pieces of work a core: their sizes differ."""
+WASTE = 0.15
+"""Share of lanes left empty from which blocks take several passes of columns."""
+FEW = 512
+"""Blocks without a loop that are computed sooner than another thread begins."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a program returns.
+
+    Attributes
+    ----------
+    values
+        The function's outputs, a pytree; leaves (lanes, \\*shape).
+    columns
+        Their derivatives along the Q tangents, leaves (lanes, \\*shape, Q). Those of an output
+        whose first axis is a loop's are left as they were laid, (lanes, turns, passes, \\*rest,
+        columns of a pass), the last pass filled up: `joined` lays them side by side. None for an
+        output that does not move, and if nothing moves.
+    """
+
+    values: Any
+    columns: Any
+
+
+def joined(columns: NDArray[Any], count: int, *, axis: int = 1) -> NDArray[Any]:
+    """Return derivatives side by side, (..., Q), whose passes lie along an axis."""
+    beside = np.moveaxis(columns, axis, -2)
+    return beside.reshape(*beside.shape[:-2], -1)[..., :count]
+
+
+Function: TypeAlias = Callable[[Any, Lengths], Any]
+
+
+class Program:
+    """A function of one lane, compiled for many.
+
+    Parameters
+    ----------
+    function
+        Takes a pytree of arrays, as one lane has them, and the lengths by name; returns a pytree of
+        arrays. It must be traceable and forward-differentiable by jax.
+    arguments
+        Pytree of `Argument`, of the structure that ``function`` takes.
+    at_once
+        Columns computed in one pass over a block of lanes; with more, passes take turns.
+    name
+        For messages.
+    """
+
+    def __init__(
+        self, function: Function, arguments: Any, *, at_once: int = 2, name: str = ""
+    ) -> None:
+        self.function, self.name = function, name or getattr(function, "__name__", "function")
+        leaves, structure = jax.tree.flatten(
+            arguments, is_leaf=lambda leaf: isinstance(leaf, Argument)
+        )
+        self.structure: Any = structure
+        self.arguments: tuple[Argument, ...] = tuple(leaves)
+        self.moving = tuple(number for number, a in enumerate(leaves) if a.moves)
+        names = {length for a in leaves for length in a.shape if isinstance(length, str)}
+        self.names = tuple(sorted(names))
+        self.columns = at_once if self.moving else 0
+
+    # what is computed
+
+    def _pushed(self, lengths: Lengths) -> Callable[..., Any]:
+        """Return the function of flat arguments and tangents, or of arguments alone."""
+
+        def flown(*leaves: Any) -> Any:
+            return self.function(jax.tree.unflatten(self.structure, leaves), lengths)
+
+        def pushed(leaves: Sequence[Any], tangents: Sequence[Any]) -> Any:
+            def of_moving(*moved: Any) -> Any:
+                whole = list(leaves)
+                for number, leaf in zip(self.moving, moved, strict=True):
+                    whole[number] = leaf
+                return flown(*whole)
+
+            given = [leaves[number] for number in self.moving]
+            found, moved = jax.jvp(of_moving, given, list(tangents))
+            # what is no real number has no derivative
+            return found, jax.tree.map(
+                lambda t: jnp.zeros(()) if t.dtype == jax.dtypes.float0 else t, moved
+            )
+
+        if not self.moving:
+            return lambda leaves, _: flown(*leaves)
+        return pushed
+
+    def _shaped(self, argument: Argument, lengths: Lengths) -> jax.ShapeDtypeStruct:
+        shape = tuple(lengths[n] if isinstance(n, str) else n for n in argument.shape)
+        return jax.ShapeDtypeStruct(shape, argument.dtype)
+
+    @cached_property
+    def _traced(self) -> tuple[Any, Any, dict[str, int]]:
+        """The jaxpr, the structure of its outputs, and the stand-ins of lengths."""
+        lengths = dict(zip((*self.names, *self._own_lengths()), _STAND_INS, strict=False))
+        given = [self._shaped(a, lengths) for a in self.arguments]
+        tangents = [given[number] for number in self.moving]
+        closed, shapes = jax.make_jaxpr(self._pushed(lengths), return_shape=True)(given, tangents)
+        return closed, shapes, lengths
+
+    def _own_lengths(self) -> tuple[str, ...]:
+        """Names of lengths that no argument has: those of loops."""
+        return ("turns",)
+
+    @cached_property
+    def _compiled(self) -> _Compiled | None:
+        """The kernel, or None where something has no rule."""
+        try:
+            return _Compiled(self)
+        except UnsupportedError as missing:
+            logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
+            return None
+
+    @property
+    def is_kernel(self) -> bool:
+        """Whether it runs as a kernel; else through XLA."""
+        return self._compiled is not None
+
+    def __call__(self, values: Any, tangents: Any = None, *, lanes: int, turns: int = 0) -> Run:
+        """Run.
+
+        Parameters
+        ----------
+        values
+            Pytree of arrays: (\\*shape, lanes) where each lane has its own, else (\\*shape).
+        tangents
+            Of the arguments that move, in the order of their leaves: (Q, \\*shape) each.
+        lanes
+            How many there are.
+        turns
+            The length named ``turns``, of loops.
+        """
+        leaves = [
+            np.asarray(leaf, a.dtype)
+            for leaf, a in zip(self.structure.flatten_up_to(values), self.arguments, strict=True)
+        ]
+        moved = [np.asarray(t, float) for t in (tangents or [])]
+        lengths = self._lengths(leaves, turns)
+        kernel = self._compiled
+        if kernel is None:
+            return self.by_xla(values, tangents, turns=turns)
+        return kernel.run(leaves, moved, lengths, lanes)
+
+    def _lengths(self, leaves: Sequence[NDArray[Any]], turns: int) -> dict[str, int]:
+        lengths = {"turns": turns}
+        for leaf, argument in zip(leaves, self.arguments, strict=True):
+            for axis, length in enumerate(argument.shape):
+                if isinstance(length, str):
+                    given = lengths.setdefault(length, leaf.shape[axis])
+                    if given != leaf.shape[axis]:
+                        raise ValueError(f"{length} is {given} and {leaf.shape[axis]}")
+        return lengths
+
+    def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> Run:
+        """Compute the same through `jax.vmap` and XLA: what a kernel is held against."""
+        leaves = [jnp.asarray(leaf) for leaf in self.structure.flatten_up_to(values)]
+        moved = [jnp.asarray(t) for t in (tangents or [])]
+        lengths = self._lengths([np.asarray(leaf) for leaf in leaves], turns)
+        run = self._xla(tuple(sorted(lengths.items())))
+        if not self.moving:
+            return Run(jax.tree.map(np.asarray, run(leaves, moved)), None)
+        found, columns = run(leaves, moved)
+        _, (shapes, _), stand_ins = self._traced
+
+        def laid(leaf: Any, shape: Any) -> NDArray[Any]:
+            last = np.moveaxis(np.asarray(leaf), 0, -1)
+            return last[:, :, None] if is_laid_by_loop(shape, stand_ins) else last
+
+        return Run(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
+
+    def _xla(self, lengths: tuple[tuple[str, int], ...]) -> Callable[..., Any]:
+        known: dict[Any, Callable[..., Any]] = self.__dict__.setdefault("_programs", {})
+        if lengths not in known:
+            axes = [-1 if a.lanes else None for a in self.arguments]
+            pushed = self._pushed(dict(lengths))
+            by_lane = jax.vmap(pushed, in_axes=(axes, None))
+            if self.moving:
+                out = (None, 0)
+                by_lane = jax.vmap(by_lane, in_axes=(None, 0), out_axes=out)
+            known[lengths] = jax.jit(by_lane)
+        return known[lengths]
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_cores(), thread_name_prefix="lanes")
+
+
+def _cores() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1
+
+
+class _Compiled:
+    """The kernel of a program."""
+
+    def __init__(self, program: Program) -> None:
+        self.program = program
+        closed, shapes, lengths = program._traced
+        self.lengths = lengths
+        self.outputs, structure = jax.tree.flatten(shapes)
+        self.structure: Any = structure
+        widest = max(
+            (np.dtype(a.dtype).itemsize for a in program.arguments if _is_real(a.dtype)), default=8
+        )
+        self.width = max(register_bytes() // widest, 1)
+        count, moving = len(program.arguments), len(program.moving)
+        flags = [False] * count + [True] * moving
+        self.moved = dependent(closed.jaxpr, flags)
+        layout = Layout(
+            program.arguments, program.moving, program.columns, lengths, self.outputs, self.moved
+        )
+        self.code = Code(layout.written(closed, self.width), "run")
+        void, whole = ctypes.c_void_p, ctypes.c_int64
+        self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 5)(self.code.address)
+
+    def run(
+        self,
+        leaves: Sequence[NDArray[Any]],
+        tangents: Sequence[NDArray[Any]],
+        lengths: Mapping[str, int],
+        lanes: int,
+    ) -> Run:
+        """Compute all lanes and columns."""
+        program, width, at_once = self.program, self.width, max(self.program.columns, 1)
+        columns = len(tangents[0]) if tangents else 0
+        passes = max(-(-columns // at_once), 1)
+        # Each lane takes one pass of columns over what is its own: few segments fill a block with
+        # several passes, many have a block for themselves and another one for each pass.
+        own_lanes = -(-lanes // width) * width
+        if passes > 1 and own_lanes - lanes > WASTE * lanes:
+            own_lanes = lanes
+        total = own_lanes * passes
+        blocks = -(-total // width)
+        place = np.minimum(np.arange(blocks * width), total - 1)
+        segment, turn = place % own_lanes, place // own_lanes
+        own_blocks = blocks if own_lanes % width else own_lanes // width
+        taken = np.minimum(segment[: own_blocks * width], lanes - 1)
+        given = [
+            np.ascontiguousarray(leaf[..., taken] if a.lanes else leaf)
+            for leaf, a in zip(leaves, program.arguments, strict=True)
+        ]
+        for number, t in zip(program.moving, tangents, strict=True):
+            rows = np.zeros((passes * at_once, *t.shape[1:]), program.arguments[number].dtype)
+            rows[:columns] = t
+            by_pass = np.moveaxis(rows.reshape(passes, at_once, *t.shape[1:]), 0, -1)
+            given.append(np.ascontiguousarray(by_pass[..., turn]))
+        sizes = {stand_in: lengths[name] for name, stand_in in self.lengths.items()}
+        found = []
+        for shape, moved in zip(self.outputs, self.moved, strict=True):
+            own = tuple(sizes.get(n, n) for n in shape.shape)
+            if moved:
+                axis = 1 if is_laid_by_loop(shape, self.lengths) else 0
+                own = (*own[:axis], passes, *own[axis:], at_once)
+            found.append(np.empty((own_lanes, *own), shape.dtype))
+        ins, outs = _addresses(given), _addresses(found)
+        values = (ctypes.c_int64 * max(len(self.lengths), 1))(
+            *[lengths[name] for name in self.lengths]
+        )
+        turn = np.ascontiguousarray(turn)
+
+        def work(task: tuple[int, int]) -> None:
+            self.function(
+                ins,
+                outs,
+                values,
+                segment.ctypes.data,
+                turn.ctypes.data,
+                len(place),
+                own_blocks,
+                passes,
+                *task,
+            )
+
+        pieces = min(blocks, TASKS_A_CORE * _cores()) if lengths["turns"] or blocks > FEW else 1
+        bounds = np.linspace(0, blocks, pieces + 1).astype(int).tolist()
+        tasks = list(pairwise(bounds))
+        if len(tasks) == 1:
+            work(tasks[0])
+        else:
+            list(_threads().map(work, tasks))
+        cut = [array[:lanes] for array in found]
+        if not program.moving:
+            return Run(jax.tree.unflatten(self.structure, cut), None)
+        half = len(cut) // 2
+        structure = self.structure.children()[0]
+        by_column = [
+            None
+            if not moved
+            else array
+            if is_laid_by_loop(shape, self.lengths)
+            else joined(array, columns)
+            for array, moved, shape in zip(
+                cut[half:], self.moved[half:], self.outputs[half:], strict=True
+            )
+        ]
+        return Run(
+            jax.tree.unflatten(structure, cut[:half]), jax.tree.unflatten(structure, by_column)
+        )
+
+
+def _is_real(dtype: Any) -> bool:
+    return np.issubdtype(np.dtype(dtype), np.floating)
+
+
+def _addresses(arrays: Sequence[NDArray[Any]]) -> Any:
+    return (ctypes.c_void_p * max(len(arrays), 1))(*[a.ctypes.data for a in arrays])

@@ -1,0 +1,418 @@
+"""Elementwise primitives: one rule each, from LLVM values to an LLVM value.
+
+Operands are scalars or vectors of one width; a rule does not see which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from llvmlite import ir
+
+from lanes.values import UnsupportedError, base, is_vector
+
+Parameters: TypeAlias = Mapping[str, Any]
+Rule: TypeAlias = Callable[..., ir.Value]
+
+CONTRACT = ("contract",)
+"""A product may be fused with a sum. Nothing else of fast-math is safe: without NaN and infinity
+the test for a crash is folded away."""
+
+BOOL = ir.IntType(1)
+TYPES: Mapping[np.dtype[Any], ir.Type] = {
+    np.dtype(np.float64): ir.DoubleType(),
+    np.dtype(np.float32): ir.FloatType(),
+    np.dtype(np.int64): ir.IntType(64),
+    np.dtype(np.int32): ir.IntType(32),
+    np.dtype(np.bool_): BOOL,
+    np.dtype(jax.dtypes.float0): BOOL,  # of what has no derivative: never looked at
+}
+
+
+def type_of(dtype: Any) -> ir.Type:
+    """Return the LLVM type of a number.
+
+    Raises
+    ------
+    UnsupportedError
+        There is none.
+    """
+    try:
+        return TYPES[np.dtype(dtype)]
+    except (KeyError, TypeError):
+        raise UnsupportedError(f"numbers of type {dtype}") from None
+
+
+def is_float(value: ir.Value) -> bool:
+    """Return whether a value is a real number."""
+    return isinstance(base(value.type), ir.FloatType | ir.DoubleType)
+
+
+def is_bool(value: ir.Value) -> bool:
+    """Return whether a value is a truth value."""
+    return bool(base(value.type) == BOOL)
+
+
+def constant(kind: ir.Type, number: float | int | bool) -> ir.Constant:
+    """Return a number as a constant of a scalar or vector type."""
+    scalar = base(kind)
+    plain = float(number) if isinstance(scalar, ir.FloatType | ir.DoubleType) else int(number)
+    if isinstance(kind, ir.VectorType):
+        return ir.Constant(kind, [plain] * kind.count)
+    return ir.Constant(kind, plain)
+
+
+class Emitter:
+    """Writes instructions; what several rules need."""
+
+    def __init__(self, module: ir.Module, width: int) -> None:
+        self.module, self.width = module, width
+        self.b = ir.IRBuilder()
+
+    def vector(self, kind: ir.Type) -> ir.VectorType:
+        """Return the type of a number for every lane."""
+        return ir.VectorType(base(kind), self.width)
+
+    def splat(self, value: ir.Value) -> ir.Value:
+        """Return a value that all lanes share as a vector."""
+        if is_vector(value):
+            return value
+        kind = self.vector(value.type)
+        if isinstance(value, ir.Constant):
+            return ir.Constant(kind, [value.constant] * self.width)
+        undefined = ir.Constant(kind, ir.Undefined)
+        first = self.b.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
+        zeros = ir.Constant(ir.VectorType(ir.IntType(32), self.width), [0] * self.width)
+        return self.b.shuffle_vector(first, undefined, zeros)
+
+    def alike(self, *values: ir.Value) -> tuple[ir.Value, ...]:
+        """Return values all as vectors, if one is."""
+        if any(map(is_vector, values)):
+            return tuple(map(self.splat, values))
+        return values
+
+    def intrinsic(self, name: str, *operands: ir.Value, suffix: str | None = None) -> ir.Value:
+        """Call an LLVM intrinsic overloaded by its operands' type."""
+        kind = operands[0].type
+        full = f"llvm.{name}.{mangled(kind) if suffix is None else suffix}"
+        function = self.declared(full, ir.FunctionType(kind, [o.type for o in operands]))
+        fast = CONTRACT if is_float(operands[0]) else ()
+        return self.b.call(function, operands, fastmath=fast)
+
+    def declared(self, name: str, kind: ir.FunctionType) -> ir.Function:
+        """Return a function of a name, declared once."""
+        known = self.module.globals.get(name)
+        return known if known is not None else ir.Function(self.module, kind, name)
+
+    def libm(self, name: str, *operands: ir.Value) -> ir.Value:
+        """Call a function of the C library, lane by lane."""
+        scalar = base(operands[0].type)
+        symbol = name if isinstance(scalar, ir.DoubleType) else f"{name}f"
+        function = self.declared(symbol, ir.FunctionType(scalar, [scalar] * len(operands)))
+        return self.by_lane(lambda *lanes: self.b.call(function, lanes), *operands)
+
+    def by_lane(self, function: Callable[..., ir.Value], *operands: ir.Value) -> ir.Value:
+        """Apply a function of scalars to each lane."""
+        if not is_vector(operands[0]):
+            return function(*operands)
+        result = None
+        for lane in range(self.width):
+            place = ir.Constant(ir.IntType(32), lane)
+            value = function(*(self.b.extract_element(o, place) for o in operands))
+            if result is None:
+                result = ir.Constant(self.vector(value.type), ir.Undefined)
+            result = self.b.insert_element(result, value, place)
+        return result
+
+    def any_lane(self, flag: ir.Value) -> ir.Value:
+        """Return whether a truth value holds in any lane."""
+        if not is_vector(flag):
+            return flag
+        bits = ir.IntType(self.width)
+        return self.b.icmp_unsigned("!=", self.b.bitcast(flag, bits), ir.Constant(bits, 0))
+
+    def number(self, like: ir.Value, value: float | int | bool) -> ir.Constant:
+        """Return a constant of another value's type."""
+        return constant(like.type, value)
+
+    def select(self, flag: ir.Value, yes: ir.Value, no: ir.Value) -> ir.Value:
+        """Choose; a shared flag chooses between vectors whole."""
+        yes, no = self.alike(yes, no)
+        if is_vector(flag):
+            flag, yes, no = self.alike(flag, yes, no)
+        return self.b.select(flag, yes, no)
+
+    def isnan(self, x: ir.Value) -> ir.Value:
+        """Return whether a number is none."""
+        return self.b.fcmp_unordered("uno", x, x)
+
+
+def mangled(kind: ir.Type) -> str:
+    """Return a type as the names of intrinsics have it."""
+    scalar = base(kind)
+    if isinstance(scalar, ir.IntType):
+        name = f"i{scalar.width}"
+    else:
+        name = "f64" if isinstance(scalar, ir.DoubleType) else "f32"
+    return f"v{kind.count}{name}" if isinstance(kind, ir.VectorType) else name
+
+
+def _arithmetic(of_floats: str, of_integers: str) -> Rule:
+    def rule(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+        if is_float(x):
+            return getattr(e.b, of_floats)(x, y, flags=CONTRACT)
+        return getattr(e.b, of_integers)(x, y)
+
+    return rule
+
+
+def _compare(sign: str) -> Rule:
+    def rule(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+        if is_float(x):
+            compare = e.b.fcmp_unordered if sign == "!=" else e.b.fcmp_ordered
+            return compare(sign, x, y)
+        if is_bool(x):
+            return e.b.icmp_unsigned(sign, x, y)
+        return e.b.icmp_signed(sign, x, y)
+
+    return rule
+
+
+def _intrinsic(name: str) -> Rule:
+    return lambda e, _, x: e.intrinsic(name, x)
+
+
+def _libm(name: str) -> Rule:
+    return lambda e, _, *operands: e.libm(name, *operands)
+
+
+def _divide(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+    """Divide; whole numbers as XLA does: by zero -1, and no trap where the quotient overflows."""
+    if is_float(x):
+        return e.b.fdiv(x, y, flags=CONTRACT)
+    by_zero, lowest, wraps = _special(e, x, y)
+    safe = e.select(e.b.or_(by_zero, wraps), e.number(y, 1), y)
+    quotient = e.select(wraps, lowest, e.b.sdiv(x, safe))
+    return e.select(by_zero, e.number(x, -1), quotient)
+
+
+def _remainder(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+    if is_float(x):
+        return e.libm("fmod", x, y)
+    by_zero, _, wraps = _special(e, x, y)
+    safe = e.select(e.b.or_(by_zero, wraps), e.number(y, 1), y)
+    return e.select(by_zero, x, e.b.srem(x, safe))
+
+
+def _special(e: Emitter, x: ir.Value, y: ir.Value) -> tuple[ir.Value, ir.Value, ir.Value]:
+    lowest = e.number(x, -(2 ** (base(x.type).width - 1)))
+    wraps = e.b.and_(e.b.icmp_signed("==", x, lowest), e.b.icmp_signed("==", y, e.number(y, -1)))
+    return e.b.icmp_signed("==", y, e.number(y, 0)), lowest, wraps
+
+
+def _extreme(sign: str) -> Rule:
+    def rule(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+        if is_bool(x):
+            return e.b.or_(x, y) if sign == ">" else e.b.and_(x, y)
+        if not is_float(x):
+            return e.select(e.b.icmp_signed(sign, x, y), x, y)
+        beyond = e.b.or_(e.b.fcmp_ordered(sign, x, y), e.isnan(x))
+        return e.select(beyond, x, y)
+
+    return rule
+
+
+_larger, _smaller = _extreme(">"), _extreme("<")
+
+
+def _clamp(e: Emitter, p: Parameters, lower: ir.Value, x: ir.Value, upper: ir.Value) -> ir.Value:
+    return _smaller(e, p, _larger(e, p, x, lower), upper)
+
+
+def _negative(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    return e.b.fneg(x) if is_float(x) else e.b.neg(x)
+
+
+def _absolute(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    if is_float(x):
+        return e.intrinsic("fabs", x)
+    return e.select(e.b.icmp_signed("<", x, e.number(x, 0)), e.b.neg(x), x)
+
+
+def _sign(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    if not is_float(x):
+        above = e.b.zext(e.b.icmp_signed(">", x, e.number(x, 0)), x.type)
+        below = e.b.zext(e.b.icmp_signed("<", x, e.number(x, 0)), x.type)
+        return e.b.sub(above, below)
+    unit = e.intrinsic("copysign", e.number(x, 1.0), x)
+    whole = e.b.fcmp_unordered("!=", x, e.number(x, 0.0))
+    return e.select(e.isnan(x), x, e.select(whole, unit, x))
+
+
+def _square(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    return e.b.fmul(x, x, flags=CONTRACT) if is_float(x) else e.b.mul(x, x)
+
+
+def _integer_power(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
+    exponent, factor, result = abs(p["y"]), x, None
+    multiply = ELEMENTWISE["mul"]
+    while exponent:
+        if exponent & 1:
+            result = factor if result is None else multiply(e, p, result, factor)
+        exponent >>= 1
+        if exponent:
+            factor = multiply(e, p, factor, factor)
+    if result is None:
+        return e.number(x, 1)
+    return _divide(e, p, e.number(x, 1), result) if p["y"] < 0 else result
+
+
+def _reciprocal_root(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    return e.b.fdiv(e.number(x, 1.0), e.intrinsic("sqrt", x), flags=CONTRACT)
+
+
+def _logistic(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    one = e.number(x, 1.0)
+    return e.b.fdiv(one, e.b.fadd(one, e.intrinsic("exp", e.b.fneg(x))))
+
+
+def _round(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
+    to_even = int(p["rounding_method"]) == 1  # lax.RoundingMethod.TO_NEAREST_EVEN
+    return e.intrinsic("roundeven" if to_even else "round", x)
+
+
+def _is_finite(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    return e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.number(x, np.inf))
+
+
+def _power(e: Emitter, _: Parameters, x: ir.Value, y: ir.Value) -> ir.Value:
+    if not is_float(y):
+        y = e.b.sitofp(y, x.type)
+    return e.intrinsic("pow", x, y)
+
+
+def _not(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    return e.b.not_(x)
+
+
+def _select_n(e: Emitter, _: Parameters, which: ir.Value, *cases: ir.Value) -> ir.Value:
+    if is_bool(which):
+        return e.select(which, cases[1], cases[0])
+    chosen = cases[0]
+    for number, case in enumerate(cases[1:], start=1):
+        at_least = e.b.icmp_signed(">=", which, e.number(which, number))
+        chosen = e.select(at_least, case, chosen)
+    return chosen
+
+
+def converted(e: Emitter, x: ir.Value, to: ir.Type) -> ir.Value:
+    """Return a number in another type; a real number becomes whole as in XLA, saturating."""
+    scalar = base(x.type)
+    kind = e.vector(to) if is_vector(x) else to
+    if scalar == to:
+        found = x
+    elif isinstance(to, ir.FloatType | ir.DoubleType):
+        if is_float(x):
+            cast = e.b.fpext if isinstance(to, ir.DoubleType) else e.b.fptrunc
+        else:
+            cast = e.b.uitofp if is_bool(x) else e.b.sitofp
+        found = cast(x, kind)
+    elif to == BOOL:
+        compare = e.b.fcmp_unordered if is_float(x) else e.b.icmp_signed
+        found = compare("!=", x, e.number(x, 0))
+    elif is_float(x):
+        name = f"llvm.fptosi.sat.{mangled(kind)}.{mangled(x.type)}"
+        found = e.b.call(e.declared(name, ir.FunctionType(kind, [x.type])), [x])
+    elif is_bool(x):
+        found = e.b.zext(x, kind)
+    else:
+        found = (e.b.sext if to.width > scalar.width else e.b.trunc)(x, kind)
+    return found
+
+
+def _convert(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
+    return converted(e, x, type_of(p["new_dtype"]))
+
+
+def _reduce_precision(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
+    if (p["exponent_bits"], p["mantissa_bits"]) == (11, 52) or isinstance(
+        base(x.type), ir.FloatType
+    ):
+        return x
+    if (p["exponent_bits"], p["mantissa_bits"]) != (8, 23):
+        raise UnsupportedError(f"reduce_precision to {p['mantissa_bits']} bits")
+    return converted(e, converted(e, x, ir.FloatType()), ir.DoubleType())
+
+
+def _same(_: Emitter, __: Parameters, x: ir.Value) -> ir.Value:
+    return x
+
+
+ELEMENTWISE: dict[str, Rule] = {
+    "add": _arithmetic("fadd", "add"),
+    "add_any": _arithmetic("fadd", "add"),
+    "sub": _arithmetic("fsub", "sub"),
+    "mul": _arithmetic("fmul", "mul"),
+    "div": _divide,
+    "rem": _remainder,
+    "max": _larger,
+    "min": _smaller,
+    "pow": _power,
+    "atan2": _libm("atan2"),
+    "nextafter": _libm("nextafter"),
+    "neg": _negative,
+    "abs": _absolute,
+    "sign": _sign,
+    "square": _square,
+    "integer_pow": _integer_power,
+    "sqrt": _intrinsic("sqrt"),
+    "rsqrt": _reciprocal_root,
+    "cbrt": _libm("cbrt"),
+    "exp": _intrinsic("exp"),
+    "exp2": _intrinsic("exp2"),
+    "log": _intrinsic("log"),
+    "expm1": _libm("expm1"),
+    "log1p": _libm("log1p"),
+    "sin": _intrinsic("sin"),
+    "cos": _intrinsic("cos"),
+    "tan": _libm("tan"),
+    "asin": _libm("asin"),
+    "acos": _libm("acos"),
+    "atan": _libm("atan"),
+    "sinh": _libm("sinh"),
+    "cosh": _libm("cosh"),
+    "tanh": _libm("tanh"),
+    "asinh": _libm("asinh"),
+    "acosh": _libm("acosh"),
+    "atanh": _libm("atanh"),
+    "erf": _libm("erf"),
+    "erfc": _libm("erfc"),
+    "logistic": _logistic,
+    "floor": _intrinsic("floor"),
+    "ceil": _intrinsic("ceil"),
+    "round": _round,
+    "is_finite": _is_finite,
+    "lt": _compare("<"),
+    "le": _compare("<="),
+    "gt": _compare(">"),
+    "ge": _compare(">="),
+    "eq": _compare("=="),
+    "ne": _compare("!="),
+    "and": lambda e, _, x, y: e.b.and_(x, y),
+    "or": lambda e, _, x, y: e.b.or_(x, y),
+    "xor": lambda e, _, x, y: e.b.xor(x, y),
+    "not": _not,
+    "clamp": _clamp,
+    "select_n": _select_n,
+    "convert_element_type": _convert,
+    "reduce_precision": _reduce_precision,
+    "copy": _same,
+    "copy_p": _same,
+    "stop_gradient": _same,
+    "real": _same,
+    "optimization_barrier": _same,
+}
+"""Primitive -> rule, for those that do to arrays what they do to each element."""

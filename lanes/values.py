@@ -1,0 +1,94 @@
+"""What a variable of a jaxpr is while it is lowered: elements in registers, or an array elsewhere.
+
+An array of a few numbers is a NumPy array of `Element`. An element is an LLVM value, scalar if all
+lanes share it and a vector if each has its own, or a tuple of them: one for each column, where it
+is a tangent. Reshaping, slicing or stacking such arrays costs no instruction.
+
+Longer arrays, and those whose length is an argument, are read element by element: `Memory` holds
+them, `Deferred` computes each when it is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+from llvmlite import ir
+from numpy.typing import NDArray
+
+Element: TypeAlias = Any
+"""An `ir.Value`, or a tuple of one a column."""
+Elements: TypeAlias = NDArray[np.object_]
+Index: TypeAlias = Sequence[ir.Value]
+
+
+class UnsupportedError(NotImplementedError):
+    """A function holds something that no rule covers; its message names it."""
+
+
+def array_of(elements: Sequence[Element], shape: Sequence[int]) -> Elements:
+    """Return elements in row-major order as an array of a shape."""
+    array = np.empty(len(elements), object)
+    for number, element in enumerate(elements):
+        array[number] = element
+    return array.reshape(tuple(shape))
+
+
+def is_vector(value: ir.Value) -> bool:
+    """Return whether each lane has its own."""
+    return isinstance(value.type, ir.VectorType)
+
+
+def base(kind: ir.Type) -> ir.Type:
+    """Return the type of one lane's number."""
+    return kind.element if isinstance(kind, ir.VectorType) else kind
+
+
+@dataclass(eq=False)
+class Storage:
+    """Memory behind an array; every write makes older views of it stale."""
+
+    pointer: ir.Value
+    """To the first number of lane 0 in column 0."""
+    kind: ir.Type
+    """Of a number while it is computed with; truth values are bytes in memory."""
+    strides: tuple[ir.Value, ...]
+    """Numbers from one index to the next, axis by axis."""
+    lane_stride: ir.Value | None
+    """Numbers from one lane to the next; None where lanes share the array."""
+    first_lane: ir.Value | None
+    """Number of the block's first lane."""
+    column_stride: ir.Value | None = None
+    """Numbers from one column to the next; None where it is no tangent."""
+    scattered: Sequence[ir.Value] = ()
+    """Of an output: where in it the numbers of each lane of the block begin. Empty where the lanes
+    of an element lie beside each other."""
+    writable: bool = False
+    guard: ir.Value | None = None
+    """When it is written to; None for always."""
+    version: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """An array in memory, as it is after so many writes."""
+
+    storage: Storage
+    shape: tuple[int, ...]
+    version: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Deferred:
+    """An array whose elements are computed where they are read."""
+
+    shape: tuple[int, ...]
+    at: Callable[[Index], Element] = field(repr=False)
+    sources: tuple[Any, ...] = ()
+    """What it is computed of, to see what it depends on."""
+
+
+Array: TypeAlias = "Memory | Deferred"
+Value: TypeAlias = "Elements | Memory | Deferred"

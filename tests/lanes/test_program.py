@@ -1,0 +1,201 @@
+"""Loops, conditions, memory and columns of a program against XLA; what it does where it cannot."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import lanes.program
+from lanes import Argument, Program, joined, keep_code_in
+from lanes.machine import object_code
+
+RANDOM = np.random.default_rng(1)
+
+
+def filtered(given, lengths):
+    """Return a delay line's answer to a table: loops, conditions of a lane and of all, memory."""
+    x, gain, table = given["x"], given["gain"], given["table"]
+
+    def turn(carry, number):
+        state, line = carry
+        row = lax.dynamic_index_in_dim(table, number, 0, keepdims=False)
+        line = lax.dynamic_update_index_in_dim(line, state * row, number % 4, 0)
+        late = lax.dynamic_index_in_dim(line, (number + 1) % 4, 0, keepdims=False)
+        state = lax.cond(
+            number % 2 == 0, lambda: jnp.sin(state) + late * gain, lambda: state * 0.9 + late
+        )
+        state = lax.fori_loop(0, 3, lambda _, s: s - 0.1 * gain * s, state)
+        state = lax.cond(state[0] > 1.0, lambda: state - 1.0, lambda: state)
+        return (state, line), {"state": state, "twice": state[0] * 2.0, "high": state[1] > 0.0}
+
+    (state, _), rows = lax.scan(turn, (x, jnp.zeros((4, 3))), jnp.arange(lengths["turns"]))
+    return rows, state
+
+
+ARGUMENTS = {
+    "x": Argument((3,), float, lanes=True, moves=True),
+    "gain": Argument((), float, lanes=False, moves=True),
+    "table": Argument(("rows", 3), float, lanes=True),
+}
+
+
+def given(count, rows, seed=2):
+    random = np.random.default_rng(seed)
+    values = {
+        "x": random.normal(size=(3, count)),
+        "gain": np.array(0.3),
+        "table": random.normal(size=(rows, 3, count)),
+    }
+    return values, [random.normal(size=5), random.normal(size=(5, 3))]
+
+
+def flat(run, columns=5):
+    """Return all arrays of a run, columns side by side."""
+    (rows, _), (moved_rows, moved) = run.values, run.columns
+    return [
+        *jax.tree.leaves(rows),
+        run.values[1],
+        *(joined(moved_rows[name], columns, axis=2) for name in ("state", "twice")),
+        moved,
+    ]
+
+
+@pytest.fixture(scope="module")
+def program():
+    return Program(filtered, ARGUMENTS, at_once=2)
+
+
+@pytest.mark.parametrize(("count", "turns"), [(1, 7), (3, 20), (8, 1), (19, 33), (64, 2)])
+def test_one_program_serves_every_length_and_every_number_of_lanes(program, count, turns):
+    values, tangents = given(count, turns)
+    assert program.is_kernel
+    got = program(values, tangents, lanes=count, turns=turns)
+    want = program.by_xla(values, tangents, turns=turns)
+    for mine, theirs in zip(flat(got), flat(want), strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
+
+
+def test_results_do_not_depend_on_threads_nor_on_other_lanes(program, monkeypatch):
+    values, tangents = given(37, 25)
+    together = flat(program(values, tangents, lanes=37, turns=25))
+    monkeypatch.setattr(lanes.program, "TASKS_A_CORE", 64)
+    for mine, theirs in zip(
+        together, flat(program(values, tangents, lanes=37, turns=25)), strict=True
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+    some = {"x": values["x"][:, 5:6], "gain": values["gain"], "table": values["table"][..., 5:6]}
+    alone = flat(program(some, tangents, lanes=1, turns=25))
+    for mine, theirs in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(mine[5:6], theirs)
+
+
+def test_a_loop_that_each_lane_ends_for_itself():
+    def halved(x, _):
+        return lax.while_loop(lambda c: c[0] > 1.0, lambda c: (c[0] / 2.0, c[1] + 1), (x, 0))
+
+    program = Program(halved, Argument((), float, lanes=True))
+    values = np.array([0.5, 3.0, 100.0, 7.0, 1.0, 2.0, 1e9, 5.0, 6.0])
+    got = program(values, lanes=9)
+    assert program.is_kernel
+    want = program.by_xla(values)
+    for mine, theirs in zip(got.values, want.values, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_choice_of_several_branches_shared_or_not():
+    def chosen(given, _):
+        branches = [lambda x: x, lambda x: -x, lambda x: x * x]
+        mine = lax.switch(given[0], branches, given[2])
+        return mine, lax.switch(given[1], branches, given[2])
+
+    kinds = (
+        Argument((), np.int32, lanes=True),
+        Argument((), np.int32, lanes=False),
+        Argument((), float, lanes=True),
+    )
+    program = Program(chosen, kinds)
+    for shared in (-1, 0, 1, 2, 5):
+        index = RANDOM.integers(-1, 4, 11).astype(np.int32)
+        values = (index, np.int32(shared), RANDOM.normal(size=11))
+        got, want = program(values, lanes=11), program.by_xla(values)
+        for mine, theirs in zip(got.values, want.values, strict=True):
+            np.testing.assert_array_equal(mine, theirs)
+
+
+def test_an_array_read_after_it_was_changed_in_place_is_refused_not_misread():
+    def stale(x, lengths):
+        def turn(line, number):
+            new = lax.dynamic_update_index_in_dim(line, x * number, number % 40, 0)
+            old = lax.dynamic_index_in_dim(line, number % 40, 0, keepdims=False)
+            return new, old
+
+        return lax.scan(turn, jnp.zeros(40), jnp.arange(lengths["turns"]))[1]
+
+    program = Program(stale, Argument((), float, lanes=True))
+    values = np.arange(3.0)
+    assert not program.is_kernel
+    got = program(values, lanes=3, turns=90)
+    np.testing.assert_array_equal(got.values, program.by_xla(values, turns=90).values)
+
+
+def test_what_has_no_rule_runs_through_xla_and_is_named(caplog):
+    def sorted_(x, _):
+        return jnp.sort(x)
+
+    program = Program(sorted_, Argument((4,), float, lanes=True), name="sorting")
+    values = RANDOM.normal(size=(4, 6))
+    with caplog.at_level(logging.DEBUG, logger="lanes"):
+        got = program(values, lanes=6)
+    np.testing.assert_array_equal(got.values, np.sort(values, axis=0).T)
+    assert "sorting runs through XLA: no rule for primitive sort" in caplog.text
+
+
+TEXT = "define i32 @seven() {\n ret i32 7\n}\n"
+
+
+def test_kept_code_is_used_and_damage_is_noticed(tmp_path):
+    keep_code_in(tmp_path)
+    try:
+        code = object_code(TEXT)
+        (path,) = tmp_path.glob("*.o")
+        held = path.read_bytes()
+        assert held[32:] == code
+        assert held[:32] == hashlib.sha256(code).digest()
+        other = b"other code"
+        path.write_bytes(hashlib.sha256(other).digest() + other)
+        assert object_code(TEXT) == other  # it is the file that is read
+        for damaged in (b"", held[:40], held[:-1] + b"!", b"x" * len(held)):
+            path.write_bytes(damaged)
+            assert object_code(TEXT) == code
+            assert path.read_bytes() == held
+    finally:
+        keep_code_in(None)
+
+
+def test_kept_code_is_bounded_and_the_longest_unused_goes(tmp_path, monkeypatch):
+    monkeypatch.setattr(lanes.machine, "MOST", 1500)
+    keep_code_in(tmp_path)
+    try:
+        for number in range(6):
+            object_code(TEXT.replace("7", str(number)))
+        held = list(tmp_path.glob("*.o"))
+        assert sum(path.stat().st_size for path in held) <= 1500
+        assert held
+    finally:
+        keep_code_in(None)
+
+
+def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    keep_code_in(blocked / "below")
+    try:
+        assert object_code(TEXT)
+    finally:
+        keep_code_in(None)

@@ -1,0 +1,196 @@
+"""Every primitive with a rule gives what jax gives, on random numbers and on those at the edge."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from lanes import Argument, Program
+
+EDGES = [0.0, -0.0, 1.0, -1.0, 0.5, 1e-300, -1e-300, 1e300, -1e300, np.inf, -np.inf, np.nan]
+WHOLE_EDGES = [0, 1, -1, 2, -2, 7, -7, 2**31 - 1, -(2**31)]
+RANDOM = np.random.default_rng(0)
+FLOATS = np.concatenate([np.array(EDGES), RANDOM.normal(size=30), 100.0 * RANDOM.normal(size=7)])
+WHOLE = np.concatenate([np.array(WHOLE_EDGES), RANDOM.integers(-50, 50, 20)])
+BOOLS = np.array([True, False, True, True, False])
+
+
+def agree(function, *arguments, rtol=2e-15, each=1):
+    """Hold the kernel of a function of numbers against jax, every lane of its own."""
+    kinds = [Argument(np.shape(a)[:-1], a.dtype, lanes=True) for a in arguments]
+    program = Program(lambda given, _: function(*given), tuple(kinds))
+    assert program.is_kernel
+    lanes = np.shape(arguments[0])[-1]
+    run = program(arguments, lanes=lanes)
+    want = jax.vmap(function, in_axes=-1)(*map(jnp.asarray, arguments))
+    for got, expected in zip(jax.tree.leaves(run.values), jax.tree.leaves(want), strict=True):
+        assert got.dtype == expected.dtype
+        smallest = np.finfo(got.dtype).tiny if got.dtype.kind == "f" else 0.0  # XLA flushes below
+        np.testing.assert_allclose(got, np.asarray(expected), rtol=rtol * each, atol=smallest)
+
+
+def pairs(values):
+    """Return all pairs of some numbers, as two arrays."""
+    first, second = np.meshgrid(values, values)
+    return first.ravel(), second.ravel()
+
+
+UNARY = {
+    "neg": lambda x: -x,
+    "abs": jnp.abs,
+    "sign": jnp.sign,
+    "square": lax.square,
+    "sqrt": lax.sqrt,
+    "rsqrt": lax.rsqrt,
+    "cbrt": lax.cbrt,
+    "exp": lax.exp,
+    "exp2": lax.exp2,
+    "log": lax.log,
+    "expm1": lax.expm1,
+    "log1p": lax.log1p,
+    "sin": lax.sin,
+    "cos": lax.cos,
+    "tan": lax.tan,
+    "asin": lax.asin,
+    "acos": lax.acos,
+    "atan": lax.atan,
+    "sinh": lax.sinh,
+    "cosh": lax.cosh,
+    "tanh": lax.tanh,
+    "asinh": lax.asinh,
+    "acosh": lax.acosh,
+    "atanh": lax.atanh,
+    "erf": lax.erf,
+    "erfc": lax.erfc,
+    "logistic": lax.logistic,
+    "floor": lax.floor,
+    "ceil": lax.ceil,
+    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN),
+    "round away": lambda x: lax.round(x, lax.RoundingMethod.AWAY_FROM_ZERO),
+    "is_finite": lax.is_finite,
+    "square power": lambda x: lax.integer_pow(x, 2),
+    "fifth power": lambda x: lax.integer_pow(x, 5),
+    "inverse cube": lambda x: lax.integer_pow(x, -3),
+    "no power": lambda x: lax.integer_pow(x, 0),
+    "single precision": lambda x: lax.reduce_precision(x, 8, 23),
+    "as a whole number": lambda x: lax.convert_element_type(x, jnp.int32),
+    "as a truth value": lambda x: lax.convert_element_type(x, bool),
+    "as float32": lambda x: lax.convert_element_type(x, jnp.float32),
+    "at most": lambda x: lax.clamp(x.dtype.type(-0.7), x, x.dtype.type(0.9)),
+}
+ACCURATE = {
+    "erf",
+    "erfc",
+    "asinh",
+    "acosh",
+    "atanh",
+    "tan",
+    "sinh",
+    "cosh",
+    "tanh",
+    "exp2",
+    "cbrt",
+    "logistic",
+    "log1p",
+    "expm1",
+}
+"""Of which XLA's own approximation differs from the C library's in the last digits."""
+
+
+@pytest.mark.parametrize("name", UNARY)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_functions_of_a_real_number(name, dtype):
+    with np.errstate(over="ignore"):
+        values = FLOATS.astype(dtype)
+    unit = 2e-15 if dtype == np.float64 else 1e-6
+    agree(UNARY[name], values, rtol=unit, each=500 if name in ACCURATE else 4)
+
+
+BINARY = {
+    "add": lambda x, y: x + y,
+    "sub": lambda x, y: x - y,
+    "mul": lambda x, y: x * y,
+    "div": lax.div,
+    "rem": lax.rem,
+    "max": lax.max,
+    "min": lax.min,
+    "lt": lambda x, y: x < y,
+    "le": lambda x, y: x <= y,
+    "gt": lambda x, y: x > y,
+    "ge": lambda x, y: x >= y,
+    "eq": lambda x, y: x == y,
+    "ne": lambda x, y: x != y,
+    "select": lambda x, y: jnp.where(x < y, x, y),
+}
+OF_REALS = {"pow": lax.pow, "atan2": lax.atan2, "nextafter": lax.nextafter}
+
+
+@pytest.mark.parametrize("name", [*BINARY, *OF_REALS])
+def test_functions_of_two_real_numbers(name):
+    function = {**BINARY, **OF_REALS}[name]
+    agree(function, *pairs(FLOATS), each=4)
+
+
+@pytest.mark.parametrize("name", BINARY)
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_functions_of_two_whole_numbers(name, dtype):
+    agree(BINARY[name], *pairs(WHOLE.astype(dtype)))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64])
+def test_functions_of_a_whole_number(dtype):
+    values = WHOLE.astype(dtype)
+    for function in (lax.neg, lax.abs, lax.sign, lambda x: lax.integer_pow(x, 3)):
+        agree(function, values)
+    for to in (np.float64, np.float32, np.int32, np.int64, np.bool_):
+        agree(lambda x, to=to: lax.convert_element_type(x, to), values)
+
+
+def test_functions_of_truth_values():
+    first, second = pairs(BOOLS)
+    for function in (jnp.logical_and, jnp.logical_or, jnp.logical_xor, lax.max, lax.min):
+        agree(function, first, second)
+    for function in (lambda x, y: x == y, lambda x, y: x != y):
+        agree(function, first, second)
+    agree(jnp.logical_not, BOOLS)
+    for to in (np.float64, np.int32):
+        agree(lambda x, to=to: lax.convert_element_type(x, to), BOOLS)
+    agree(lambda x: lax.select_n(x % 3, x, 2 * x, 3 * x), np.arange(9))
+
+
+ARRAYS = {
+    "broadcast": lambda x: jnp.broadcast_to(x[:, None], (6, 4)),
+    "reshape": lambda x: x.reshape(2, 3),
+    "transpose": lambda x: x.reshape(2, 3).T,
+    "concatenate": lambda x: jnp.concatenate([x[2:], x[:2]]),
+    "stack": lambda x: jnp.stack([x, 2.0 * x], axis=1),
+    "slice": lambda x: x[1:6:2],
+    "split": lambda x: jnp.split(x, [2, 5])[1],
+    "reverse": lambda x: x[::-1],
+    "pad": lambda x: lax.pad(x, 0.5, [(1, -2, 1)]),
+    "iota": lambda x: x * jnp.arange(6),
+    "sum": lambda x: jnp.sum(x.reshape(2, 3), axis=1),
+    "largest": jnp.max,
+    "smallest": lambda x: jnp.min(x.reshape(2, 3), axis=0),
+    "product": jnp.prod,
+    "any": lambda x: jnp.any(x > 0.5),
+    "all": lambda x: jnp.all(x.reshape(3, 2) > -1.0, axis=0),
+    "matrix product": lambda x: x.reshape(2, 3) @ jnp.arange(12.0).reshape(3, 4),
+    "matrices": lambda x: jnp.einsum("bij,bjk->bik", x.reshape(2, 1, 3), jnp.ones((2, 3, 2))),
+    "table": lambda x: x[0] * lax.dynamic_index_in_dim(jnp.arange(600.0) ** 2, jnp.int32(7), 0),
+    "changed at": lambda x: lax.dynamic_update_slice(x, x[:2] * 2.0, (3,)),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_functions_that_move_elements(name):
+    agree(ARRAYS[name], RANDOM.normal(size=(6, 11)), each=4)
+
+
+def test_a_lane_reads_at_its_own_index_which_is_kept_inside():
+    index = np.array([0, 5, -3, 2, 90, 1, 4, 3, 5], np.int32)
+    table = RANDOM.normal(size=(6, 9))
+    agree(lambda x, i: lax.dynamic_index_in_dim(x, i, 0, keepdims=False), table, index)

@@ -1,0 +1,74 @@
+"""Flights of every inlet run as kernels, and as jax and XLA fly them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lanes import joined
+from tuner.config import Options, settle
+from tuner.job.prepare import job_of
+from tuner.model import with_coefficients
+from tuner.objective import flown
+from tuner.objective.flight import simulate_segments, trace_of
+from tuner.recordings import recordings_of
+
+MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
+SAMPLES = 120
+
+
+@pytest.fixture(params=["reference", "body_rate", "actuator", "rotor_speed", "attitude"])
+def objective(request, flight, full_flight, updated):
+    recording = flight if request.param == "reference" else full_flight
+    settings = settle(Options(flights=(str(recording.path),), vehicle=updated))
+    settings = replace(settings, job=settings.job.replace(inlet=request.param))
+    job = job_of(settings, recordings_of(settings, [recording]))
+    return job.windows or job.objective
+
+
+def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
+    model = objective.tunable.at(jnp.asarray(objective.space.initial))
+    segments, schedule = objective.segments, objective.schedule
+    states = None
+    if segments.freedom is not None:
+        states = np.random.default_rng(0).normal(0.0, 0.3, segments.freedom.shape)
+    values = objective.tunable.values(np.asarray(objective.space.initial))
+    tangents = {name: np.eye(len(MOVING))[i] for i, name in enumerate(MOVING)}
+    got = flown.fly(
+        jax.tree.map(np.asarray, model),
+        segments,
+        schedule,
+        samples=SAMPLES,
+        limits=objective.limits,
+        coefficients=values,
+        states=states,
+        tangents=tangents,
+    )
+    names = tuple(segments.measured)
+
+    def fly(moved):
+        changed = with_coefficients(model, dict(zip(MOVING, moved, strict=True)))
+        rolled = simulate_segments(
+            changed,
+            segments,
+            schedule,
+            samples=SAMPLES,
+            horizon=None,
+            limits=objective.limits,
+            states=states,
+        )
+        return trace_of(rolled, changed, segments).channels
+
+    at = jnp.stack([jnp.asarray(values[name]) for name in MOVING])
+    want, slopes = fly(at), jax.jit(jax.jacfwd(fly))(at)
+    for name in names:
+        expected = np.moveaxis(np.asarray(want[name]), -1, 0)
+        np.testing.assert_allclose(got.channels[name], expected, rtol=1e-9, atol=1e-9)
+        columns = joined(got.columns[name], len(MOVING), axis=2)
+        slope = np.moveaxis(np.asarray(slopes[name]), 2, 0)
+        scale = np.abs(slope).max(axis=(0, 1, 2)) + 1e-9
+        np.testing.assert_allclose(columns / scale, slope / scale, atol=1e-8)

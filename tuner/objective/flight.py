@@ -1,0 +1,221 @@
+"""Segments as flights in JAX: their starts, what is fed in, and what is recorded of them."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float, Int
+
+from sim_jax.crash import Limits
+from sim_jax.environment import Environment
+from sim_jax.inlet import Inlet
+from sim_jax.markers import markers_of
+from sim_jax.plant import Sample
+from sim_jax.rigid_body import Motion
+from sim_jax.rollout import Rollout, rollout
+from sim_jax.schedule import Schedule
+from sim_jax.state import Start
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import total_wrench
+from sim_jax.trim import in_trim
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import PerRotor, Vehicle
+from tuner.model import Model
+from tuner.objective.battery import relative_log_voltage
+from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole
+from tuner.objective.segments import Segments
+
+MOTION, TURNED, SETPOINTS = "motion", "turned", "setpoints"
+"""What no recording holds: the centre of mass's position, velocity and body rate; the body's
+attitude; and the set-points of rate and thrust."""
+
+
+class Trace(eqx.Module):
+    """What a rollout is compared by, logged at ``schedule.log_rate``; its pose is the markers'.
+
+    Attributes
+    ----------
+    channels
+        Channel -> (samples, columns, F).
+    crash_time
+        (F,) s, infinite for a segment that flew.
+    """
+
+    channels: dict[str, Float[Array, "samples c F"]]
+    crash_time: Float[Array, " F"]
+
+
+def recorded_of(
+    log: Sample,
+    model: Model,
+    environment: Environment,
+    conditions: Mapping[str, Float[Array, " *F"]],
+    channels: Collection[str],
+) -> dict[str, Array]:
+    """Return channel -> what a recording of logged samples would hold, columns after the samples.
+
+    Parameters
+    ----------
+    log
+        Leaves (*samples, *F), or those of one sample.
+    model, environment, conditions
+        As they were flown.
+    channels
+        Which are asked for.
+    """
+    motion, markers = log.motion, markers_of(model.vehicle)
+    position, attitude = motion.position, motion.attitude
+    if markers is not None:
+        position, attitude = markers.recorded(motion)
+    logged = {
+        "position": (position.x, position.y, position.z),
+        "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
+        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
+        "rotor_speed": log.rotor_speed,
+        "command": log.command,
+        MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
+        TURNED: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
+        SETPOINTS: (*_parts(log.setpoints.rate), log.setpoints.thrust),
+    }
+    if "acceleration" in channels:
+        logged["acceleration"] = accelerometer(
+            model.vehicle, motion, log.rotor_speed, environment, conditions
+        )
+    axis = min(jnp.ndim(position.x), 1)
+    return {name: jnp.stack(logged[name], axis=axis) for name in channels}
+
+
+def _parts(vector: Vec3) -> tuple[Array, Array, Array]:
+    return vector.x, vector.y, vector.z
+
+
+def trace_of(
+    flown: Rollout,
+    model: Model,
+    segments: Segments,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> Trace:
+    """Return what simulated segments are compared by; ``conditions`` as of `simulate_segments`."""
+    environment = environment_of(model, segments, conditions)
+    recorded = recorded_of(flown.log, model, environment, conditions, segments.measured)
+    return Trace(recorded, flown.crash_time)
+
+
+def simulate_segments(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    samples: int,
+    horizon: Int[Array, ""] | None,
+    limits: Limits,
+    states: Float[Array, "L F"] | None = None,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> Rollout:
+    """Simulate every segment up to a horizon in samples.
+
+    Parameters
+    ----------
+    model, segments, schedule, samples, horizon, limits
+        As of `sim_jax.rollout.rollout`.
+    states
+        How far the starts lie from the recorded ones, in the segments' standard deviations.
+    conditions
+        Name, of `tuner.coefficients.conditions` -> what surrounds each segment, in its unit.
+    """
+    start, inlet, environment = beginning_of(
+        model, segments, schedule, states=states, conditions=conditions
+    )
+    return rollout(
+        model.vehicle,
+        model.controller,
+        schedule,
+        inlet,
+        start,
+        samples=samples,
+        environment=environment,
+        horizon=horizon,
+        limits=limits,
+    )
+
+
+def beginning_of(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    states: Float[Array, "L F"] | None = None,
+    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
+) -> tuple[Start, Inlet, Environment]:
+    """Return what segments start from, what is fed in and what surrounds them.
+
+    The arguments are those of `simulate_segments`.
+    """
+    start, inlet = segments.start, segments.inlet
+    markers = markers_of(model.vehicle)
+    if markers is not None:
+        start = markers.start(start, segments.resting, model.controller.sees_markers)
+    environment = environment_of(model, segments, conditions)
+    if segments.resting is not None:
+        exponent = model.vehicle.effects.get("battery_exponent")
+        factor = environment.speed_factor(exponent, jnp.asarray(0), schedule)
+        start = in_trim(
+            model.vehicle, model.controller, start, segments.resting, speed_factor=factor
+        )
+    if segments.wander is not None:
+        start = moved(start, segments.wander)
+    if segments.turning is not None:
+        start = spun_up(start, model.vehicle, segments.turning)
+    if states is not None and segments.freedom is not None:
+        change = whole(states * segments.freedom, segments.freed)
+        start = moved(start, change)
+        if ROWS["trim"].start in segments.freed:
+            inlet = trimmed(inlet, model.vehicle, change)
+    return start, inlet, environment
+
+
+def accelerometer(
+    vehicle: Vehicle,
+    motion: Motion,
+    rotor_speed: PerRotor,
+    environment: Environment,
+    biases: Mapping[str, Float[Array, " F"]],
+) -> tuple[Array, Array, Array]:
+    """Return what an accelerometer at the centre of mass reads, m/s² along the body's axes.
+
+    That is the specific force: all that acts but gravity, over the mass; plus its bias.
+    """
+    air = Air.around(vehicle, motion, environment, tuple(jnp.zeros_like(w) for w in rotor_speed))
+    pull = total_wrench(vehicle, motion, rotor_speed, air).force * (1.0 / vehicle.body.mass)
+    x, y, z = (getattr(pull, axis) + biases.get(f"accelerometer_{axis}", 0.0) for axis in "xyz")
+    return x, y, z
+
+
+def environment_of(
+    model: Model, segments: Segments, conditions: Mapping[str, Float[Array, " F"]]
+) -> Environment:
+    """Return what surrounds the segments, as far as it acts on a model."""
+    log_voltage = None
+    volts, reference = segments.log_voltage, model.reference_voltage
+    acts = "battery_exponent" in model.vehicle.effects
+    if acts and volts is not None and reference is not None:
+        log_voltage = relative_log_voltage(volts, reference)
+    decline = conditions.get("battery_decline")
+    return Environment(
+        wind=_wind(conditions),
+        log_voltage=log_voltage,
+        battery_decline=decline,
+        begin=None if decline is None else segments.begin,
+    )
+
+
+def _wind(conditions: Mapping[str, Float[Array, " F"]]) -> Vec3 | None:
+    known = [conditions[name] for name in ("wind_x", "wind_y") if name in conditions]
+    if not known:
+        return None
+    calm = jnp.zeros_like(known[0])
+    return Vec3(conditions.get("wind_x", calm), conditions.get("wind_y", calm), calm)

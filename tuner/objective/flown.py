@@ -1,0 +1,276 @@
+"""Segments flown by a kernel, and the derivatives of what they are compared by.
+
+The function below flies one segment; `lanes` flies many side by side. A program belongs to what is
+simulated (inlet, rates, terms, what is compared), not to how many segments there are, how long they
+last or which coefficients are free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from numpy.typing import NDArray
+
+from lanes import Argument, Program
+from sim_jax.crash import Limits
+from sim_jax.environment import Environment
+from sim_jax.inlet import Inlet
+from sim_jax.rollout import begun
+from sim_jax.schedule import Schedule
+from sim_jax.state import Start, State
+from tuner.model import Model, with_coefficients
+from tuner.objective.flight import beginning_of, recorded_of
+from tuner.objective.segments import Segments
+
+Array = NDArray[np.float64]
+
+AT_ONCE = 2
+"""Columns of derivatives in one pass over a block of segments: with more, code leaves the
+instruction cache and takes longer to build."""
+
+
+class Flown(NamedTuple):
+    """What segments are compared by, logged at ``schedule.log_rate``; the pose is the markers'.
+
+    Attributes
+    ----------
+    channels
+        Channel -> (F, samples, c).
+    columns
+        Channel -> (F, samples, passes, c, columns of a pass) derivatives, as of a `lanes.Run`; None
+        where nothing moves.
+    crash_time
+        (F,) s, infinite for a segment that flew.
+    """
+
+    channels: dict[str, Array]
+    columns: dict[str, Array | None]
+    crash_time: Array
+
+
+class _Given(NamedTuple):
+    """What a program is given of a model and of one segment."""
+
+    model: Model
+    coefficients: dict[str, Any]
+    segments: Segments
+    states: Any
+    conditions: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Static:
+    """What a program belongs to, besides the structure of what it is given."""
+
+    schedule: Schedule
+    limits: Limits
+    channels: tuple[str, ...]
+    moves: bool
+
+
+def fly(
+    model: Model,
+    segments: Segments,
+    schedule: Schedule,
+    *,
+    samples: int,
+    limits: Limits,
+    coefficients: Mapping[str, Any] = MappingProxyType({}),
+    states: Array | None = None,
+    conditions: Mapping[str, Any] = MappingProxyType({}),
+    tangents: Mapping[str, Array] | None = None,
+    channels: tuple[str, ...] | None = None,
+) -> Flown:
+    """Fly segments.
+
+    Parameters
+    ----------
+    model, schedule, limits
+        What flies.
+    segments
+        F of them.
+    samples
+        How many samples are logged.
+    coefficients
+        Name -> value that replaces the model's: a number, or (F,) each segment's own.
+    states
+        (L, F) how far the starts lie from the recorded ones, in the segments' standard deviations.
+    conditions
+        Name -> (F,) per-flight conditions, in their units.
+    tangents
+        Directions along which is differentiated: coefficient or condition -> (Q,), and
+        ``"states"`` -> (Q, L). None differentiates by nothing.
+    channels
+        What is logged; by default what was measured.
+    """
+    names = tuple(segments.measured) if channels is None else channels
+    own = any(np.ndim(value) for value in coefficients.values())
+    given = _Given(
+        model=model,
+        coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
+        segments=_flown_part(segments),
+        states=None if segments.freedom is None else states,
+        conditions=dict(conditions),
+    )
+    if own:
+        given = given._replace(
+            coefficients={
+                name: np.broadcast_to(value, (segments.count,))
+                for name, value in given.coefficients.items()
+            }
+        )
+    arguments = _arguments(given, own_coefficients=own, moves=tangents is not None)
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda leaf: isinstance(leaf, Argument))
+    static = _Static(schedule, limits, names, tangents is not None)
+    program = _program(tuple(leaves), structure, static)
+    run = program(
+        given,
+        None if tangents is None else _directions(given, tangents),
+        lanes=segments.count,
+        turns=samples,
+    )
+    logged, crash_time = run.values
+    still: dict[str, Array | None] = dict.fromkeys(names)
+    return Flown(logged, still if run.columns is None else run.columns[0], crash_time)
+
+
+def _flown_part(segments: Segments) -> Segments:
+    """Return what of segments is flown, not compared."""
+    flown: Segments = replace(segments, measured={}, flight=jnp.zeros(segments.count, int))
+    return flown
+
+
+def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
+    """Return how each leaf is laid out: segments along the last axis but for what they share."""
+
+    def shared(leaf: Any) -> Argument:
+        return Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
+
+    def each(name: str) -> Any:
+        def of(leaf: Any) -> Argument:
+            shape = np.shape(leaf)[:-1]
+            return Argument((name, *shape[1:]) if name else shape, np.result_type(leaf), lanes=True)
+
+        return of
+
+    def moving(leaf: Any, *, lanes: bool) -> Argument:
+        shape = np.shape(leaf)[:-1] if lanes else np.shape(leaf)
+        return Argument(shape, np.result_type(leaf), lanes=lanes, moves=moves)
+
+    parts = {
+        name: getattr(given.segments, name)
+        for name in (
+            "inlet",
+            "start",
+            "turning",
+            "begin",
+            "resting",
+            "log_voltage",
+            "wander",
+            "freedom",
+        )
+    }
+    segments = jax.tree.map(each(""), given.segments)
+    segments = eqx.tree_at(
+        lambda s: [s.inlet, s.log_voltage],
+        segments,
+        [_tables(given.segments.inlet), jax.tree.map(each("volts"), parts["log_voltage"])],
+        is_leaf=lambda leaf: leaf is None or isinstance(leaf, Argument),
+    )
+    return _Given(
+        model=jax.tree.map(shared, given.model),
+        coefficients=jax.tree.map(
+            lambda leaf: moving(leaf, lanes=own_coefficients), given.coefficients
+        ),
+        segments=segments,
+        states=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.states),
+        conditions=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.conditions),
+    )
+
+
+def _tables(inlet: Inlet) -> Inlet:
+    """Return how an inlet's leaves are laid out: those of more than one axis are tables in time."""
+
+    def of(leaf: Any) -> Argument:
+        shape = np.shape(leaf)[:-1]
+        if shape:
+            shape = (f"rows {shape[0]}", *shape[1:])
+        return Argument(shape, np.result_type(leaf), lanes=True)
+
+    laid = jax.tree.map(of, inlet)
+    # tables of one length share a name that does not tell the length
+    lengths = {
+        argument.shape[0]: None
+        for argument in jax.tree.leaves(laid, is_leaf=lambda a: isinstance(a, Argument))
+        if argument.shape
+    }
+    names = {length: f"rows {number}" for number, length in enumerate(lengths)}
+
+    def named(argument: Argument) -> Argument:
+        if not argument.shape:
+            return argument
+        return Argument(
+            (names[argument.shape[0]], *argument.shape[1:]), argument.dtype, argument.lanes
+        )
+
+    tables: Inlet = jax.tree.map(named, laid, is_leaf=lambda a: isinstance(a, Argument))
+    return tables
+
+
+def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
+    """Return the tangents of what moves, in the order of the leaves."""
+    count = len(next(iter(tangents.values())))
+    still = np.zeros(count)
+    moved = [tangents.get(name, still) for name in sorted(given.coefficients)]
+    if given.states is not None:
+        length = np.shape(given.states)[0]
+        moved.append(tangents.get("states", np.zeros((count, length))))
+    return [*moved, *(tangents.get(name, still) for name in sorted(given.conditions))]
+
+
+@lru_cache(maxsize=64)
+def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> Program:
+    arguments = jax.tree.unflatten(structure, leaves)
+
+    def flight(given: _Given, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
+        return _flight(given, static, lengths["turns"])
+
+    return Program(flight, arguments, at_once=AT_ONCE, name="flight of a segment")
+
+
+def _flight(given: _Given, static: _Static, samples: int) -> tuple[dict[str, Any], Any]:
+    """Fly one segment: channel -> (samples, c), and the time of a crash."""
+    model = with_coefficients(given.model, given.coefficients)
+    parts: tuple[Start, Inlet, Environment] = beginning_of(
+        model,
+        given.segments,
+        static.schedule,
+        states=given.states,
+        conditions=given.conditions,
+    )
+    start, inlet, environment = parts
+    plant, first = begun(
+        model.vehicle,
+        model.controller,
+        static.schedule,
+        inlet,
+        start,
+        environment=environment,
+        limits=static.limits,
+    )
+
+    def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
+        after, row = plant.sample(state, number)
+        return after, recorded_of(row, model, environment, given.conditions, static.channels)
+
+    last, channels = lax.scan(sample, first, jnp.arange(samples))
+    return channels, last.crash_time
