@@ -197,6 +197,21 @@ def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool)
     )
 
 
+def _require_definitions(recording: Recording, signals: Iterable[str]) -> None:
+    """Raise if topics would hold some signals, but the definitions of their types are missing."""
+    undefined = getattr(recording, "undefined", lambda _: None)
+    for topic in recording.topics:
+        holds = topic.count and any(recording.usual(topic.name, signal) for signal in signals)
+        if holds and undefined(topic.name) is not None:
+            raise RecordingError(
+                recording.path,
+                f"holds {topic.name}, but not the definition of its type {topic.type}, which "
+                "databases of ROS 2 Humble and before do not",
+                "name the folder of its package's .msg files under 'messages' in a topic map "
+                "(extends: px4_ros2), or convert the recording to MCAP",
+            )
+
+
 def require_pose(
     recording: Recording, topics: TopicMap, places: Mapping[str, Place], *, given: bool = False
 ) -> None:
@@ -220,6 +235,7 @@ def require_pose(
         raise RecordingError(
             recording.path, f"the topic map '{topics.name}' names no topic for {what}", "add one"
         )
+    _require_definitions(recording, missing)
     names = [topic.name for topic in recording.topics if topic.count]
     if all(source.topic == "*" for source in sources):
         held = [field for name in names for field in recording.fields(name)]

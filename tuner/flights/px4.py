@@ -18,7 +18,12 @@ def _array(name: str, *, count: int = 3, unit: str = "si") -> Usual:
 
 _LOCAL_POSITION = {"position": _fields("x", "y", "z"), "velocity": _fields("vx", "vy", "vz")}
 _ATTITUDE = {"attitude": _array("q", count=4)}
-_ODOMETRY = {"position": _array("position"), "attitude": _array("q", count=4)}
+_ODOMETRY = {
+    "position": _array("position"),
+    "attitude": _array("q", count=4),
+    "velocity": _array("velocity"),
+    "body_rate": _array("angular_velocity"),
+}
 
 #: Message, named as in a log -> signal -> where it is.
 USUAL: Mapping[str, Mapping[str, Usual]] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -318,6 +319,11 @@ def to_ulog(
 # PX4 in ROS 2 ----------------------------------------------------------------------------------
 
 _PX4_TYPES = {
+    "VehicleOdometry": "uint64 timestamp\nuint64 timestamp_sample\nuint8 pose_frame\n"
+    "float64[3] position\nfloat64[4] q\nuint8 velocity_frame\nfloat64[3] velocity\n"
+    "float64[3] angular_velocity\n",
+    "ActuatorMotors": "uint64 timestamp\nuint64 timestamp_sample\nuint16 reversible_flags\n"
+    "float64[4] control\n",
     "VehicleLocalPosition": "uint64 timestamp\nuint64 timestamp_sample\nbool xy_valid\n"
     "float64 x\nfloat64 y\nfloat64 z\nfloat64[2] delta_xy\nfloat64 vx\nfloat64 vy\nfloat64 vz\n",
     "VehicleAttitude": "uint64 timestamp\nuint64 timestamp_sample\nfloat64[4] q\n",
@@ -356,6 +362,89 @@ def to_px4_ros2(messages: Mapping[str, Column], folder: Path, *, boot: int = 0) 
     return folder
 
 
+MOCAP_TYPES = {
+    "mocap4r2_msgs/msg/RigidBodies": "std_msgs/Header header\nuint32 frame_number\n"
+    "mocap4r2_msgs/RigidBody[] rigidbodies\n",
+    "mocap4r2_msgs/msg/RigidBody": "string rigid_body_name\nmocap4r2_msgs/Marker[] markers\n"
+    "geometry_msgs/Pose pose\n",
+    "mocap4r2_msgs/msg/Marker": "int8 USE_NAME=0\nint8 id_type\nint32 marker_index\n"
+    "string marker_name\ngeometry_msgs/Point translation\n",
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": "std_msgs/Header header\n"
+    "motion_capture_tracking_interfaces/NamedPose[] poses\n",
+    "motion_capture_tracking_interfaces/msg/NamedPose": "string name\ngeometry_msgs/Pose pose\n",
+}
+#: Driver of a motion capture -> its topic and message type.
+MOCAPS = {
+    "mocap4r2": ("/rigid_bodies", "mocap4r2_msgs/msg/RigidBodies"),
+    "motion_capture_tracking": (
+        "/poses",
+        "motion_capture_tracking_interfaces/msg/NamedPoseArray",
+    ),
+    "vrpn_mocap": ("/vrpn_mocap/quad/pose", "geometry_msgs/msg/PoseStamped"),
+}
+
+
+def px4_store() -> Any:
+    """Return the message types of PX4's bridge and of motion capture beside it."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types: dict[str, Any] = {}
+    for name, text in _PX4_TYPES.items():
+        types.update(get_types_from_msg(text, f"px4_msgs/msg/{name}"))
+    for name, text in MOCAP_TYPES.items():
+        types.update(get_types_from_msg(text, name))
+    store.register(types)
+    return store
+
+
+def mocap_message(store: Any, driver: str, when: int, row: np.ndarray) -> Any:
+    """Return a driver's message of a pose: position, then quaternion with w first."""
+    t, (topic, kind) = store.types, MOCAPS[driver]
+    stamp = t["builtin_interfaces/msg/Time"](*divmod(when, 1_000_000_000))
+    header = t["std_msgs/msg/Header"](stamp, "map")
+    place = t["geometry_msgs/msg/Point"](*row[:3])
+    pose = t["geometry_msgs/msg/Pose"](place, t["geometry_msgs/msg/Quaternion"](*row[4:], row[3]))
+    if driver == "mocap4r2":
+        marker = t["mocap4r2_msgs/msg/Marker"]
+        markers = [marker(0, i, "marker", place) for i in range(3 + when % 2)]
+        body = t["mocap4r2_msgs/msg/RigidBody"]("quad", markers, pose)
+        return t[kind](header, 7, [body])
+    if driver == "motion_capture_tracking":
+        named = t["motion_capture_tracking_interfaces/msg/NamedPose"]
+        return t[kind](header, [named("quad", pose), named("other", pose)])
+    del topic
+    return t[kind](header, pose)
+
+
+def to_px4_and_mocap(
+    messages: Mapping[str, Column],
+    pose: Column,
+    driver: str,
+    folder: Path,
+    *,
+    boot: int,
+    storage: StoragePlugin = StoragePlugin.MCAP,
+) -> Path:
+    """Write PX4's messages, on its own clock, and the poses of a motion capture, on the host's."""
+    store, rows = px4_store(), []
+    with Writer(folder, version=9, storage_plugin=storage) as writer:
+        for name, column in messages.items():
+            kind = "px4_msgs/msg/" + "".join(part.title() for part in name.split("_"))
+            side = "in" if name == "trajectory_setpoint" else "out"
+            connection = writer.add_connection(f"/fmu/{side}/{name}", kind, typestore=store)
+            make = _px4_maker(store, kind)
+            for when, row in zip(column.time, column.values, strict=True):
+                message = make((int(when) - boot) // 1000, row)
+                rows.append((int(when), connection, store.serialize_cdr(message, kind)))
+        topic, kind = MOCAPS[driver]
+        connection = writer.add_connection(topic, kind, typestore=store)
+        for when, row in zip(pose.time, pose.values, strict=True):
+            message = mocap_message(store, driver, int(when), row)
+            rows.append((int(when), connection, store.serialize_cdr(message, kind)))
+        for when, connection, content in sorted(rows, key=lambda item: item[0]):
+            writer.write(connection, when + 700_000, content)
+    return folder
+
+
 def _px4_maker(store: Any, kind: str) -> Callable[[int, np.ndarray], Any]:
     """Return a function that fills a message's float fields in order."""
     fields = store.fielddefs[kind][1]
@@ -380,3 +469,12 @@ def _px4_maker(store: Any, kind: str) -> Callable[[int, np.ndarray], Any]:
         return store.types[kind](*values)
 
     return make
+
+
+def without_definitions(folder: Path) -> None:
+    """Take the message definitions out of an SQLite recording, as ROS 2 Humble leaves them out."""
+    (database,) = folder.glob("*.db3")
+    connection = sqlite3.connect(database)
+    with connection:
+        connection.execute("DROP TABLE IF EXISTS message_definitions")
+    connection.close()

@@ -19,6 +19,23 @@ Fields = list[tuple[str, Any]]
 #: The longest honest definition is some 20 kB; beyond this a parser is only kept busy.
 LONGEST = 200_000
 
+#: Types of motion capture's own packages, which databases of ROS 2 Humble and before do not carry.
+MOTION_CAPTURE = {
+    "mocap4r2_msgs/msg/RigidBodies": (
+        "std_msgs/Header header\nuint32 frame_number\nmocap4r2_msgs/RigidBody[] rigidbodies\n"
+    ),
+    "mocap4r2_msgs/msg/RigidBody": (
+        "string rigid_body_name\nmocap4r2_msgs/Marker[] markers\ngeometry_msgs/Pose pose\n"
+    ),
+    "mocap4r2_msgs/msg/Marker": (
+        "int8 id_type\nint32 marker_index\nstring marker_name\ngeometry_msgs/Point translation\n"
+    ),
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": (
+        "std_msgs/Header header\nmotion_capture_tracking_interfaces/NamedPose[] poses\n"
+    ),
+    "motion_capture_tracking_interfaces/msg/NamedPose": ("string name\ngeometry_msgs/Pose pose\n"),
+}
+
 
 @dataclass
 class Definitions:
@@ -61,6 +78,9 @@ class Definitions:
         for path in _message_files(self.files):
             for name, fields in _parse(path, _read(path), _type_of(path)).items():
                 self._known.setdefault(name, fields)
+        if self.standard and kind not in self._known and kind in MOTION_CAPTURE:
+            text = MessageDefinition(MessageDefinitionFormat.MSG, MOTION_CAPTURE[kind])
+            self._known[kind] = _parse(self.path, text, kind)[kind]
         stores = [Stores.EMPTY, Stores.ROS2_HUMBLE] if self.standard else [Stores.EMPTY]
         for store in stores:
             if kind not in self._known and kind in (known := get_typestore(store).fielddefs):

@@ -94,6 +94,15 @@ class RosRecording:
         except (UnknownFieldError, RecordingError):
             return fields
 
+    def undefined(self, topic: str) -> str | None:
+        """Return the message type of a topic if its definition is nowhere; None if it is known."""
+        kind = self._kind(topic)
+        try:
+            self._definitions.fields(kind)
+        except RecordingError:
+            return kind
+        return None
+
     def _kind(self, topic: str) -> str:
         return next((known.type for known in self.topics if known.name == topic), "")
 

@@ -34,6 +34,7 @@ _TRANSFORM = {
     "position": _of("transform.translation"),
     "attitude": _of("transform.rotation", _WXYZ),
 }
+_FIRST_BODY = _pose("rigidbodies[0].pose.")
 _VECTOR = {"velocity": _of("vector"), "body_rate": _of("vector"), "acceleration": _of("vector")}
 
 #: Message type -> signal -> where it is, fields in the order of the signal's columns. Whether a
@@ -46,6 +47,10 @@ USUAL: Mapping[str, Mapping[str, Usual]] = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": _twist("twist.twist."),
     "geometry_msgs/msg/Vector3Stamped": _VECTOR,
     "geometry_msgs/msg/AccelStamped": {"acceleration": _of("accel.linear")},
+    # of several rigid bodies the first; a topic map names another
+    "mocap4r2_msgs/msg/RigidBodies": _FIRST_BODY,
+    "mocap_msgs/msg/RigidBodies": _FIRST_BODY,
+    "motion_capture_tracking_interfaces/msg/NamedPoseArray": _pose("poses[0].pose."),
     "nav_msgs/msg/Odometry": {**_pose("pose.pose."), **_twist("twist.twist.")},
     "sensor_msgs/msg/Imu": {
         "attitude": _of("orientation", _WXYZ),
