@@ -14,7 +14,7 @@ from starlette.requests import ClientDisconnect
 from tuner.disk import file_name
 from tuner.errors import InputError
 from tuner.service import jobs, recordings
-from tuner.service.errors import NotKnownError, TooManyError, UnavailableError
+from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.events import follow
 from tuner.service.history import history
 from tuner.service.incoming import FIELD, Upload, receive
@@ -292,16 +292,19 @@ def get_history(service: Served, name: str) -> History:
 @watching.get("/healthz", responses={503: {"model": Health}})
 def healthz(service: Served) -> Response:
     """Say whether the server does its work."""
-    database = "ok"
+    database = uploads = "ok"
     try:
-        service.database.ping()
+        recordings.check_space(service.database, service.store, service.settings)
     except UnavailableError as error:
-        database = error.what
+        database = uploads = error.what
+    except ServiceError as error:
+        uploads = error.what
     workers = "ok" if service.dispatcher.is_alive else "stopped"
-    is_well = database == workers == "ok"
+    is_well = database == uploads == workers == "ok"
     answer = Health(
         status="ok" if is_well else "failing",
         database=database,
+        uploads=uploads,
         workers=workers,
         version=installed(),
     )

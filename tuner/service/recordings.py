@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ from tuner.service.tables import RecordingRow
 
 
 def check_space(database: Database, store: Store, settings: ServiceSettings) -> None:
-    """Refuse an upload before it begins, where there is no room for it.
+    """Refuse an upload before it begins, where there is no room for one.
 
     Raises
     ------
@@ -33,8 +34,8 @@ def check_space(database: Database, store: Store, settings: ServiceSettings) -> 
         There are too many recordings, or the disk is nearly full.
     """
     limits = settings.limits
-    free = store.free_bytes()
-    if free is not None and free < limits.free_bytes:
+    free = (store.free_bytes(), shutil.disk_usage(settings.incoming).free)
+    if any(left is not None and left < limits.free_bytes for left in free):
         raise NoSpaceError("the server", "has no space left", "free some space and try again")
     with database.reading() as session:
         stored = session.scalar(select(func.count()).select_from(RecordingRow)) or 0

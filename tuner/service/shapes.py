@@ -143,6 +143,7 @@ class Health(BaseModel):
 
     status: str
     database: str
+    uploads: str
     workers: str
     version: str
 

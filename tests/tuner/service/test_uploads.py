@@ -165,6 +165,10 @@ def test_a_disk_that_is_nearly_full_takes_nothing_more(settings, table):
     service = Service.open(replace(settings, limits=replace(LIMITS, free_bytes=2**60)))
     with listening(service) as client:
         assert send(client, table.read_bytes()).status_code == 507
+        health = client.get("/healthz")
+        assert health.status_code == 503
+        assert health.json()["status"] == "failing"
+        assert health.json()["uploads"] == "has no space left"
     service.close()
 
 
@@ -174,6 +178,7 @@ def test_the_number_of_recordings_and_of_uploads_at_once_is_limited(settings, ta
     with listening(service) as client:
         first = upload(client, table.read_bytes())
         assert send(client, b"time,x\n1,2\n").status_code == 429
+        assert client.get("/healthz").json()["uploads"] == "keeps 1 recordings"
         body = {"recordings": [first, "0" * 64]}
         assert client.post("/api/v1/jobs", json=body).status_code == 429
     service.close()
