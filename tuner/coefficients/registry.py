@@ -244,6 +244,15 @@ def scale_group() -> tuple[str, ...]:
     return tuple(name for name, row in COEFFICIENTS.items() if row.mass_exponent == 1)
 
 
+def at_mass(name: str, mass: float | None, wanted: float | None) -> float:
+    """Return the factor that brings a coefficient found with one mass to another, kg.
+
+    1 where a mass is not known, and for the mass itself.
+    """
+    exponent = 0 if name == "mass" or name not in REGISTRY else REGISTRY[name].mass_exponent
+    return float((wanted / mass) ** exponent) if mass and wanted else 1.0
+
+
 def term_groups() -> dict[str, tuple[str, ...]]:
     """Return every group of terms that a fit may add, with its coefficients."""
     groups: dict[str, tuple[str, ...]] = {}

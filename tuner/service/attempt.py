@@ -247,7 +247,7 @@ def outcome_of(last: Mapping[str, Any], folder: Path, store: Store) -> Outcome:
                 "identifiable": found.identifiable,
             }
             for name, found in result.coefficients.items()
-            if found.fitted
+            if found.fitted or name == "mass"  # which others are compared at
         ],
     )
 

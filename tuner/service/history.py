@@ -5,6 +5,7 @@ from __future__ import annotations
 from sqlalchemy import func, select
 from sqlalchemy.orm import selectinload
 
+from tuner.coefficients.registry import at_mass
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, shown
 from tuner.service.naming import stems
@@ -19,7 +20,8 @@ def history(database: Database, vehicle: str) -> History:
     """Return every fitted coefficient over the jobs of a vehicle that are done.
 
     They stand in the order in which their recordings were flown, as far as that is known, and else
-    in which they were submitted.
+    in which they were submitted. What goes with the mass is that at the last job's mass, for flights
+    show only its ratio to the mass.
 
     Raises
     ------
@@ -40,26 +42,31 @@ def history(database: Database, vehicle: str) -> History:
         by_number = {job.number: job for job in jobs}
         rows = session.scalars(select(PointRow).where(PointRow.job.in_(by_number))).all()
     rows = sorted(rows, key=lambda row: _moment(by_number[row.job]))
+    masses = {row.job: row.best for row in rows if row.coefficient == "mass"}
+    mass = next((masses[row.job] for row in reversed(rows) if row.job in masses), None)
     coefficients: dict[str, CoefficientHistory] = {}
     for row in rows:
+        if row.coefficient == "mass" and row.identifiable is None:
+            continue  # not fitted
         job = by_number[row.job]
-        ci95 = None
+        factor, ci95 = at_mass(row.coefficient, masses.get(row.job), mass), None
         if row.lower is not None and row.upper is not None:
-            ci95 = (row.lower, row.upper)
+            ci95 = (factor * row.lower, factor * row.upper)
         point = Point(
             job=job.id,
             name=job.name,
             flown=iso(job.flown),
             ended=iso(job.ended),
-            best=row.best,
-            std_error=row.std_error,
+            mass=masses.get(row.job),
+            best=factor * row.best,
+            std_error=None if row.std_error is None else factor * row.std_error,
             ci95=ci95,
             identifiable=row.identifiable,
             flights=stems(flight.name for flight in job.flights if not flight.holdout),
         )
         empty = CoefficientHistory(unit=row.unit, points=[])
         coefficients.setdefault(row.coefficient, empty).points.append(point)
-    return History(vehicle=vehicle, coefficients=coefficients)
+    return History(vehicle=vehicle, mass=mass, coefficients=coefficients)
 
 
 def _moment(job: JobRow) -> tuple[float, int]:

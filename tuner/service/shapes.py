@@ -111,12 +111,16 @@ class JobPage(BaseModel):
 
 
 class Point(BaseModel):
-    """A coefficient as one job found it, with the flights behind it; times as ISO 8601."""
+    """A coefficient as one job found it, with the flights behind it; times as ISO 8601.
+
+    ``mass``, kg, is the job's own; what goes with the mass is at that of `History`.
+    """
 
     job: str
     name: str
     flown: str | None
     ended: str | None
+    mass: float | None
     best: float
     std_error: float | None
     ci95: tuple[float, float] | None
@@ -132,9 +136,10 @@ class CoefficientHistory(BaseModel):
 
 
 class History(BaseModel):
-    """All coefficients of a vehicle."""
+    """All coefficients of a vehicle; what goes with the mass is at ``mass``, kg, the last job's."""
 
     vehicle: str
+    mass: float | None
     coefficients: dict[str, CoefficientHistory]
 
 

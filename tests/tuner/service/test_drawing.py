@@ -12,6 +12,7 @@ from tuner.service.web.drawing import history_bars
 
 def point(best: float, half: float) -> Point:
     return Point(
+        mass=None,
         job="0" * 16,
         name="day",
         flown=None,

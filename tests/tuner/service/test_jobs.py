@@ -194,6 +194,22 @@ def test_the_history_of_a_vehicle_has_every_job_with_its_interval(client, record
     assert client.get("/api/v1/vehicles/nobody/history").status_code == 404
 
 
+def test_what_goes_with_the_mass_is_compared_at_one_mass(client, recording):
+    jobs = [ended(client, submit(client, recording, mass=mass))["id"] for mass in (2.0, 2.5)]
+    history = client.get("/api/v1/vehicles/hovergames/history").json()
+    assert history["mass"] == 2.5
+    assert list(history["coefficients"]) == ["motor_constant"]
+    points = history["coefficients"]["motor_constant"]["points"]
+    assert [point["mass"] for point in points] == [2.0, 2.5]
+    assert points[0]["best"] == pytest.approx(points[1]["best"]) == 1.25e-7
+    assert points[0]["std_error"] == pytest.approx(1.25e-8)
+    assert points[0]["ci95"] == pytest.approx([1e-7, 1.5e-7])
+    assert "at 2.5 kg" in client.get("/vehicles/hovergames").text
+    page = client.get("/compare", params={"a": jobs[0], "b": jobs[1]}).text
+    assert all(words in page for words in ("2 kg", "2.5 kg", "motor_constant*", "+0.00 %", ">0.0<"))
+    assert "motor_constant*" not in client.get("/compare", params={"a": jobs[0], "b": jobs[0]}).text
+
+
 def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):
     own = updated.model_dump(mode="json", exclude_none=True) | {"name": "quad 7"}
     submit(client, recording, vehicle=own)

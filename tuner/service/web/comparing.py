@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
+from tuner.coefficients.registry import at_mass
 from tuner.files import MAX_BYTES
 from tuner.result import RMSE_UNITS, CoefficientResult, FlightResult, RunResult
 from tuner.service import jobs
@@ -22,7 +23,9 @@ class Pair:
     Attributes
     ----------
     name, a, b
-        See there.
+        See there; what goes with the mass is the second's at the mass of the first.
+    scaled
+        Whether it was brought to that mass.
     change
         Of the second from the first, relative; None where that has no sense.
     sigmas
@@ -32,6 +35,7 @@ class Pair:
     name: str
     a: CoefficientResult
     b: CoefficientResult
+    scaled: bool
     change: float | None
     sigmas: float | None
 
@@ -69,22 +73,31 @@ def result_of(database: Database, store: Store, job: str) -> RunResult:
         ) from None
 
 
+def mass_of(result: RunResult) -> float | None:
+    """Return the mass in kg that a fit found or was given."""
+    return result.coefficients["mass"].best if "mass" in result.coefficients else None
+
+
 def pairs(a: RunResult, b: RunResult) -> list[Pair]:
-    """Return the coefficients of both, those first that lie furthest apart."""
+    """Return the coefficients of both, at the first's mass, those first that lie furthest apart."""
+    masses = mass_of(b), mass_of(a)
     both = [
-        _pair(name, one, b.coefficients[name])
+        _pair(name, one, b.coefficients[name], at_mass(name, *masses))
         for name, one in a.coefficients.items()
         if name in b.coefficients and (one.fitted or b.coefficients[name].fitted)
     ]
     return sorted(both, key=lambda pair: -(pair.sigmas or 0.0))
 
 
-def _pair(name: str, a: CoefficientResult, b: CoefficientResult) -> Pair:
+def _pair(name: str, a: CoefficientResult, b: CoefficientResult, factor: float) -> Pair:
+    scaled_error = None if b.std_error is None else factor * b.std_error
+    b = b.model_copy(update={"best": factor * b.best, "std_error": scaled_error})
     error = math.hypot(a.std_error or 0.0, b.std_error or 0.0)
     return Pair(
         name,
         a,
         b,
+        scaled=factor != 1.0,
         change=(b.best - a.best) / abs(a.best) if a.best else None,
         sigmas=abs(b.best - a.best) / error if error else None,
     )

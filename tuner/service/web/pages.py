@@ -263,7 +263,7 @@ def show_vehicle(service: Served, name: str) -> Response:
     """Show every coefficient of a vehicle over time."""
     found = history(service.database, name)
     charts = [(key, of, history_bars(of)) for key, of in found.coefficients.items()]
-    return render("vehicle.html.jinja", vehicle=name, charts=charts)
+    return render("vehicle.html.jinja", vehicle=name, mass=found.mass, charts=charts)
 
 
 @web.get("/compare")
@@ -275,6 +275,7 @@ def compare(service: Served, a: str = "", b: str = "") -> Response:
         "compare.html.jinja",
         a=rows[0],
         b=rows[1],
+        masses=[comparing.mass_of(result) for result in (first, second)],
         pairs=comparing.pairs(first, second),
         flights=comparing.flight_pairs(first, second),
         units=RMSE_UNITS,
