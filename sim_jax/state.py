@@ -59,7 +59,7 @@ class State(eqx.Module):
 def hover_speed(vehicle: Vehicle, *, gravity: float = GRAVITY) -> Scalar:
     """Return the speed, rad/s, at which equal rotors carry a vehicle's weight in still air."""
     thrust = vehicle.body.mass * gravity / len(vehicle.rotors)
-    return jnp.sqrt(thrust / vehicle.aerodynamics.motor_constant)
+    return vehicle.aerodynamics.speed_at(thrust)
 
 
 def hover(vehicle: Vehicle, position: Vec3, *, gravity: float = GRAVITY) -> Start:

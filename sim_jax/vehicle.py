@@ -75,6 +75,18 @@ class Aerodynamics(eqx.Module):
     """m/s, axial air speed at which thrust has fallen to zero."""
     reaction_torque: Literal["body", "world"] = eqx.field(static=True, default="body")
     """Axis of the drag torque: body z (upstream) or world z (the thesis's branch)."""
+    thrust_law: Literal["linear"] | None = eqx.field(static=True, default=None)
+    """Thrust goes with the squared rotor speed; ``linear``: with the speed, motor_constant in
+    N s/rad, as in simulators whose state is a thrust or a throttle."""
+
+    def squared(self, speed: Scalar) -> Scalar:
+        """Return what motor_constant multiplies: the squared rotor speed, or the speed."""
+        return speed if self.thrust_law == "linear" else speed * speed
+
+    def speed_at(self, thrust: Scalar) -> Scalar:
+        """Return the speed in rad/s at which a rotor in still air gives a thrust in N."""
+        squared = thrust / self.motor_constant
+        return squared if self.thrust_law == "linear" else jnp.sqrt(squared)
 
 
 class Setup(eqx.Module):

@@ -26,6 +26,8 @@ from tuner.config import ControllerFile, VehicleFile, initial_values
 
 RADIUS = 0.13
 """m of the rotors of a vehicle of the registry's size; those of others are in proportion."""
+LAWS = ("reaction_torque", "thrust_law")
+"""Keys of the vehicle file's aerodynamics that are no number."""
 
 
 class Model(eqx.Module):
@@ -113,8 +115,9 @@ def vehicle_of(file: VehicleFile) -> Vehicle:
         ),
         motor=Motor(**{key: jnp.asarray(value) for key, value in file.motor}),
         aerodynamics=Aerodynamics(
-            **{k: jnp.asarray(v) for k, v in aerodynamics if k != "reaction_torque"},
+            **{k: jnp.asarray(v) for k, v in aerodynamics if k not in LAWS},
             reaction_torque=aerodynamics.reaction_torque,
+            thrust_law=aerodynamics.thrust_law,
         ),
         setup=Setup(
             jnp.asarray(file.setup.estimate_latency), jnp.asarray(file.setup.actuator_latency)

@@ -231,7 +231,7 @@ class EffectiveResult(Part):
         Whether the fit stopped because its steps gained nothing, not at its limit.
     """
 
-    target: Literal["gazebo"]
+    target: str
     coefficients: dict[str, float]
     lost: tuple[LostTerm, ...]
     carried: tuple[str, ...]

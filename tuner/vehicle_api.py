@@ -17,7 +17,6 @@ from tuner.trajectory_settings import TrajectoryName
 if TYPE_CHECKING:
     from sim_jax.precision import Precision
     from tuner.exporters.export import Exported
-    from tuner.exporters.target import Simulator
     from tuner.simulation.simulate import Simulation
 
 Named = str | Path
@@ -114,7 +113,7 @@ def export(
     *,
     into: Named | None = None,
     out: Named | None = None,
-    simulator: Simulator = "gazebo-classic",
+    simulator: str = "",
     accept: str = "",
 ) -> Exported:
     """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
@@ -130,7 +129,7 @@ def export(
     out
         Where to write; None is the model itself, or ``export/`` in the result folder.
     simulator
-        Whose plugins tags without a model are for.
+        Which of a format's simulators it is for, as of ``tune export``.
     accept
         A reason to export in spite of conditions that are not met.
 
@@ -144,11 +143,13 @@ def export(
     configure()
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.refly import refly  # noqa: PLC0415
+    from tuner.job.effective_of_run import kept_effective  # noqa: PLC0415
 
     return export_run(
         run if isinstance(run, Run) else read_run(run),
         format,
         refly=refly,
+        refit=kept_effective,
         today=date.today(),  # the user's own day
         into=None if into is None else Path(into),
         out=None if out is None else Path(out),

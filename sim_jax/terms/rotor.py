@@ -32,7 +32,8 @@ def thrust(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Air) ->
     zero = jnp.zeros_like(motion.velocity.x)
     lifts = []
     for number, (speed, through) in enumerate(zip(rotor_speed, air.at_rotors, strict=True)):
-        square = speed * speed * _remaining_share(aerodynamics, through.z, air.draught)
+        share = _remaining_share(aerodynamics, through.z, air.draught)
+        square = aerodynamics.squared(speed) * share
         scale = _thrust_scale(vehicle, number)
         if scale is not None:
             square = scale * square
@@ -83,7 +84,9 @@ def drag_torque(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: Ai
     square = zero = jnp.zeros_like(motion.velocity.x)
     for number, (rotor, speed) in enumerate(zip(vehicle.rotors, rotor_speed, strict=True)):
         scale = _thrust_scale(vehicle, number)
-        turned = speed * speed if scale is None else scale * (speed * speed)
+        turned = aerodynamics.squared(speed)
+        if scale is not None:
+            turned = scale * turned
         square = square + rotor.spin * turned
     torque = -aerodynamics.motor_constant * aerodynamics.moment_constant * square
     if aerodynamics.reaction_torque == "world":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -17,7 +17,7 @@ def export(
     format: str,  # noqa: A002 (the option's name)
     into: Path | None = None,
     out: Path | None = None,
-    simulator: Literal["gazebo-classic", "gz-sim"] = "gazebo-classic",
+    simulator: str = "",
     accept: Annotated[str, Parameter(name="--accept")] = "",
     quiet: Quiet = False,
 ) -> None:
@@ -28,14 +28,17 @@ def export(
     run
         Export from this result folder.
     format
-        Write a vehicle file with confidence intervals (yaml), a model of Gazebo classic or gz-sim
-        (sdf), or parameters of PX4 (px4).
+        Write a vehicle file with confidence intervals (yaml), a model of Gazebo classic (sdf) or
+        gz-sim (gz-sim; or sdf, where the model is one), or parameters of PX4 (px4).
     into
-        Put the coefficients into this model (.sdf or .sdf.jinja). Default: write the tags alone.
+        Put the coefficients into this model (.sdf or .sdf.jinja), and into what it includes from
+        folders beside its own. Default: write the tags alone.
     out
-        Write this file. Default: the model itself, or export/ in the result folder.
+        Write this file; a folder, where the model is split over several. Default: the model itself,
+        or export/ in the result folder.
     simulator
-        Write tags without a model for the plugins of this simulator.
+        Write for this simulator of a format's: gazebo-classic or gz-sim (sdf), sih or gz-sim
+        (px4). Default: the one that the model is for, or the first.
     accept
         Export although a condition is not met, and record this reason in the file.
     """

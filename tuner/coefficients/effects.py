@@ -25,7 +25,7 @@ def _effect(
     prior_sd: float,
     step: float,
     gazebo: str | Written = "Gazebo's motor model has no such term",
-    px4: str = "the SIH model has no such term",
+    px4: str | Written = "the SIH model has no such term",
     mass_exponent: int = 0,
     length_exponent: float = 0.0,
     informed_by: str | None = None,
@@ -34,9 +34,12 @@ def _effect(
 ) -> Coefficient:
     """Return the row of an effect that vanishes at zero and is searched between ±limit.
 
-    ``gazebo`` is where SDF holds it, or why it does not.
+    ``gazebo`` and ``px4`` are where SDF and PX4 hold it, or why they do not.
     """
-    in_sdf = gazebo if isinstance(gazebo, Written) else NotCarried(gazebo, 0.0)
+    held = {
+        target: entry if isinstance(entry, Written) else NotCarried(entry, 0.0)
+        for target, entry in (("sdf", gazebo), ("px4", px4))
+    }
     return Coefficient(
         name=name,
         unit=unit,
@@ -53,7 +56,7 @@ def _effect(
         group=group,
         stands_in=stands_in,
         reads=reads,
-        exported_as={"sdf": in_sdf, "px4": NotCarried(px4, 0.0)},
+        exported_as=held,
         informed_by=informed_by,
     )
 
@@ -122,6 +125,7 @@ EFFECT_ROWS = (
             mass_exponent=1,
             length_exponent=-0.5,
             stands_in=True,
+            px4=Written("SIH_KDV"),
         )
         for axis, direction in _AXES.items()
     ),
@@ -254,6 +258,7 @@ EFFECT_ROWS = (
             mass_exponent=1,
             length_exponent=1.5,
             stands_in=True,
+            px4=Written("SIH_KDW"),
         )
         for axis, usual, source in (
             ("x", 0.01, "what is left of inflow and flapping: -c·ω"),

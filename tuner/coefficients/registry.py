@@ -16,6 +16,9 @@ from tuner.coefficients.surroundings import SURROUNDING_ROWS
 
 _FROM_SPEEDS = Written("CA_ROTOR*_CT, SIH_T_MAX, SIM_GZ_EC_*")
 
+NO_LOSS = 1e6
+"""m/s, of ``max_relative_airspeed`` in a simulator whose thrust does not depend on the airspeed."""
+
 _ROWS = (
     # mass and inertia
     Coefficient(
@@ -186,7 +189,7 @@ _ROWS = (
         mass_exponent=1,
         exported_as={
             "sdf": Written("rollingMomentCoefficient", "motor"),
-            "px4": NotCarried("the SIH model has no rolling moment"),
+            "px4": NotCarried("the SIH model has no rolling moment", 0.0),
         },
         informed_by="nothing",
     ),
@@ -200,7 +203,7 @@ _ROWS = (
         prior_sd=1.0,
         exported_as={
             "sdf": NotCarried("the motor plugins have 25 m/s built in", 25.0),
-            "px4": NotCarried("the SIH model's thrust does not depend on the airspeed"),
+            "px4": NotCarried("the SIH model's thrust does not depend on the airspeed", NO_LOSS),
         },
         informed_by="climb",
     ),

@@ -158,13 +158,14 @@ class ExportSettings(Section):
     Attributes
     ----------
     formats
-        ``yaml`` is the vehicle file with source and confidence of each coefficient, ``sdf`` the
-        model or, without one, its tags, ``px4`` the parameters; all by default.
+        ``yaml``, the vehicle file with source and confidence of each coefficient, and ``sdf``, the
+        model or, without one, its tags, by default; any other of ``tune export``. One for a
+        simulator that lacks some of what acts takes a minute for the coefficients that it needs.
     into
         The SDF model that ``sdf`` starts from; the original stays as it is.
     """
 
-    formats: tuple[FormatName, ...] = Field(default_factory=lambda: tuple(NAMES))
+    formats: tuple[FormatName, ...] = ("yaml", "sdf")
     into: Path | None = None
 
 
@@ -196,8 +197,8 @@ class JobFile(Section):
         left is none of them.
     target
         Which of a run's two answers the exports for simulators hold: ``gazebo``, the coefficients
-        with which Gazebo, which lacks some of the terms, flies most like the vehicle; ``physical``,
-        the vehicle's own. Both are in the result.
+        with which the simulator of each format, which lacks some of the terms, flies most like the
+        vehicle; ``physical``, the vehicle's own. Those for Gazebo are in the result.
     coefficients
         Bounds, scale and prior of single coefficients.
     ties

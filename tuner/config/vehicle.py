@@ -115,6 +115,9 @@ class Aerodynamics(Section):
     reaction_torque
         Whether the drag torque acts about the body's z axis or, as one simulator has it, the
         world's.
+    thrust_law
+        ``linear`` for a simulator whose thrust goes with the rotor speed itself (motor_constant in
+        N s/rad); left out, it goes with the square.
     """
 
     motor_constant: Positive
@@ -123,6 +126,7 @@ class Aerodynamics(Section):
     rolling_moment_coefficient: NonNegative
     max_relative_airspeed: Positive = 25.0
     reaction_torque: Literal["body", "world"] = "body"
+    thrust_law: Literal["linear"] | None = None
 
 
 class Setup(Section):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tuner.config import VehicleFile
@@ -15,6 +16,19 @@ from tuner.files import read_bytes
 MAX_BYTES = 10_000_000
 #: Numbers are written with twelve digits; mass and inertia may go through sums of links.
 TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class Gate:
+    """One condition: what it is, and what stands against it (nothing if it is met)."""
+
+    name: str
+    objections: tuple[str, ...]
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing stands against it."""
+        return not self.objections
 
 
 @dataclass(frozen=True)
@@ -30,13 +44,20 @@ class Draft:
     notes
         What was done, and what the format has no place for.
     faults
-        Given the file as it stands on the disk, what is wrong with the numbers in it.
+        Given the file as it stands on the disk, and others that stand in for theirs, what is wrong
+        with the numbers in it.
+    gates
+        Conditions of the format's own.
+    others
+        Further files -> their text, where a model is split over several.
     """
 
     text: str
     vehicle: VehicleFile
     notes: tuple[str, ...]
-    faults: Callable[[Path], Sequence[str]]
+    faults: Callable[..., Sequence[str]]
+    gates: tuple[Gate, ...] = ()
+    others: Mapping[Path, str] = field(default_factory=dict)
 
 
 def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[str]:
@@ -48,8 +69,17 @@ def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[
     ]
 
 
-def write(draft: Draft, path: Path) -> None:
-    """Write a draft if it reads back as what it should hold; otherwise the file stays as it was.
+def write(draft: Draft, path: Path, others: Mapping[Path, Path] | None = None) -> None:
+    """Write a draft if it reads back as what it should hold; otherwise all stays as it was.
+
+    Parameters
+    ----------
+    draft
+        What to write.
+    path
+        Where to; it appears whole.
+    others
+        Further file of the draft -> where it is written instead; None writes it where it is.
 
     Raises
     ------
@@ -58,10 +88,20 @@ def write(draft: Draft, path: Path) -> None:
     OutputError
         It cannot be written.
     """
-    make_folder(path.parent)
-    with whole_file(path) as unfinished:
-        unfinished.write_text(draft.text, encoding="utf-8")
-        wrong = draft.faults(unfinished)
+    with ExitStack() as stack:
+
+        def written(place: Path, text: str) -> Path:
+            make_folder(place.parent)
+            unfinished = stack.enter_context(whole_file(place))
+            unfinished.write_text(text, encoding="utf-8", newline="")
+            return unfinished
+
+        first = written(path, draft.text)
+        instead = {
+            file: written((others or {}).get(file, file), text)
+            for file, text in draft.others.items()
+        }
+        wrong = draft.faults(first, instead) if instead else draft.faults(first)
         if wrong:
             raise ExportError(
                 path, f"would not read back: {'; '.join(wrong)}", "report this; nothing was written"

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
 from tuner.config.job import ExportSettings
 from tuner.disk import check_file, file_name, inside
 from tuner.errors import ExportError, InputError
-from tuner.exporters.draft import write
-from tuner.exporters.gates import Gate, Refly, check
-from tuner.exporters.provenance import exported_vehicle, in_simulator, provenance
+from tuner.exporters.draft import Draft, Gate, write
+from tuner.exporters.gates import Refly, check, check_hover
+from tuner.exporters.provenance import Refit, exported_vehicle, in_simulator, provenance
 from tuner.exporters.target import (
     Choices,
-    Simulator,
     check_every_coefficient,
     not_carried,
     target_of,
@@ -52,9 +51,11 @@ def export(
     *,
     refly: Refly,
     today: date,
+    refit: Refit | None = None,
     into: Path | None = None,
     out: Path | None = None,
-    simulator: Simulator = "gazebo-classic",
+    copies: Path | None = None,
+    simulator: str = "",
     accept: str = "",
 ) -> Exported:
     """Write a run's coefficients in a format, if they hold there.
@@ -70,12 +71,18 @@ def export(
         Flies the run's flights with a vehicle.
     today
         For the provenance.
+    refit
+        Finds the effective coefficients for a simulator that lacks some of what acts; without it,
+        those for Gazebo stand in.
     into
         With ``sdf``, the model to patch; without, the tags alone are written.
     out
         Where to write; by default the model itself, or ``export/`` in the result folder.
+    copies
+        Folder for a copy of the model, which then stays as it is.
     simulator
-        Whose plugins a bare snippet is for.
+        Which of the format's simulators it is for, where a model to patch does not say; empty for
+        its usual one.
     accept
         A reason to export in spite of gates that are not met; it goes into the provenance.
 
@@ -87,20 +94,32 @@ def export(
         The file cannot be written.
     """
     target = target_of(kind)
-    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
-    path = out or into or inside(run.folder, own)
-    check_file(path, folder_is_made=True)
     if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
-    physical, run = run, in_simulator(run, target)
+    choices = Choices(into, simulator)
+    target = target.chosen(choices)
+    physical, (run, effective) = run, in_simulator(run, target, refit)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
-    line, effective = provenance(run, today, accept), physical.result.effective
-    if run is not physical and effective is not None:
-        line = f"{what_is_exported(effective)}; {line}"
-        decided = (*decided, *what_is_lost(effective, target.entry))
-    draft = target.draft(vehicle, line, Choices(into, simulator))
-    gates = check(run, draft.vehicle, refly)
+    line = provenance(run, today, accept)
+    if effective is not None:
+        assert target.simulator is not None
+        line = f"{what_is_exported(effective, target.simulator.title)}; {line}"
+        decided = (
+            f"these are {what_is_exported(effective, target.simulator.title)}",
+            *decided,
+            *what_is_lost(effective, target.entry, target.simulator.deviations),
+        )
+    draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
+    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
+    if into is not None and copies is not None and out is None:
+        out = copies if draft.others else inside(copies, into.name)
+    path, others = _places(draft, out or into or inside(run.folder, own), into)
+    gates = (
+        *draft.gates,
+        check_hover(target.flown(vehicle), draft.vehicle),
+        *check(run, draft.vehicle, refly),
+    )
     refused = [objection for gate in gates for objection in gate.objections]
     if refused and not accept:
         raise ExportError(
@@ -108,12 +127,46 @@ def export(
             f"its numbers are not fit to export: {'; '.join(refused)}",
             "fit again, or export with --accept 'REASON'",
         )
-    write(draft, path)
+    write(draft, path, others)
     return Exported(path, gates, (*decided, *draft.notes, *not_carried(vehicle, target)))
 
 
+def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Path, Path]]:
+    """Return where a draft is written, and where its further files are.
+
+    A model that is split over several files stays where it is, or is written into a folder, each
+    file in a folder of the name of its own.
+
+    Raises
+    ------
+    ExportError
+        It is split, and is to become one file.
+    OutputError
+        It cannot be written there.
+    """
+    if into is None or path == into or not draft.others:
+        check_file(path, folder_is_made=True)
+        return path, {}
+    if path.suffix:
+        raise ExportError(
+            path,
+            f"is one file, and {into} is split over {len(draft.others) + 1}",
+            "give --out a folder, or leave it out to change the model where it is",
+        )
+    files = (into, *draft.others)
+    places = {f: inside(path, f"{f.absolute().parent.name}/{f.name}") for f in files}
+    for place in places.values():
+        check_file(place, folder_is_made=True)
+    return places.pop(into), places
+
+
 def exports_of_job(
-    folder: Path, wanted: ExportSettings, *, refly: Refly, today: date
+    folder: Path,
+    wanted: ExportSettings,
+    *,
+    refly: Refly,
+    today: date,
+    refit: Refit | None = None,
 ) -> Iterator[tuple[str, Path | InputError]]:
     """Write every format that a job asks for into its result folder.
 
@@ -125,7 +178,7 @@ def exports_of_job(
         A finished result folder.
     wanted
         Formats, and the model for ``sdf``, which stays as it is.
-    refly, today
+    refly, today, refit
         As of `export`.
 
     Yields
@@ -137,7 +190,15 @@ def exports_of_job(
     for kind in wanted.formats:
         into = wanted.into if target_of(kind).patches else None
         try:
-            out = inside(folder / FOLDER, into.name) if into else None
-            yield kind, export(run, kind, refly=refly, today=today, into=into, out=out).path
+            done = export(
+                run,
+                kind,
+                refly=refly,
+                today=today,
+                refit=refit,
+                into=into,
+                copies=folder / FOLDER,
+            )
+            yield kind, done.path
         except InputError as error:
             yield kind, error

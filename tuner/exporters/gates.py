@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 from tuner.config import VehicleFile
 from tuner.errors import InputError
+from tuner.exporters.draft import Gate
+from tuner.exporters.hover import hover_command, thrust_to_weight
 from tuner.result import RMSE_UNITS, AxesRmse, Run
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.
@@ -19,22 +20,11 @@ ON_BOUND = 1e-4
 WORSE = 0.01
 #: What a re-flown RMSE may differ from the run's: relative, or in m and degrees.
 SAME_RELATIVE, SAME_ABSOLUTE = 0.01, 1e-4
+#: What the throttle of the hover, 0..1, may differ.
+SAME_THROTTLE = 0.005
 
 POSITION = ("x", "y", "z")
 ATTITUDE = ("roll", "pitch", "yaw")
-
-
-@dataclass(frozen=True)
-class Gate:
-    """One condition: what it is, and what stands against it (nothing if it is met)."""
-
-    name: str
-    objections: tuple[str, ...]
-
-    @property
-    def passed(self) -> bool:
-        """Whether nothing stands against it."""
-        return not self.objections
 
 
 def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
@@ -50,6 +40,29 @@ def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
         Gate("no held-out flight is worse than before", tuple(_worse(run))),
         Gate("no coefficient sits on a bound", tuple(_on_bounds(run))),
     )
+
+
+def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:
+    """Check what is exported by thrust and hover, which need no flight.
+
+    Parameters
+    ----------
+    wanted
+        The vehicle as the simulator should fly it.
+    there
+        As it flies what was written.
+    """
+    objections = []
+    ratio, expected = thrust_to_weight(there), thrust_to_weight(wanted)
+    if not math.isclose(ratio, expected, rel_tol=SAME_RELATIVE):
+        objections.append(f"full thrust is {ratio:.3g} times the weight, should be {expected:.3g}")
+    hover, wanted_hover = hover_command(there), hover_command(wanted)
+    if hover is None:
+        objections.append(f"it cannot hover, its full thrust is {ratio:.3g} times its weight")
+    elif wanted_hover is None or abs(hover - wanted_hover) > SAME_THROTTLE:
+        should = "none at all" if wanted_hover is None else f"{wanted_hover:.3f}"
+        objections.append(f"it hovers at a throttle of {hover:.3f}, should be {should}")
+    return Gate("thrust to weight and hover throttle are the vehicle's", tuple(objections))
 
 
 def _crashes(flown: Mapping[str, AxesRmse]) -> list[str]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import date
 
 from pydantic import JsonValue
 
 from tuner.coefficients import REGISTRY, Written
 from tuner.config import VehicleFile
+from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.exporters.target import Target
-from tuner.result import Run
+from tuner.result import EffectiveResult, Run
 from tuner.wording.verdicts import judgement_in_words
+
+Refit = Callable[[Run, Simulator], tuple[VehicleFile, EffectiveResult] | None]
+"""Finds the vehicle with which a simulator flies most like a run's; None where it is that one."""
 
 
 def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...]]:
@@ -62,18 +67,31 @@ def _confidence(run: Run, name: str) -> dict[str, JsonValue]:
     return known
 
 
-def in_simulator(run: Run, target: Target) -> Run:
-    """Return a run as a target flies it: with its second answer in the place of the first.
+def in_simulator(
+    run: Run, target: Target, refit: Refit | None
+) -> tuple[Run, EffectiveResult | None]:
+    """Return a run as a target's simulator flies it, and how that was found.
 
-    The run itself where both are the same, where the target has a place for all that Gazebo lacks,
-    and where the job wants physical coefficients.
+    The run itself where the simulator lacks nothing, where there is none, and where the job wants
+    physical coefficients. Without ``refit``, what was found for Gazebo stands in for others.
     """
+    simulator, found = target.simulator, None
+    if simulator is None or _wanted(run) == "physical":
+        return run, None
     effective, flying = run.result.effective, run.effective
-    if effective is None or flying is None or _wanted(run) == "physical":
-        return run
+    if effective is not None and flying is not None:
+        lost = {name for term in effective.lost for name in term.names}
+        is_for = GAZEBO_CLASSIC.name if effective.target == "gazebo" else effective.target
+        if is_for == simulator.name or refit is None:
+            if all(isinstance(target.entry(REGISTRY[name]), Written) for name in lost):
+                return run, None
+            found = flying, effective
+    if found is None and refit is not None:
+        found = refit(run, simulator)
+    if found is None:
+        return run, None
+    flying, effective = found
     lost = {name for term in effective.lost for name in term.names}
-    if all(isinstance(target.entry(REGISTRY[name]), Written) for name in lost):
-        return run
     coefficients = {
         name: row.model_copy(update={"best": effective.coefficients[name]})
         for name, row in run.result.coefficients.items()
@@ -89,7 +107,7 @@ def in_simulator(run: Run, target: Target) -> Run:
         for flight in run.result.flights
     )
     result = run.result.model_copy(update={"coefficients": coefficients, "flights": flights})
-    return run.model_copy(update={"vehicle": flying, "result": result})
+    return run.model_copy(update={"vehicle": flying, "result": result}), effective
 
 
 def _wanted(run: Run) -> str:

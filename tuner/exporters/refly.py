@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tuner.comparison.comparison import Comparison
 from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
 from tuner.errors import InputError
-from tuner.recordings import read_usable, with_conditions, with_inputs_late, with_offsets
+from tuner.recordings import Recording, read_usable, with_conditions, with_inputs_late, with_offsets
 from tuner.result import AxesRmse, Run, RunResult
 
 
@@ -31,6 +31,20 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     """
     if not run.result.flights:  # of ground measurements
         return {}
+    settings, recordings = recordings_of(run)
+    window = settings.job.search.window
+    flown = Comparison(recordings, settings.controller, window=window).fly(vehicle)
+    return {name: errors.rmse for name, errors in flown.items()}
+
+
+def recordings_of(run: Run) -> tuple[Settings, tuple[Recording, ...]]:
+    """Return the settings of a run, and its recordings with clocks and air as it ended with them.
+
+    Raises
+    ------
+    InputError
+        As of `refly`.
+    """
     settings = _settings(run)
     wanted = {flight.name: flight for flight in run.result.flights}
     readable, _ = read_usable(settings, fits=False)
@@ -43,9 +57,7 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
     on_time = with_offsets(recordings, {name: f.time_offset for name, f in wanted.items()})
     on_time = with_conditions(on_time, {name: f.conditions for name, f in wanted.items()})
     on_time = with_inputs_late(on_time, {name: f.input_late for name, f in wanted.items()})
-    window = settings.job.search.window
-    flown = Comparison(on_time, settings.controller, window=window).fly(vehicle)
-    return {name: errors.rmse for name, errors in flown.items()}
+    return settings, tuple(on_time)
 
 
 def _settings(run: Run) -> Settings:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Literal
 
-from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried, Written
+from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried
 from tuner.config import VehicleFile, values_of
 from tuner.errors import ExportError, did_you_mean
 from tuner.exporters import targets
 from tuner.exporters.draft import Draft
-
-Simulator = Literal["gazebo-classic", "gz-sim"]
-Entry = Written | NotCarried
+from tuner.exporters.simulators import Entry, Simulator
 
 
 @dataclass(frozen=True)
@@ -27,11 +24,11 @@ class Choices:
     into
         The model to patch; None for a file of its own.
     simulator
-        Whose plugins a snippet without a model is for.
+        Which of a format's simulators it is for; empty for its usual one.
     """
 
     into: Path | None = None
-    simulator: Simulator = "gazebo-classic"
+    simulator: str = ""
 
 
 @dataclass(frozen=True)
@@ -52,6 +49,12 @@ class Target:
         about which nothing is registered.
     patches
         Whether it can go into a model that exists.
+    simulator
+        Who flies what it holds; None for this project.
+    others
+        Further simulators that read the format.
+    detected
+        A model to patch -> the name of the simulator that it is for.
     """
 
     name: str
@@ -59,6 +62,46 @@ class Target:
     draft: Callable[[VehicleFile, str, Choices], Draft]
     entry: Callable[[Coefficient], Entry | None]
     patches: bool = False
+    simulator: Simulator | None = None
+    others: tuple[Simulator, ...] = ()
+    detected: Callable[[Path], str] | None = None
+
+    @property
+    def simulator_name(self) -> str:
+        """Of who flies it; empty for this project."""
+        return "" if self.simulator is None else self.simulator.name
+
+    def chosen(self, choices: Choices) -> Target:
+        """Return the target for the simulator that is asked for, or that a model is for.
+
+        Raises
+        ------
+        ExportError
+            It has nothing for that simulator, or the model is for another one.
+        """
+        known = {s.name: s for s in (self.simulator, *self.others) if s is not None}
+        is_for = ""
+        if choices.into is not None and self.detected is not None:
+            is_for = self.detected(choices.into)
+        for what, name in (("--simulator", choices.simulator), (str(choices.into), is_for)):
+            if name and name not in known:
+                raise ExportError(
+                    what,
+                    f"--format {self.name} is not for {name}",
+                    f"it is for {' or '.join(known) or 'this project'}",
+                )
+        if is_for and choices.simulator and choices.simulator != is_for:
+            raise ExportError(
+                str(choices.into), f"is a model for {is_for}", f"leave --simulator {is_for} out"
+            )
+        simulator = known.get(is_for or choices.simulator)
+        if simulator is None or simulator is self.simulator:
+            return self
+        return replace(self, simulator=simulator, entry=simulator.entry)
+
+    def flown(self, vehicle: VehicleFile) -> VehicleFile:
+        """Return the vehicle as whoever reads the file flies it."""
+        return vehicle if self.simulator is None else self.simulator.flown(vehicle)
 
 
 def target_of(name: str) -> Target:
@@ -72,7 +115,7 @@ def target_of(name: str) -> Target:
     if name not in targets.NAMES:
         remedy = did_you_mean(name, targets.NAMES)
         raise ExportError("--format", f"unknown export format '{name}'", remedy)
-    target: Target = import_module(f"{targets.__name__}.{name}").TARGET
+    target: Target = import_module(f"{targets.__name__}.{name.replace('-', '_')}").TARGET
     return target
 
 

@@ -29,6 +29,7 @@ from tuner.job.check import check_information, check_recordings
 from tuner.job.cross_validation import cross_validate, jackknife_errors
 from tuner.job.disturbances import Examined, examined
 from tuner.job.effective import Effective, effective_fit
+from tuner.job.effective_of_run import kept_effective
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.explanation import Explanation
 from tuner.job.findings import (
@@ -346,7 +347,10 @@ def _write_flown(folder: Path, validation: Validation, fitted: Fitted) -> None:
 def _export(folder: Path, settings: Settings, listener: Listener) -> None:
     """Write the exports that the job asks for."""
     today = datetime.date.today()
-    for kind, outcome in exports_of_job(folder, settings.job.export, refly=refly, today=today):
+    exports = exports_of_job(
+        folder, settings.job.export, refly=refly, today=today, refit=kept_effective
+    )
+    for kind, outcome in exports:
         listener.on_message(export_sentence(kind, outcome))
 
 

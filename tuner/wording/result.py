@@ -112,26 +112,39 @@ def metres(value: float) -> str:
     return f"{100 * value:.2g} cm" if value >= 0.01 else f"{1000 * value:.2g} mm"
 
 
-def what_is_exported(effective: EffectiveResult) -> str:
-    """Return, as a clause, what the numbers of an export are."""
-    lost = listed([term.group for term in effective.lost])
+def what_is_exported(effective: EffectiveResult, simulator: str) -> str:
+    """Return, as a clause, what the numbers of an export for a simulator are."""
+    lost = listed([term.group if term.names else "other laws" for term in effective.lost])
     return (
-        f"effective coefficients, not physical ones: Gazebo lacks {lost}, and misses the flights "
-        f"by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "
+        f"effective coefficients, not physical ones: {simulator} lacks {lost}, and misses the "
+        f"flights by {rmse_in_words(effective.rmse_effective)} where all terms miss them by "
         f"{rmse_in_words(effective.rmse_physical)}"
     )
 
 
 def what_is_lost(
-    effective: EffectiveResult, entry: Callable[[Coefficient], Written | NotCarried | None]
+    effective: EffectiveResult,
+    entry: Callable[[Coefficient], Written | NotCarried | None],
+    deviations: Sequence[str],
 ) -> tuple[str, ...]:
-    """Return a clause on each group that is lost: why a target lacks it, and what it is worth."""
-    return tuple(
-        f"{term.group} is not exported: {reason}; without it alone the flights are missed by "
-        f"{rmse_in_words(term.rmse_without)}"
-        for term in effective.lost
-        if (reason := _reason(term, entry))
-    )
+    """Return a clause on each group that is lost: why a target lacks it, and what it is worth.
+
+    ``deviations`` are what the simulator computes otherwise than any coefficient says.
+    """
+    clauses = []
+    for term in effective.lost:
+        rmse = rmse_in_words(term.rmse_without)
+        if not term.names:
+            clauses.append(
+                f"the simulator computes otherwise: {'; '.join(deviations)}; that alone misses the "
+                f"flights by {rmse}"
+            )
+        elif reason := _reason(term, entry):
+            clauses.append(
+                f"{term.group} is not exported: {reason}; without it alone the flights are missed "
+                f"by {rmse}"
+            )
+    return tuple(clauses)
 
 
 def _reason(term: LostTerm, entry: Callable[[Coefficient], Written | NotCarried | None]) -> str:

@@ -236,10 +236,15 @@ def in_both(run, _vehicle, flown=None):
 def test_a_simulator_gets_the_effective_coefficients_and_the_file_says_so(make_run, kind):
     run, flown = make_run(**DRAGGY, effective=EFFECTIVE), []
     done = exported(run, kind, refly=lambda r, v: in_both(r, v, flown))
-    assert flown[0].aerodynamics.rotor_drag_coefficient == 3e-4
+    if kind == "sdf":
+        assert flown[0].aerodynamics.rotor_drag_coefficient == 3e-4
+    else:  # as the SIH flies it
+        hover = (2.243 * 9.81 / 4 / 1.45e-5) ** 0.5
+        assert flown[0].effects["linear_drag_x"] == pytest.approx(4 * hover * 3e-4, rel=1e-3)
     assert not flown[0].effects.get("fuselage_drag")
     text = done.path.read_text()
-    assert "effective coefficients, not physical ones: Gazebo lacks fuselage_drag" in text
+    simulator = {"sdf": "Gazebo", "px4": "PX4's SIH"}[kind]
+    assert f"effective coefficients, not physical ones: {simulator} lacks fuselage_drag" in text
     assert "by 1.2 cm and 0.2° where all terms miss them by 2 mm and 0.1°" in text
     lost = [note for note in done.notes if note.startswith("fuselage_drag is not exported")]
     assert len(lost) == 1

@@ -4,12 +4,14 @@ import pytest
 
 from tuner.errors import ExportError
 from tuner.exporters.draft import write
+from tuner.exporters.px4_parameters import Parameter, outside_range, read_parameters
+from tuner.exporters.simulators import GZ_SIM, SIH
 from tuner.exporters.target import Choices
-from tuner.exporters.targets.px4 import Parameter, parameters, px4_draft, read_parameters
+from tuner.exporters.targets.px4 import parameters, px4_draft
 
 
-def value(vehicle):
-    return {parameter.name: parameter.value for parameter in parameters(vehicle)}
+def value(vehicle, simulator=SIH):
+    return {parameter.name: parameter.value for parameter in parameters(vehicle, simulator)}
 
 
 def test_rotors_are_in_px4s_frame_forward_right_down(vehicle):
@@ -49,19 +51,67 @@ def test_the_simulation_in_hardware_gets_the_body(vehicle):
     assert values["SIH_T_TAU"] == pytest.approx(0.01875)
 
 
-def test_hover_command_carries_the_weight(vehicle):
-    hover = value(vehicle)["MPC_THR_HOVER"]
-    assert 4 * 1.45e-5 * (950 * hover + 100) ** 2 == pytest.approx(2.243 * 9.81, rel=1e-6)
-    curved = vehicle.replace(motor=vehicle.motor.replace(quadratic=-200.0, input_offset=0.02))
-    hover = value(curved)["MPC_THR_HOVER"]
-    speed = 950 * (hover + 0.02) + 100 - 200 * (hover + 0.02) ** 2
+def test_the_hover_is_that_of_the_simulator_in_the_file(vehicle):
+    sih = value(vehicle)  # whose thrust is linear in the command
+    assert 4 * sih["SIH_T_MAX"] * sih["MPC_THR_HOVER"] == pytest.approx(2.243 * 9.81, rel=1e-6)
+    assert not any(name.startswith("SIM_GZ") for name in sih)
+    gz = value(vehicle, GZ_SIM)
+    assert not any(name.startswith("SIH_") for name in gz)
+    low, high = gz["SIM_GZ_EC_MIN1"], gz["SIM_GZ_EC_MAX1"]
+    unit = 1000 / 1050
+    speed = (low + (high - low) * gz["MPC_THR_HOVER"]) / unit
     assert 4 * 1.45e-5 * speed**2 == pytest.approx(2.243 * 9.81, rel=1e-6)
 
 
+def test_angular_drag_is_written_and_none_is_zero(vehicle):
+    assert value(vehicle)["SIH_KDW"] == 0.0  # PX4's default damps
+    damped = vehicle.replace(effects={f"angular_drag_{axis}": 0.01 for axis in "xyz"})
+    assert value(damped)["SIH_KDW"] == pytest.approx(0.01)
+    dragging = vehicle.replace(effects={"linear_drag_x": 0.1, "linear_drag_y": 0.1})
+    assert value(dragging)["SIH_KDV"] == pytest.approx(value(vehicle)["SIH_KDV"] + 0.1)
+
+
+def test_what_px4_does_not_accept_is_a_gate(vehicle):
+    assert outside_range([Parameter("SIM_GZ_EC_MAX1", 1066)]) == (
+        "SIM_GZ_EC_MAX1 1066: PX4 accepts 0 to 1000",
+    )
+    assert outside_range([Parameter("SIH_KDW", -1.0), Parameter("SIH_IXY", -1.0)]) == (
+        "SIH_KDW -1: PX4 accepts at least 0",
+    )
+    heavy = px4_draft(vehicle.replace(mass=5.8), "", Choices())
+    (gate, _) = heavy.gates
+    assert gate.objections[0].startswith("MPC_THR_HOVER 0.8")
+    assert px4_draft(vehicle, "", Choices()).gates[0].passed
+
+
+def test_the_sih_of_another_airframe_is_a_gate(vehicle):
+    rotors = list(vehicle.rotors)
+    rotors[0] = rotors[0].replace(position=(0.2, -0.17678, 0.06))
+    (_, gate) = px4_draft(vehicle.replace(rotors=tuple(rotors)), "", Choices()).gates
+    assert "along x" in gate.objections[0]
+    (_, gate) = px4_draft(vehicle, "", Choices(simulator="gz-sim")).gates
+    assert gate.passed
+
+
+def test_hover_command_carries_the_weight(vehicle):
+    vehicle = vehicle.replace(motor=vehicle.motor.replace(input_scaling=850.0))
+    hover = value(vehicle, GZ_SIM)["MPC_THR_HOVER"]
+    assert 4 * 1.45e-5 * (850 * hover + 100) ** 2 == pytest.approx(2.243 * 9.81, rel=1e-6)
+
+
+def test_speeds_beyond_px4s_range_are_scaled(vehicle):
+    values = value(vehicle, GZ_SIM)
+    assert (values["SIM_GZ_EC_MIN1"], values["SIM_GZ_EC_MAX1"]) == (95, 1000)
+    draft = px4_draft(vehicle, "", Choices(simulator="gz-sim"))
+    assert any("scaled by 0.952381" in note for note in draft.notes)
+    assert draft.vehicle.motor.input_scaling == pytest.approx(950, rel=1e-3)
+    assert draft.vehicle.aerodynamics.motor_constant == 1.45e-5
+
+
 def test_the_gz_bridge_gets_whole_speeds(vehicle):
-    values = value(vehicle)
+    values = value(vehicle.replace(motor=vehicle.motor.replace(input_scaling=850.4)), GZ_SIM)
     assert [values[f"SIM_GZ_EC_MIN{i}"] for i in range(1, 5)] == [100] * 4
-    assert [values[f"SIM_GZ_EC_MAX{i}"] for i in range(1, 5)] == [1050] * 4
+    assert [values[f"SIM_GZ_EC_MAX{i}"] for i in range(1, 5)] == [950] * 4
     assert isinstance(values["SIM_GZ_EC_MAX1"], int)
 
 
@@ -77,7 +127,7 @@ def test_the_file_is_what_ground_stations_load(vehicle, tmp_path):
     lines = path.read_text().splitlines()
     assert lines[0] == "# by a test"
     assert "1\t1\tSIH_MASS\t2.243\t9" in lines
-    assert "1\t1\tSIM_GZ_EC_MIN1\t100\t6" in lines
+    assert "1\t1\tCA_ROTOR_COUNT\t4\t6" in lines
     again = read_parameters(path)
     assert {p.name for p in again} == {p.name for p in parameters(vehicle)}
     assert Parameter("SIH_MASS", 2.243) in again
@@ -93,9 +143,3 @@ def test_a_changed_file_does_not_read_back(vehicle, tmp_path):
     path.write_text("1 1 SIH_MASS\n")
     with pytest.raises(ExportError, match="SIH_MASS"):
         draft.faults(path)
-
-
-def test_a_hover_command_that_px4_refuses_is_said(vehicle):
-    heavy = px4_draft(vehicle.replace(mass=5.2), "", Choices())
-    assert any("outside what PX4 accepts" in note for note in heavy.notes)
-    assert not any("outside" in note for note in px4_draft(vehicle, "", Choices()).notes)

@@ -17,7 +17,8 @@ from tuner.exporters.sdf.read_back import composite, values_in
 from tuner.exporters.sdf.snippet import snippet_draft
 from tuner.exporters.sdf.tags import carried_values
 from tuner.exporters.sdf.template import blanked, rendered
-from tuner.exporters.target import not_carried
+from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
+from tuner.exporters.target import Choices, not_carried, target_of
 from tuner.exporters.targets.sdf import TARGET
 
 CLASSIC, GZ, TEMPLATE = (
@@ -63,11 +64,22 @@ def test_only_our_values_change(path, vehicle):
         "-<rotorDragCoefficient>0.000806</rotorDragCoefficient>",
         "+<rotorDragCoefficient>0.000145</rotorDragCoefficient>",
     }
+    if path == GZ:  # speeds scaled to the 1000 rad/s that PX4 can tell gz-sim of
+        expected -= {line for line in expected if "otor" in line and line[0] == "+"}
+        expected |= {
+            "+<motorConstant>1.598625e-05</motorConstant>",
+            "+<rotorDragCoefficient>0.00015225</rotorDragCoefficient>",
+            "-<rollingMomentCoefficient>1e-06</rollingMomentCoefficient>",
+            "+<rollingMomentCoefficient>0</rollingMomentCoefficient>",
+            "-<maxRotVelocity>1100</maxRotVelocity>",
+            "+<maxRotVelocity>1047.61904762</maxRotVelocity>",
+        }
     if path == CLASSIC:
         expected |= {"-<input_scaling>1000</input_scaling>", "+<input_scaling>950</input_scaling>"}
     assert changes(before, draft.text) == expected
     assert len(draft.text.splitlines()) == len(before.splitlines()) + 1
-    assert draft.text.count("<motorConstant>1.45e-05<") == 4
+    constant = "1.598625e-05" if path == GZ else "1.45e-05"
+    assert draft.text.count(f"<motorConstant>{constant}<") == 4
 
 
 def test_a_template_keeps_its_expressions_and_sets_its_variables(vehicle):
@@ -122,7 +134,8 @@ def test_what_was_written_is_read_back(path, vehicle, tmp_path):
     draft = sdf_draft(path, vehicle, "by a test")
     write(draft, target)
     assert draft.faults(target) == []
-    target.write_text(draft.text.replace("0.000145", "0.000146"), encoding="utf-8")
+    other = draft.text.replace("0.000145", "0.000146").replace("0.00015225", "0.00015226")
+    target.write_text(other, encoding="utf-8")
     assert any("rotor_drag_coefficient" in fault for fault in draft.faults(target))
     target.write_text(draft.text.replace("2.204", "2.205"), encoding="utf-8")
     assert any(fault.startswith("mass is 2.24") for fault in draft.faults(target))
@@ -201,7 +214,7 @@ def test_poses_of_links_and_inertials_count(vehicle, tmp_path):
     draft = patched(tmp_path, vehicle, text)
     whole = composite(read_model(draft.text, CLASSIC, 4))
     np.testing.assert_allclose(whole.inertia, np.diag([0.028, 0.033, 0.038]), atol=1e-12)
-    assert any("rotor_0 sits at" in note or "rotor_0 sits" in note for note in draft.notes)
+    assert any("rotor_0 sits" in objection for objection in draft.gates[0].objections)
 
 
 def test_what_has_no_tag_is_said(vehicle):
@@ -221,7 +234,7 @@ def test_what_has_no_tag_is_said(vehicle):
 
 def test_the_commands_of_gz_sim_are_px4_parameters(vehicle):
     notes = " / ".join(sdf_draft(GZ, vehicle, "by a test").notes)
-    assert "SIM_GZ_EC_MIN1..4 to 100 and SIM_GZ_EC_MAX1..4 to 1050" in notes
+    assert "SIM_GZ_EC_MIN1..4 to 95 and SIM_GZ_EC_MAX1..4 to 1000" in notes
     assert "SIM_GZ" not in " / ".join(sdf_draft(CLASSIC, vehicle, "by a test").notes)
 
 
@@ -272,17 +285,20 @@ def test_blanking_a_template_keeps_every_place():
     assert "{" not in blank
 
 
-@pytest.mark.parametrize("simulator", ["gazebo-classic", "gz-sim"])
+@pytest.mark.parametrize("simulator", [GAZEBO_CLASSIC, GZ_SIM], ids=lambda s: s.name)
 def test_a_snippet_holds_the_vehicle(simulator, vehicle, tmp_path):
     draft = snippet_draft(vehicle, simulator, "by a test")
     path = tmp_path / "snippet.sdf"
     write(draft, path)
     model = f"<model><link name='base_link'>{draft.text}</link></model>"
-    classic = simulator == "gazebo-classic"
-    assert values_in(model, path, vehicle) == carried_values(vehicle, channels=classic)
-    assert draft.vehicle == vehicle
-    assert draft.text.count("<channel ") == (4 if simulator == "gazebo-classic" else 0)
-    path.write_text(draft.text.replace("1.45e-05", "1.46e-05"), encoding="utf-8")
+    classic = simulator is GAZEBO_CLASSIC
+    if classic:
+        assert values_in(model, path, vehicle) == carried_values(vehicle, channels=True)
+    flown = simulator.flown(vehicle)
+    assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
+    assert draft.text.count("<channel ") == (4 if classic else 0)
+    other = draft.text.replace("1.45e-05", "1.46e-05").replace("1.598625e-05", "1.6e-05")
+    path.write_text(other, encoding="utf-8")
     assert draft.faults(path)
 
 
@@ -310,13 +326,18 @@ def test_centre_of_mass_and_uneven_rotors_are_in_the_model(path, vehicle, tmp_pa
     final = etree.fromstring(draft.text.encode())
     constants = [float(element.text) for element in final.iter("motorConstant")]
     last = 1.0 / (1.02 * 0.985 * 0.99)
-    assert constants == pytest.approx([1.45e-5 * s for s in (1.02, 0.985, 0.99, last)], rel=1e-11)
-    assert values_of(draft.vehicle) == pytest.approx(values_of(uneven(vehicle)), rel=1e-12)
+    unit = 1000 / 1050 if path == GZ else 1.0
+    expected = [1.45e-5 / unit**2 * s for s in (1.02, 0.985, 0.99, last)]
+    assert constants == pytest.approx(expected, rel=1e-11)
+    flown = (GZ_SIM if path == GZ else GAZEBO_CLASSIC).flown(uneven(vehicle))
+    assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     assert any("moves to" in note for note in draft.notes)
     again = tmp_path / path.name
     write(draft, again)
     assert sdf_draft(again, uneven(vehicle), "by a test").text == draft.text
-    again.write_text(draft.text.replace("1.479e-05", "1.478e-05"), encoding="utf-8")
+    first = f"<motorConstant>{constants[0]:.12g}<"
+    assert first in draft.text
+    again.write_text(draft.text.replace(first, "<motorConstant>1.47e-05<"), encoding="utf-8")
     assert any("motor_constant of rotor_0" in fault for fault in draft.faults(again))
     unmoved = re.sub(r"(</inertia>)\s*<pose>[^<]*</pose>", r"\1", draft.text, count=1)
     again.write_text(unmoved, encoding="utf-8")
@@ -341,9 +362,41 @@ def test_a_centre_of_mass_needs_rotors_to_count_from(vehicle, tmp_path):
 
 
 def test_a_snippet_holds_centre_of_mass_and_uneven_rotors(vehicle, tmp_path):
-    draft = snippet_draft(uneven(vehicle), "gz-sim", "by a test")
+    draft = snippet_draft(uneven(vehicle), GZ_SIM, "by a test")
     assert "<pose>0.003 -0.002 0.015 0 0 0</pose>" in draft.text
-    assert values_of(draft.vehicle) == pytest.approx(values_of(uneven(vehicle)), rel=1e-12)
+    flown = GZ_SIM.flown(uneven(vehicle))
+    assert values_of(draft.vehicle) == pytest.approx(values_of(flown), rel=1e-11)
     path = tmp_path / "snippet.sdf"
     write(draft, path)
     assert draft.faults(path) == []
+
+
+def test_a_model_for_another_vehicle_is_a_gate(vehicle, tmp_path):
+    (gate,) = sdf_draft(CLASSIC, vehicle, "by a test").gates
+    assert gate.passed
+    text = CLASSIC.read_text(encoding="utf-8").replace("ccw<", "cw<", 1)
+    (gate,) = patched(tmp_path, vehicle, text).gates
+    assert gate.objections == ("rotor_0 turns cw, the vehicle file's ccw",)
+    wider = [r.replace(position=(1.2 * r.position[0], *r.position[1:])) for r in vehicle.rotors]
+    draft = sdf_draft(CLASSIC, vehicle.replace(rotors=tuple(wider)), "by a test")
+    assert len(draft.gates[0].objections) == 4
+    assert draft.vehicle.rotors[0].position[0] == pytest.approx(0.17678, abs=1e-3)  # it flies there
+
+
+def test_gz_sim_is_flown_by_its_own_laws(vehicle):
+    flown = sdf_draft(GZ, vehicle, "by a test").vehicle
+    assert flown.aerodynamics.max_relative_airspeed > 1e5
+    assert flown.aerodynamics.rolling_moment_coefficient == 0
+    assert sdf_draft(CLASSIC, vehicle, "by a test").vehicle.aerodynamics == vehicle.aerodynamics
+    notes = " / ".join(not_carried(vehicle, TARGET.chosen(Choices(GZ))))
+    assert "thrust in gz-sim does not depend on the airspeed" in notes
+
+
+def test_format_and_model_agree_about_the_simulator():
+    assert TARGET.chosen(Choices(GZ)).simulator is GZ_SIM
+    assert TARGET.chosen(Choices(simulator="gz-sim")).simulator is GZ_SIM
+    assert TARGET.chosen(Choices()).simulator is GAZEBO_CLASSIC
+    with pytest.raises(ExportError, match="is a model for gz-sim"):
+        TARGET.chosen(Choices(GZ, "gazebo-classic"))
+    with pytest.raises(ExportError, match="--format gz-sim is not for gazebo-classic"):
+        target_of("gz-sim").chosen(Choices(CLASSIC))

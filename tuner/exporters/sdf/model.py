@@ -10,6 +10,7 @@ import numpy as np
 
 from tuner.errors import ExportError
 from tuner.exporters.sdf.composite import IDENTITY, Inertial, Pose, pose_of
+from tuner.exporters.sdf.includes import MERGED, model_in
 from tuner.exporters.sdf.spans import Element, content, number, parse
 
 #: How each of the two simulators calls its motor model and its control channels.
@@ -42,14 +43,38 @@ class Model:
 
     @property
     def links(self) -> list[Element]:
-        """Every link of the model itself."""
-        return [child for child in self.root.children if child.tag == "link"]
+        """Every link of the model itself, and of what it takes in."""
+        return [element for element, _ in self._members() if element.tag == "link"]
+
+    def _members(self) -> Iterator[tuple[Element, Pose]]:
+        """Yield what the model holds, and the frame that it counts from."""
+        return _inside(self.root, IDENTITY)
 
     @property
     def included(self) -> list[str]:
         """What the model includes from other files, whose mass we cannot see."""
         uris = (include.find("uri") for include in self.root.all("include"))
         return [content(uri, self.text) for uri in uris if uri is not None]
+
+    @property
+    def is_gz(self) -> bool:
+        """Whether its motors are gz-sim's, not Gazebo classic's."""
+        return any(_GZ_MOTOR in _named(motor) for motor in self.motors())
+
+    def rotor_links(self) -> dict[int, tuple[Element, str]]:
+        """Return number of a motor -> its rotor's link, and ``ccw`` or ``cw`` (empty where open).
+
+        Motors whose number or link a template leaves open are not there.
+        """
+        links = {link.attributes.get("name"): link for link in self.links}
+        rotors = {}
+        for motor in self.motors():
+            number = self.motor_number(motor)
+            named, turns = (motor.find(tag) for tag in ("linkName", "turningDirection"))
+            link = links.get(content(named, self.text)) if named else None
+            if number is not None and link is not None:
+                rotors[number] = (link, content(turns, self.text) if turns else "")
+        return rotors
 
     def motors(self) -> list[Element]:
         """Return the motor plugins of the vehicle's rotors.
@@ -58,8 +83,7 @@ class Model:
         """
         plugins = []
         for plugin in self.root.all("plugin"):
-            names = plugin.attributes.get("filename", "") + plugin.attributes.get("name", "")
-            names = names.replace("MulticopterMotorModel", _GZ_MOTOR)
+            names = _named(plugin)
             if _CLASSIC_MOTOR in names or _GZ_MOTOR in names:
                 index = self._number_in(plugin, "motorNumber")
                 if index is None or 0 <= index < self.rotors:
@@ -152,12 +176,13 @@ class Model:
         pose = element.find("pose")
         named = pose.attributes.get("relative_to", "") if pose else ""
         frame = named or element.attributes.get("attached_to", "")
+        if frame in {"", "__model__"}:
+            within = next((at for member, at in self._members() if member is element), IDENTITY)
+            return within @ self._written(element)
         return self._frame(frame, passed) @ self._written(element)
 
     def _frame(self, name: str, passed: tuple[str, ...]) -> Pose:
-        if name in {"", "__model__"}:
-            return IDENTITY
-        for element in self.root.children:
+        for element, _ in self._members():
             same = element.attributes.get("name") == name
             if same and element.tag in {"link", "frame"} and name not in passed:
                 return self._placed(element, (*passed, name))
@@ -170,6 +195,12 @@ class Model:
         return None if child is None else number(child, self.text)
 
 
+def _named(plugin: Element) -> str:
+    """Return what a plugin is called, gz-sim's motor model by one name."""
+    names = plugin.attributes.get("filename", "") + plugin.attributes.get("name", "")
+    return names.replace("MulticopterMotorModel", _GZ_MOTOR)
+
+
 def read_model(text: str, path: Path, rotors: int) -> Model:
     """Take a model file apart.
 
@@ -178,19 +209,33 @@ def read_model(text: str, path: Path, rotors: int) -> Model:
     ExportError
         It holds no model, no link, or no motor plugin.
     """
-    root = parse(text, path)
-    element = root if root.tag == "model" else next(root.all("model"), None)
-    if element is None:
-        raise ExportError(path, "holds no <model>", "give the SDF of a multirotor")
-    links = [child for child in element.children if child.tag == "link"]
+    element = model_in(parse(text, path), path)
+    links = [member for member, _ in _inside(element, IDENTITY) if member.tag == "link"]
+    missing = [include for include in element.all("include") if include.attributes.get("merge")]
     if not links:
-        raise ExportError(path, "has no <link>", "give the SDF of a multirotor")
+        remedy = "give the SDF of a multirotor"
+        if missing:
+            remedy = "put the folders of the models that it includes beside its own"
+        raise ExportError(path, "has no <link>", remedy)
     model = Model(path, text, element, _base(element, links), rotors)
     if not model.motors():
         raise ExportError(
-            path, "has no motor model plugin", "give a model for PX4's motor model plugins"
+            path,
+            "has no motor model plugin",
+            "give a model for PX4's motor model plugins: where it is split over files, the one "
+            "that includes the others",
         )
     return model
+
+
+def _inside(parent: Element, frame: Pose) -> Iterator[tuple[Element, Pose]]:
+    """Yield what an element holds, through what was merged into it, and the frame of each."""
+    for child in parent.children:
+        if child.tag == MERGED:
+            numbers = [float(word) for word in child.attributes["at"].split()]
+            yield from _inside(child, frame @ pose_of(numbers))
+        else:
+            yield child, frame
 
 
 def _base(root: Element, links: list[Element]) -> Element:

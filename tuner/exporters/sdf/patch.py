@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from tuner.config import VehicleFile
 from tuner.errors import ExportError
-from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.draft import Draft, Gate, differences, read_file
+from tuner.exporters.hover import rotor_speed
 from tuner.exporters.sdf import spans, tags
-from tuner.exporters.sdf.composite import Array, Inertial, base_for, together
+from tuner.exporters.sdf.composite import Inertial, base_for, together
+from tuner.exporters.sdf.includes import MERGED, Whole, assembled
 from tuner.exporters.sdf.model import Model, inertials, read_model
 from tuner.exporters.sdf.read_back import rotor_origin, values_in
 from tuner.exporters.sdf.spans import Edit, Element
 from tuner.exporters.sdf.template import blanked, rendered
+from tuner.exporters.simulators import (
+    FASTEST_GZ,
+    GAZEBO_CLASSIC,
+    GZ_SIM,
+    gz_unit,
+    with_speeds_in,
+)
 
 #: Products of inertia below this part of the trace are taken as none.
 NO_PRODUCT = 1e-9
@@ -24,6 +34,8 @@ PROVENANCE = "Coefficients by tune"
 
 #: m within which a rotor counts as sitting where the vehicle file has it.
 PLACE_TOLERANCE = 0.005
+#: Of a vehicle: motors with a larger number drive something else.
+MOST_ROTORS = 12
 
 
 def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
@@ -32,44 +44,87 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
     Parameters
     ----------
     path
-        The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one.
+        The model: SDF of Gazebo classic or gz-sim, or a Jinja template of one. What it includes and
+        merges from folders beside its own is patched where it stands.
     vehicle
         Whose coefficients.
     provenance
-        One line that says where they come from; it becomes a comment in the model.
+        One line that says where they come from; it becomes a comment in each file that changes.
 
     Raises
     ------
     ExportError
         The model cannot be understood, or would not come out with the wanted numbers.
     """
-    text = read_file(path)
-    blank = blanked(text)
+    pieces = assembled(path, read_file, lambda text, _: blanked(text))
+    text, blank = pieces.raw, pieces.text
     rotors = len(vehicle.rotors)
     model = read_model(blank, path, rotors)
-    whole = read_model(rendered(text, path), path, rotors)
+    before = assembled(path, read_file, rendered).text
+    whole = read_model(before, path, rotors)
+    simulator = GZ_SIM if whole.is_gz else GAZEBO_CLASSIC
+    flown = simulator.flown(vehicle)
+    unit = gz_unit(flown) if whole.is_gz else 1.0
+    vehicle, asked = with_speeds_in(flown, unit), vehicle
     base = _base(whole, vehicle)
     edits = [*_inertial_edits(model, base), *_motor_edits(model, vehicle)]
     if tags.center_of_mass(vehicle) is not None:
         edits += _pose_edits(model, whole, base)
     edits = [_through_variable(text, blank, edit, path) for edit in edits]
-    edits.append(_provenance_edit(text, model, provenance))
     edits = list(dict.fromkeys(edits))
     _refuse_contradictions(edits, path)
-    patched = spans.apply(text, edits)
+    patched = _patched(pieces, edits, model, provenance)
+
+    def read(file: Path, instead: Mapping[Path, Path] | None = None) -> str:
+        standing = {path: file, **(instead or {})}
+        return assembled(path, lambda p: read_file(standing.get(p, p)), rendered).text
+
+    final = assembled(path, lambda p: patched.get(p) or read_file(p), rendered).text
     wanted = tags.carried_values(vehicle, channels=bool(whole.channels()))
-    written_values = values_in(rendered(patched, path), path, vehicle)
+    written_values = values_in(final, path, vehicle)
     wrong = differences(wanted, written_values)
     if wrong:
         raise ExportError(path, f"would come out with {'; '.join(wrong)}", "nothing was written")
+    geometry = _other_rotors(whole, vehicle, base)
+    there = placed(read_model(final, path, rotors), tags.as_flown(vehicle, written_values))
     return Draft(
-        patched,
-        tags.as_flown(vehicle, written_values),
-        tuple(_notes(whole, vehicle, base)),
-        lambda written: differences(
-            wanted, values_in(rendered(read_file(written), written), written, vehicle)
+        patched.pop(path, pieces.files[path]),
+        with_speeds_in(there, 1.0 / unit),
+        tuple(_notes(whole, asked, vehicle, base, unit)),
+        lambda file, instead=None: differences(
+            wanted, values_in(read(file, instead), path, vehicle)
         ),
+        gates=(Gate("rotors sit and turn there as the vehicle's do", geometry),),
+        others=patched,
     )
+
+
+def simulator_of(path: Path) -> str:
+    """Return the name of the simulator that a model is for.
+
+    Raises
+    ------
+    ExportError
+        It is no model of a multirotor.
+    """
+    text = assembled(path, read_file, rendered).text
+    return (GZ_SIM if read_model(text, path, MOST_ROTORS).is_gz else GAZEBO_CLASSIC).name
+
+
+def _patched(
+    pieces: Whole, edits: Sequence[Edit], model: Model, provenance: str
+) -> dict[Path, str]:
+    """Return each file that changes -> its new text, with a comment where its model begins."""
+    comments = {}
+    for element in (*model.root.all(MERGED), model.root):  # the outermost of a file is the last
+        path = pieces.path_at(element.children[0].start)
+        comments[path] = element
+    by_file, patched = pieces.by_file(edits), {}
+    for path in by_file if len(pieces.files) > 1 else pieces.files:
+        text = pieces.files[path]
+        edit = _provenance_edit(pieces, comments[path], provenance, text)
+        patched[path] = spans.apply(text, [*by_file.get(path, ()), edit])
+    return patched
 
 
 def _base(model: Model, vehicle: VehicleFile) -> Inertial:
@@ -210,19 +265,23 @@ def _through_variable(text: str, blank: str, edit: Edit, path: Path) -> Edit:
     return Edit(assignments[0].start(1), assignments[0].end(1), edit.text)
 
 
-def _provenance_edit(text: str, model: Model, provenance: str) -> Edit:
-    """Return the edit that puts our comment first in the model, in place of an earlier one."""
+def _provenance_edit(pieces: Whole, element: Element, provenance: str, text: str) -> Edit:
+    """Return the edit of a file that puts our comment first in a model, or for an earlier one."""
     comment = f"<!-- {PROVENANCE}: {provenance.replace('--', '- -')} -->"
     earlier = re.search(rf"<!-- {PROVENANCE}: .*?-->", text, re.DOTALL)
     if earlier:
         return Edit(earlier.start(), earlier.end(), comment)
-    first = model.root.children[0]
-    before = text[text.rfind("\n", 0, first.start) + 1 : first.start]
+    whole, first = pieces.raw, element.children[0].start
+    before = whole[whole.rfind("\n", 0, first) + 1 : first]
     indent = "\n" + before if not before.strip() else ""
-    return Edit(model.root.content, model.root.content, indent + comment)
+    place = Edit(element.content, element.content, indent + comment)
+    ((edit,),) = pieces.by_file([place]).values()
+    return edit
 
 
-def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
+def _notes(
+    model: Model, asked: VehicleFile, vehicle: VehicleFile, base: Inertial, unit: float
+) -> Iterator[str]:
     """Yield what was done, and what of the vehicle the format has no place for."""
     name = model.base.attributes.get("name", "")
     others = [(link, body) for link, body in inertials(model) if link is not model.base]
@@ -234,38 +293,61 @@ def _notes(model: Model, vehicle: VehicleFile, base: Inertial) -> Iterator[str]:
         )
     if model.included:
         yield f"the mass of what the model includes is not counted: {', '.join(model.included)}"
-    centre = together([base, *(body for _, body in others)]).pose.position
-    for rotor, expected in _rotor_places(model, vehicle, centre):
-        yield (
-            f"{rotor}, which the vehicle file puts {expected} m from it; the model's geometry is "
-            "left as it is"
-        )
-    motor = vehicle.motor
-    if not model.channels():
+    if model.is_gz:
+        low, high = (rotor_speed(vehicle, command) for command in (0.0, 1.0))
         last = len(vehicle.rotors)
-        low = motor.input_offset * motor.input_scaling + motor.zero_position_armed
         yield (
-            "the model has no control channels (gz-sim has them in PX4's parameters): set "
-            f"SIM_GZ_EC_MIN1..{last} to {low:.0f} and SIM_GZ_EC_MAX1..{last} to "
-            f"{low + motor.input_scaling:.0f}, as the px4 export does"
+            "gz-sim has no control channels, PX4's parameters map commands: set "
+            f"SIM_GZ_EC_MIN1..{last} to {low:.0f} and SIM_GZ_EC_MAX1..{last} to {high:.0f}, as "
+            "--format px4 --simulator gz-sim does"
+        )
+    if unit < 1:
+        yield (
+            f"rotors turn at up to {rotor_speed(vehicle, 1.0) / unit:.0f} rad/s and PX4 lets "
+            f"gz-sim be told of {FASTEST_GZ:.0f} at most: speeds are scaled by {unit:.6g} and "
+            "motorConstant and rotorDragCoefficient to match, which moves nothing otherwise"
         )
     if tags.center_of_mass(vehicle) is not None:
         place = ", ".join(tags.as_text(round(number, 9)) for number in base.pose.position)
         yield f"the inertial of '{name}' moves to ({place}) m for the vehicle's centre of mass"
-    yield from tags.lost_in(vehicle)
+    yield from tags.lost_in(asked)
 
 
-def _rotor_places(model: Model, vehicle: VehicleFile, centre: Array) -> Iterator[tuple[str, str]]:
-    """Yield the rotors whose place from the centre of mass is not the vehicle file's."""
-    links = {link.attributes.get("name"): link for link in model.links}
+def _other_rotors(model: Model, vehicle: VehicleFile, base: Inertial) -> tuple[str, ...]:
+    """Return how the model's rotors are others than the vehicle file's, a clause each."""
+    count = len(read_model(model.text, model.path, MOST_ROTORS).rotor_links())
+    clauses = []
+    if count > len(vehicle.rotors):
+        clauses.append(f"the model has {count} rotors, the vehicle {len(vehicle.rotors)}")
+    others = [body for link, body in inertials(model) if link is not model.base]
+    centre = together([base, *others]).pose.position
     offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
-    for index, rotor in enumerate(vehicle.rotors):
-        link = links.get(f"rotor_{index}")
-        if link is not None:
-            place = model.pose_of_link(link).position - centre
-            expected = np.array(rotor.position) - offset
-            if np.abs(place - expected).max() > PLACE_TOLERANCE:
-                yield (
-                    f"rotor_{index} sits {place.round(4).tolist()} m from the centre of mass",
-                    str(expected.round(4).tolist()),
-                )
+    for index, (link, turns) in sorted(model.rotor_links().items()):
+        rotor = vehicle.rotors[index]
+        place = model.pose_of_link(link).position - centre
+        expected = np.array(rotor.position) - offset
+        if np.abs(place - expected).max() > PLACE_TOLERANCE:
+            clauses.append(
+                f"rotor_{index} sits {place.round(4).tolist()} m from the centre of mass, the "
+                f"vehicle file's {expected.round(4).tolist()} m"
+            )
+        if turns and turns != rotor.spin:
+            clauses.append(f"rotor_{index} turns {turns}, the vehicle file's {rotor.spin}")
+    return tuple(clauses)
+
+
+def placed(model: Model, vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with its rotors where a model has them, and turning as they do there."""
+    centre = together([body for _, body in inertials(model)]).pose.position
+    offset = np.array(tags.center_of_mass(vehicle) or (0.0, 0.0, 0.0))
+    rotors = list(vehicle.rotors)
+    for index, (link, turns) in model.rotor_links().items():
+        place = model.pose_of_link(link).position - centre + offset
+        if np.abs(place - np.array(rotors[index].position)).max() > PLACE_TOLERANCE:
+            rotors[index] = rotors[index].replace(position=tuple(place.tolist()))
+        if turns in ("ccw", "cw"):
+            rotors[index] = rotors[index].replace(spin=turns)
+    try:
+        return vehicle.replace(rotors=tuple(rotors))
+    except ValidationError:  # in another order than the mixer's, which a gate says
+        return vehicle

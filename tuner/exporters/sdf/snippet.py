@@ -10,7 +10,7 @@ from tuner.config import VehicleFile
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.read_back import values_in
-from tuner.exporters.target import Simulator
+from tuner.exporters.simulators import GZ_SIM, Simulator, gz_unit, with_speeds_in
 
 TEMPLATE = Path(__file__).parent / "snippet.sdf.jinja"
 
@@ -32,12 +32,16 @@ def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -
         model = f"<model><link name='base_link'>{text}</link></model>"
         return values_in(model, path, vehicle)
 
-    wanted = tags.carried_values(vehicle, channels=simulator == "gazebo-classic")
+    notes = tags.lost_in(vehicle)
+    vehicle = simulator.flown(vehicle)
+    unit = gz_unit(vehicle) if simulator is GZ_SIM else 1.0
+    vehicle = with_speeds_in(vehicle, unit)
+    wanted = tags.carried_values(vehicle, channels=simulator is not GZ_SIM)
     text = _text(vehicle, simulator, provenance)
     return Draft(
         text,
-        tags.as_flown(vehicle, wanted | held_by(text, TEMPLATE)),
-        tags.lost_in(vehicle),
+        with_speeds_in(tags.as_flown(vehicle, wanted | held_by(text, TEMPLATE)), 1.0 / unit),
+        notes,
         lambda path: differences(wanted, held_by(read_file(path), path)),
     )
 
@@ -60,7 +64,7 @@ def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
     ]
     return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         provenance=provenance.replace("--", "- -"),
-        simulator=simulator,
+        simulator=simulator.name,
         mass=tags.as_text(vehicle.mass),
         ixx=tags.as_text(inertia.xx),
         iyy=tags.as_text(inertia.yy),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from tuner.coefficients import COEFFICIENTS, NotCarried, Written
+from tuner.coefficients import COEFFICIENTS, Written
 from tuner.config import VehicleFile, values_of, with_values
 
 Parent = Literal["inertial", "inertia", "motor", "channel"]
@@ -109,22 +109,14 @@ def as_text(value: float) -> str:
 
 
 def as_flown(vehicle: VehicleFile, read: dict[str, float]) -> VehicleFile:
-    """Return the vehicle that the plugins fly: what a model holds, and what they have built in.
+    """Return a vehicle, as its simulator flies it, with the numbers that a model holds.
 
     Of uneven rotors it holds each one's motor constant, which are the vehicle's own.
     """
-    built_in = {}
-    for name in values_of(vehicle):
-        entry = COEFFICIENTS[name].exported_as.get("sdf")
-        if isinstance(entry, NotCarried) and entry.built_in is not None:
-            built_in[name] = entry.built_in
     limit = read[SPEED_LIMIT_KEY]
     coefficients = {name: value for name, value in read.items() if name in COEFFICIENTS}
-    flown = with_values(vehicle, built_in | coefficients)
-    return flown.replace(
-        motor=flown.motor.replace(max_rotor_velocity=limit),
-        aerodynamics=flown.aerodynamics.replace(reaction_torque="body"),
-    )
+    flown = with_values(vehicle, coefficients)
+    return flown.replace(motor=flown.motor.replace(max_rotor_velocity=limit))
 
 
 def lost_in(vehicle: VehicleFile) -> tuple[str, ...]:

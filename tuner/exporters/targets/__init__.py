@@ -6,5 +6,5 @@ can carry, how it is written and how it is read back.
 
 import pkgutil
 
-NAMES = [module.name for module in pkgutil.iter_modules(__path__)]
+NAMES = [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)]
 """Of the targets; known without importing them."""

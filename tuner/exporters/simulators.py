@@ -1,0 +1,327 @@
+"""What each simulator computes of a vehicle, written down once for each, with source and version.
+
+A simulator is told apart from the physics that is fitted by the coefficients that it flies at a
+value of its own (`Simulator.entry`) and by its laws (`Simulator.laws`). Both together give the
+vehicle that it flies, which the project's own simulation flies for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from statistics import fmean
+
+from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried, Written
+from tuner.coefficients.registry import NO_LOSS
+from tuner.config import VehicleFile, values_of, with_values
+from tuner.exporters.hover import (
+    GRAVITY,
+    full_thrust,
+    hover_command,
+    hover_speed,
+    rotor_speed,
+    thrust_at,
+)
+
+Entry = Written | NotCarried
+Laws = Callable[[VehicleFile], VehicleFile]
+
+_OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator that a vehicle is exported for.
+
+    Attributes
+    ----------
+    name, title
+        As users type it, and as it is called.
+    version, source
+        What was read to know what it computes.
+    deviations
+        What it computes otherwise than the physics that is fitted, a clause each.
+    entry
+        Where its file holds a coefficient, or why it has no place for it and what it flies instead.
+    laws
+        A vehicle -> the one that its laws make of it, where a coefficient does not say it. Applied
+        twice it changes nothing.
+    free
+        Coefficients that stand in for what it lacks, beside those of Gazebo's motor model.
+    ties
+        Groups of coefficients of which it has only one.
+    fixed
+        Coefficients that are one with others there, or that would go to no sensible value.
+    start
+        A vehicle -> where a fit of effective coefficients begins; None begins with what is flown.
+    """
+
+    name: str
+    title: str
+    version: str
+    source: str
+    deviations: tuple[str, ...]
+    entry: Callable[[Coefficient], Entry | None]
+    laws: Laws = lambda vehicle: vehicle
+    free: tuple[str, ...] = ()
+    ties: tuple[tuple[str, ...], ...] = ()
+    fixed: tuple[str, ...] = ()
+    start: Laws | None = None
+
+    def flown(self, vehicle: VehicleFile) -> VehicleFile:
+        """Return the vehicle as the simulator flies it, in a file that this project flies."""
+        vehicle = self.laws(vehicle)
+        effects, built_in = dict(vehicle.effects), {}
+        for name in values_of(vehicle):
+            row = COEFFICIENTS[name]
+            entry = self.entry(row)
+            if isinstance(entry, NotCarried) and entry.built_in is not None:
+                if row.is_effect:
+                    del effects[name]
+                else:
+                    built_in[name] = entry.built_in
+        flown = with_values(vehicle.replace(effects=effects), built_in)
+        return flown.replace(aerodynamics=flown.aerodynamics.replace(reaction_torque="body"))
+
+
+def entries(
+    held: Mapping[str, str], lacks: Mapping[str, NotCarried], *, title: str
+) -> Callable[[Coefficient], Entry]:
+    """Return `Simulator.entry` of what a simulator holds, and of what it lacks for a reason.
+
+    Parameters
+    ----------
+    held
+        Coefficient -> the key of its file.
+    lacks
+        Coefficient -> why, for those of Gazebo's motor model, and those of which there is more to
+        say than that there is no such term.
+    title
+        Of the simulator.
+    """
+
+    def entry(row: Coefficient) -> Entry:
+        if row.name in held:
+            return Written(held[row.name])
+        if row.name in lacks:
+            return lacks[row.name]
+        if row.scope != "vehicle":
+            return _OF_SETUP
+        return NotCarried(f"{title} has no such term", row.neutral)
+
+    return entry
+
+
+# laws
+
+
+def _mean_lag(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotors speed up and slow down with one lag, the mean."""
+    motor = vehicle.motor
+    lag = fmean((motor.time_constant_up, motor.time_constant_down))
+    return vehicle.replace(motor=motor.replace(time_constant_up=lag, time_constant_down=lag))
+
+
+def drag_at_hover(vehicle: VehicleFile) -> tuple[float, float, float]:
+    """Return the vehicle's drag along x, y and z in N s/m at the hover's rotor speed.
+
+    That of the rotors and of the body's linear drag; along z, what thrust changes with the inflow.
+    """
+    count, speed, effects = len(vehicle.rotors), hover_speed(vehicle), vehicle.effects
+    rotors = count * speed * vehicle.aerodynamics.rotor_drag_coefficient
+    body = [effects.get(f"linear_drag_{axis}", 0.0) for axis in "xyz"]
+    inflow = count * speed * effects.get("thrust_inflow_coefficient", 0.0)
+    ratio = effects.get("rotor_drag_ratio_y", 1.0)
+    return rotors + body[0], rotors * ratio + body[1], inflow + body[2]
+
+
+def _dragging(vehicle: VehicleFile, drag: tuple[float, float, float]) -> VehicleFile:
+    """Return a vehicle with a linear drag of the body in the place of its rotors'."""
+    effects = {
+        name: value
+        for name, value in vehicle.effects.items()
+        if name not in ("rotor_drag_ratio_y", "thrust_inflow_coefficient")
+    }
+    effects |= dict(zip((f"linear_drag_{axis}" for axis in "xyz"), drag, strict=True))
+    aerodynamics = vehicle.aerodynamics.replace(rotor_drag_coefficient=0.0)
+    return vehicle.replace(effects=effects, aerodynamics=aerodynamics)
+
+
+def _same_drag(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle with one linear drag in all directions, that along x and y on average."""
+    x, y, _ = drag_at_hover(vehicle)
+    return _dragging(vehicle, (fmean((x, y)),) * 3)
+
+
+def _one_damping(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotation is damped by one coefficient about all axes, if at all."""
+    names = [f"angular_drag_{axis}" for axis in "xyz"]
+    damping = fmean(max(vehicle.effects.get(name, 0.0), 0.0) for name in names)
+    effects = {name: value for name, value in vehicle.effects.items() if name not in names}
+    if damping > 0:
+        effects |= dict.fromkeys(names, damping)
+    return vehicle.replace(effects=effects)
+
+
+def linear_in(vehicle: VehicleFile, *, idle: bool) -> VehicleFile:
+    """Return a vehicle whose lag is one of the thrust, and the thrust linear in what lags.
+
+    Its "rotor speed" is the thrust in units of which the hover's is the hover's rotor speed.
+
+    Parameters
+    ----------
+    idle
+        Whether what is asked for is the thrust that the command's rotor speed gives (a second
+        degree polynomial through no command, the hover and full command); otherwise it is the
+        command's share of the full thrust, and nothing at no command.
+    """
+    aerodynamics, motor = vehicle.aerodynamics, vehicle.motor
+    if aerodynamics.thrust_law == "linear":
+        return vehicle
+    speed, thrust = hover_speed(vehicle), vehicle.mass * GRAVITY / len(vehicle.rotors)
+    unit = speed / thrust
+
+    def asked(command: float) -> float:
+        return unit * aerodynamics.motor_constant * rotor_speed(vehicle, command) ** 2
+
+    low, full, bend = 0.0, unit * full_thrust(vehicle), 0.0
+    hover = hover_command(vehicle)
+    if idle and hover is not None:
+        low = asked(0.0)
+        bend = ((full - low) - (speed - low) / hover) / (1.0 - hover)
+    return vehicle.replace(
+        motor=motor.replace(
+            input_scaling=full - low - bend,
+            zero_position_armed=low,
+            quadratic=bend,
+            input_offset=0.0,
+            max_rotor_velocity=full,
+        ),
+        aerodynamics=aerodynamics.replace(motor_constant=1.0 / unit, thrust_law="linear"),
+    )
+
+
+def linear_at_hover(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose thrust is linear in the command, with the same hover throttle.
+
+    Its thrust changes less with the command than the vehicle's does at the hover, by as much as its
+    moments of inertia are smaller: it turns as the vehicle does.
+    """
+    hover, step = hover_command(vehicle), 1e-4
+    if hover is None or vehicle.aerodynamics.thrust_law == "linear":
+        return linear_in(vehicle, idle=False)
+    slope = [thrust_at(vehicle, rotor_speed(vehicle, hover + sign * step)) for sign in (-1, 1)]
+    thrust = vehicle.mass * GRAVITY / len(vehicle.rotors)
+    ratio = (slope[1] - slope[0]) / (2 * step) / (thrust / hover)
+    linear, inertia = linear_in(vehicle, idle=False), vehicle.inertia
+    full = hover_speed(vehicle) / hover
+    return linear.replace(
+        inertia=inertia.replace(**{axes: value / ratio for axes, value in inertia}),
+        motor=linear.motor.replace(input_scaling=full, max_rotor_velocity=full),
+    )
+
+
+def _sih_laws(vehicle: VehicleFile) -> VehicleFile:
+    return _one_damping(_same_drag(_mean_lag(linear_in(vehicle, idle=False))))
+
+
+FASTEST_GZ = 1000.0
+"""rad/s up to which PX4's bridge to gz-sim takes rotor speeds."""
+
+
+def gz_unit(vehicle: VehicleFile) -> float:
+    """Return how many rad/s of gz-sim one of the vehicle's is.
+
+    One, unless its rotors turn faster than PX4 lets the bridge say. A model with all speeds scaled,
+    and the constants to match, moves in the same way.
+    """
+    return min(1.0, FASTEST_GZ / rotor_speed(vehicle, 1.0))
+
+
+def with_speeds_in(vehicle: VehicleFile, unit: float) -> VehicleFile:
+    """Return the vehicle with every rotor speed in ``unit`` times as many of other units."""
+    motor, aerodynamics = vehicle.motor, vehicle.aerodynamics
+    return vehicle.replace(
+        motor=motor.replace(
+            input_scaling=motor.input_scaling * unit,
+            zero_position_armed=motor.zero_position_armed * unit,
+            quadratic=motor.quadratic * unit,
+            max_rotor_velocity=motor.max_rotor_velocity * unit,
+        ),
+        aerodynamics=aerodynamics.replace(
+            motor_constant=aerodynamics.motor_constant / unit**2,
+            rotor_drag_coefficient=aerodynamics.rotor_drag_coefficient / unit,
+            rolling_moment_coefficient=aerodynamics.rolling_moment_coefficient / unit,
+        ),
+    )
+
+
+def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose commands go by a line between whole rad/s, in gz-sim's unit."""
+    unit = gz_unit(vehicle)
+    low, high = (round(unit * rotor_speed(vehicle, command)) / unit for command in (0.0, 1.0))
+    motor = vehicle.motor.replace(
+        input_scaling=high - low, zero_position_armed=low, input_offset=0.0, quadratic=0.0
+    )
+    fastest = max(motor.max_rotor_velocity, high)
+    return vehicle.replace(motor=motor.replace(max_rotor_velocity=fastest))
+
+
+# simulators
+
+
+def _registered(target: str, other: Mapping[str, NotCarried]) -> Callable[..., Entry | None]:
+    return lambda row: other.get(row.name) or row.exported_as.get(target)
+
+
+GAZEBO_CLASSIC = Simulator(
+    name="gazebo-classic",
+    title="Gazebo",
+    version="PX4-SITL_gazebo-classic 807b67bb",
+    source="src/gazebo_motor_model.cpp, include/gazebo_mavlink_interface.h",
+    deviations=("thrust falls by the length of the axial airspeed over 25 m/s",),
+    entry=_registered("sdf", {}),
+)
+GZ_SIM = Simulator(
+    name="gz-sim",
+    title="gz-sim",
+    version="gz-sim 9 (061b93b1), PX4 1.15 to 1.17",
+    source="src/systems/multicopter_motor_model/MulticopterMotorModel.cc; "
+    "PX4 src/modules/simulation/gz_bridge/module.yaml",
+    deviations=(
+        "thrust does not depend on the airspeed",
+        "rolling moments add up whichever way rotors turn: none is written",
+        "commands are mapped by a line from SIM_GZ_EC_MIN to SIM_GZ_EC_MAX, whole rad/s up to 1000",
+    ),
+    entry=_registered(
+        "sdf",
+        {
+            "max_relative_airspeed": NotCarried(
+                "thrust in gz-sim does not depend on the airspeed", NO_LOSS
+            ),
+            "rolling_moment_coefficient": NotCarried(
+                "gz-sim adds rolling moments up whichever way rotors turn, so that 0 is written",
+                0.0,
+            ),
+        },
+    ),
+    laws=_between_whole_speeds,
+)
+SIH = Simulator(
+    name="sih",
+    title="PX4's SIH",
+    version="PX4 1.16 (039af95d)",
+    source="src/modules/simulation/simulator_sih/sih.cpp",
+    deviations=(
+        "thrust is linear in the command, and zero without one",
+        "the command lags, by one time constant",
+        "one drag in all directions, linear in the velocity and at the centre of mass",
+        "one damping of rotation about all axes",
+    ),
+    entry=_registered("px4", {}),
+    laws=_sih_laws,
+    free=("linear_drag_x", "linear_drag_y", "linear_drag_z"),
+    ties=(("linear_drag_x", "linear_drag_y", "linear_drag_z"),),
+    fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
+    start=linear_at_hover,
+)
