@@ -18,6 +18,9 @@ from tuner.errors import ExportError
 from tuner.exporters import refly as refly_module
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
+from tuner.exporters.simulators import GZ_SIM
+from tuner.job import effective_of_run
+from tuner.job.effective_of_run import kept_effective
 from tuner.recordings import Recording
 from tuner.result import (
     CoefficientResult,
@@ -154,3 +157,25 @@ def test_the_command_refuses_in_one_line(run, capsys):
     accepted = ["export", str(run.folder), "--format", "yaml", "--accept", "to look at"]
     assert main(accepted) == 0
     assert "NO   every trajectory" in capsys.readouterr().out
+
+
+def test_a_simulator_gets_coefficients_of_its_own_and_flies_as_it_computes(run, monkeypatch):
+    flight = run.result.flights[0].model_copy(update={"split": "fit"})
+    result = run.result.model_copy(update={"flights": (flight,)})
+    run = run.model_copy(update={"result": result})
+    today = date(2024, 5, 6)
+    with pytest.raises(ExportError, match="small_circle"):  # physical ones fly otherwise there
+        export(run, "gz-sim", refly=refly, today=today)
+    done = export(run, "gz-sim", refly=refly, refit=kept_effective, today=today)
+    assert all(gate.passed for gate in done.gates)
+    vehicle, effective = kept_effective(run, GZ_SIM)
+    assert effective.rmse_effective.position < effective.rmse_unfitted.position
+    assert {term.group for term in effective.lost} >= {"max_relative_airspeed"}
+    assert vehicle == GZ_SIM.flown(vehicle)
+    assert "effective coefficients, not physical ones: gz-sim lacks" in done.path.read_text()
+
+    def fail(*_):
+        raise AssertionError("it is kept")
+
+    monkeypatch.setattr(effective_of_run, "effective_in", fail)
+    assert kept_effective(run, GZ_SIM) == (vehicle, effective)
