@@ -141,6 +141,8 @@ class Client:
         request |= {"name": name, "force": force, "cross_validate": cross_validate}
         request["bootstrap"] = bootstrap
         request["recordings"] = [self.upload(path, on_upload) for path in recordings]
+        names = (path.name for path in recordings)
+        request["names"] = dict(zip(request["recordings"], names, strict=True))
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
         return str(self._connection.post("/jobs", request, headers)["id"])
 
@@ -152,7 +154,7 @@ class Client:
             )
         sha256 = digest(path)
         known = self._connection.find(f"/recordings/{sha256}")
-        if known is not None and known["name"] == path.name:
+        if known is not None:
             return sha256
         on_upload(path)
         return str(self._connection.upload(path)["id"])

@@ -86,9 +86,15 @@ def _open_micro_sd(path: Path, _: tuple[Path, ...]) -> Recording:
     return MicroSdRecording(path)
 
 
+NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
+"""Suffixes of recordings that no text has."""
+
+
 def _is_table(head: Head) -> bool:
-    """Return whether a file is Parquet, or a text with cells."""
-    return head.start.startswith(b"PAR1") or is_table(head.start)
+    """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
+    if head.start.startswith(b"PAR1"):
+        return True
+    return head.path.suffix.lower() not in NO_TEXTS and is_table(head.start)
 
 
 def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:
@@ -150,4 +156,6 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
         raise RecordingError(path, "is packed", "unpack it first")
     known = "; ".join(reader.files for reader in READERS)
     what = "is of no known format" if start else "is empty"
+    if path.suffix.lower() in NO_TEXTS and is_table(start):
+        what = f"is a text, and no {path.suffix}"
     raise RecordingError(path, what, f"known formats are {known}")

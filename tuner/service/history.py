@@ -20,7 +20,7 @@ def history(database: Database, vehicle: str) -> History:
     """Return every fitted coefficient over the jobs of a vehicle that are done.
 
     They stand in the order in which their recordings were flown, as far as that is known, and else
-    in which they were submitted. What goes with the mass is that at the last job's mass, for flights
+    in which they were submitted. What goes with the mass is that at the last job's mass: flights
     show only its ratio to the mass.
 
     Raises

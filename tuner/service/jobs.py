@@ -66,7 +66,7 @@ def submit(
         earlier = _earlier_vehicle(session, request)
     if unfinished is not None and unfinished >= limits.unfinished_jobs:
         raise TooManyError("the service", f"has {unfinished} unfinished jobs", "try again later")
-    flights = [recording_name(recording.name) for recording in recordings]
+    flights = [recording_name(request.names.get(r.sha256) or r.name) for r in recordings]
     asked, vehicle, holdout = checked(request, flights, earlier)
     flown = [t for r in recordings if (t := _seconds(r.inspection.get("started"))) is not None]
     row = JobRow(

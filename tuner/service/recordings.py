@@ -77,17 +77,18 @@ def _inspected(upload: Upload, settings: ServiceSettings) -> dict[str, Any]:
 
 
 def _enter(database: Database, upload: Upload, inspection: dict[str, Any]) -> RecordingRow:
-    """Enter a recording, or its new name."""
+    """Enter a recording, and return its row under the upload's name, which the first one keeps."""
     for last in (False, True):
         try:
             with database.writing() as session:
                 row = session.get(RecordingRow, upload.sha256)
                 if row is None:
-                    row = RecordingRow(sha256=upload.sha256, size=upload.size)
+                    row = RecordingRow(sha256=upload.sha256, size=upload.size, name=upload.name)
+                    row.inspection = inspection | {"path": upload.name}
                     session.add(row)
-                row.name, row.uploaded = upload.name, time.time()
-                row.inspection = inspection | {"path": upload.name}
-                return row
+                row.uploaded = time.time()
+            row.name, row.inspection = upload.name, row.inspection | {"path": upload.name}
+            return row
         except IntegrityError:  # entered by another upload of the same recording
             if last:
                 raise

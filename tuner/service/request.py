@@ -51,6 +51,8 @@ class JobRequest(Section):
     ----------
     recordings
         Ids of uploaded recordings.
+    names
+        What this job calls some of them, by id: file names. Else as they were first uploaded.
     holdout
         Names of flights that are evaluated, never fitted; None takes those of the settings.
     vehicle, controller
@@ -71,6 +73,7 @@ class JobRequest(Section):
     )
 
     recordings: Annotated[tuple[Digest, ...], Len(min_length=1, max_length=1000)]
+    names: dict[Digest, Annotated[str, Len(max_length=1000)]] = Field(default_factory=dict)
     holdout: tuple[Word, ...] | None = None
     vehicle: Named | None = None
     controller: Named | None = None

@@ -45,7 +45,7 @@ class Base(DeclarativeBase):
 class RecordingRow(Base):
     """A stored recording, once however often it is uploaded.
 
-    ``sha256`` is its address in the store; ``name`` is what the last upload called it.
+    ``sha256`` is its address in the store; ``name`` is what the first upload called it.
     """
 
     __tablename__ = "recordings"

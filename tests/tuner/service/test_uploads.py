@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import re
 import socket
 import sys
 import threading
@@ -11,7 +12,7 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, upload
+from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
 from tuner.errors import RecordingError
 from tuner.service import incoming, inspecting, recordings
 from tuner.service.service import Service
@@ -43,8 +44,53 @@ def test_an_upload_is_answered_with_what_inspect_says(client, service):
     stored = [path for path in (service.settings.data / "store").rglob("*") if path.is_file()]
     assert len(stored) == 1
     assert stored[0].read_bytes() == content
-    assert client.get(f"/api/v1/recordings/{found['id']}").json()["name"] == "same.bag"
+    assert again.json()["name"] == again.json()["inspection"]["path"] == "same.bag"
+    kept = client.get(f"/api/v1/recordings/{found['id']}").json()
+    assert kept["name"] == kept["inspection"]["path"] == "yaw_spin_3rps.bag"  # as others know it
     assert left(service) == []
+
+
+def test_a_job_calls_a_recording_as_whoever_submits_it_does(client, table):
+    recording = upload(client, table.read_bytes(), "first.csv")
+    assert upload(client, table.read_bytes(), "../second one.csv") == recording
+    assert "first.csv" in client.get("/").text
+    names = {recording: "../second one.csv"}
+    other = submit(client, upload(client, b"x\n0\n", "b.csv"))
+    job = submit(client, recording, names=names)
+    flights = client.get(f"/api/v1/jobs/{job}").json()["flights"]
+    assert flights[0]["name"].startswith("second_one-")
+    assert client.get(f"/api/v1/jobs/{other}").json()["flights"][0]["name"] == "b.csv"
+
+
+@pytest.mark.usefixtures("real_inspection")
+def test_the_page_shows_what_a_truncated_bag_has_lost_and_no_text_is_a_bag(client):
+    content, script = BAG.read_bytes(), {"x-requested-with": "script"}
+    sent = {"file": ("cut.bag", content[: 2 * len(content) // 3])}
+    card = client.post("/recordings", files=sent, headers=script)
+    assert 'class="problem">Broken: the end of the file is missing; ' in card.text
+    assert 'value="fit" checked' in card.text
+    text = {"file": ("notes.bag", b"a, b\n1, 2\n")}
+    answer = client.post("/recordings", files=text, headers=script)
+    assert answer.status_code == 422
+    assert "notes.bag: is a text, and no .bag; known formats are" in answer.text
+    odd = client.post("/recordings", files={"file": ("a.csv", text["file"][1])}, headers=script)
+    assert 'value="leave out" checked' in odd.text  # no flight can be read from it
+
+
+def test_what_a_tune_yaml_holds_out_is_shown_before_the_job_starts(client, table):
+    ids = [upload(client, table.read_bytes(), "a.csv"), upload(client, b"x\n0\n", "b.csv")]
+    form = {f"use-{one}": "fit" for one in ids} | {"settings": "holdout: [b]", "key": "k"}
+    shown = client.post("/jobs", data=form)
+    assert shown.status_code == 422
+    assert "settings: hold out b; see what checks the fit below, and start again" in shown.text
+    assert re.findall(r'name="use-(\w+)" value="holdout" checked', shown.text) == [ids[1]]
+    assert 'name="holdout" value="b"' in shown.text
+    seen = form | {"holdout": "b", f"use-{ids[0]}": "holdout"}
+    started = client.post("/jobs", data=seen)
+    assert started.status_code == 303
+    job = started.headers["location"].rpartition("/")[2]
+    flights = client.get(f"/api/v1/jobs/{job}").json()["flights"]
+    assert [flight["holdout"] for flight in flights] == [True, False]
 
 
 @pytest.mark.usefixtures("real_inspection")

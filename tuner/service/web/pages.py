@@ -67,7 +67,7 @@ def start(
 ) -> Response:
     """Show where recordings are dropped and a job begins."""
     chosen = [recordings.recording(service.database, digest) for digest in dict.fromkeys(r or ())]
-    return _start(service, [(row, "fit") for row in chosen])
+    return _start(service, [(row, "") for row in chosen])
 
 
 def _start(
@@ -81,7 +81,7 @@ def _start(
     """Return the start page, with what was filled in before."""
     ids = {row.sha256 for row, _ in chosen}
     given = given or {}
-    blank = dict.fromkeys(("name", "vehicle", "mass", "settings"), "")
+    blank = dict.fromkeys(("name", "vehicle", "mass", "settings", "holdout"), "")
     shipped = [file.stem for file in (configs_folder() / "vehicles").glob("*.yaml")]
     names = sorted({*shipped, *vehicles(service.database)})
     latest = [row for row in recordings.latest(service.database, LATEST) if row.sha256 not in ids]
@@ -113,7 +113,7 @@ async def add_recording(request: Request) -> Response:
             lambda: _start(service_of(request), [], problem=sentence, status=status)
         )
     if is_script:
-        return render("card.html.jinja", row=row, use="fit")
+        return render("card.html.jinja", row=row, use="")
     return RedirectResponse(f"/?r={row.sha256}", status_code=303)
 
 
@@ -121,7 +121,7 @@ async def add_recording(request: Request) -> Response:
 def show_card(service: Served, recording: str) -> Response:
     """Return what a stored recording holds, and how to use it."""
     row = recordings.recording(service.database, recording)
-    return render("card.html.jinja", row=row, use="fit")
+    return render("card.html.jinja", row=row, use="")
 
 
 @web.post("/jobs")
@@ -140,11 +140,19 @@ def _submit(service: Service, form: FormData) -> Response:
         if key.startswith("use-") and use in USES
     }
     chosen = [(recordings.recording(service.database, d), use) for d, use in uses.items()]
+    for recording, _ in chosen:
+        recording.name = text.get(f"name-{recording.sha256}") or recording.name
     used = [(row, use) for row, use in chosen if use != "leave out"]
     try:
+        settings = typed_settings(text.get("settings", ""))
+        if (held := _held(settings)) and " ".join(held) != text.get("holdout", ""):
+            chosen = [(r, "holdout" if _flight(r) in held else use) for r, use in chosen]
+            text["holdout"] = " ".join(held)
+            what = f"hold out {', '.join(held)}"
+            raise InputError("settings", what, "see what checks the fit below, and start again")
         row, _ = jobs.submit(
             service.database,
-            _request(text, used),
+            _request(text, settings, used),
             service.settings.limits,
             submission=text.get("key") or None,
         )
@@ -155,18 +163,33 @@ def _submit(service: Service, form: FormData) -> Response:
     return RedirectResponse(f"/jobs/{row.id}", status_code=303)
 
 
-def _request(text: Mapping[str, str], used: Sequence[tuple[RecordingRow, str]]) -> JobRequest:
+def _held(settings: Mapping[str, Any]) -> list[str]:
+    """Return the flights that some settings hold out."""
+    held = settings.get("holdout")
+    return [str(name) for name in held] if isinstance(held, list) else []
+
+
+def _flight(row: RecordingRow) -> str:
+    return recordings.flight_name(row.name)
+
+
+def _request(
+    text: Mapping[str, str],
+    settings: dict[str, Any],
+    used: Sequence[tuple[RecordingRow, str]],
+) -> JobRequest:
     """Return the request that a form makes."""
     if not used:
         raise InputError("recordings", "are none", "drop some, or choose one to fit")
     values: dict[str, Any] = {
         "recordings": [row.sha256 for row, _ in used],
-        "settings": typed_settings(text.get("settings", "")),
+        "names": {row.sha256: row.name for row, _ in used},
+        "settings": settings,
         "name": text.get("name", "").strip(),
     }
-    held = [row.name for row, use in used if use == "holdout"]
-    if held:
-        values["holdout"] = [recordings.flight_name(name) for name in held]
+    held = [_flight(row) for row, use in used if use == "holdout"]
+    if held or _held(settings):  # which the page has shown
+        values["holdout"] = held
     if vehicle := text.get("vehicle", "").strip():
         values["vehicle"] = vehicle
     if mass := text.get("mass", "").strip():

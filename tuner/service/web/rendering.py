@@ -9,11 +9,12 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
+from tuner.flights.damage import Cause, Damage
 from tuner.flights.notes import Note
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
 from tuner.service.tables import State
-from tuner.wording.notes import note_in_words
+from tuner.wording.notes import damage_sentence, note_in_words
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
 STATES: Mapping[str, tuple[str, str]] = {
@@ -45,6 +46,7 @@ def environment() -> Environment:
         "moment": lambda value: "" if value is None else iso(value),
         "lasting": _lasting,
         "note": lambda raw: note_in_words(Note.read(raw)),
+        "damage": lambda raw: damage_sentence(Damage(**raw | {"cause": Cause(raw["cause"])})),
     }
     made.filters |= filters
     made.globals |= {"states": STATES, "visitor": VISITOR.get}
