@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -65,10 +67,15 @@ class _Carry:
         self,
         lower: Lowering,
         values: Sequence[Value],
-        lanes: Sequence[bool],
-        columns: Sequence[bool],
+        kinds: Sequence[tuple[bool, bool]],
+        read: Sequence[Value] = (),
     ) -> None:
-        self.lower, self.kinds = lower, list(zip(lanes, columns, strict=True))
+        """Lay values out, each of every lane or not and with columns or not.
+
+        What the loop also reads as it was before, ``read``, is carried as a copy.
+        """
+        self.lower, self.kinds = lower, list(kinds)
+        self._taken = {id(v.storage.pointer) for v in read if isinstance(v, Memory)}
         self.values = [
             self._laid(value, lane=lane, column=column)
             for value, (lane, column) in zip(values, self.kinds, strict=True)
@@ -79,12 +86,12 @@ class _Carry:
         lower = self.lower
         if isinstance(value, Memory) and value.storage.writable:
             same = _is_lanes(value) or not lane, _is_tangent(value) or not column
-            if all(same):
+            if all(same) and id(value.storage.pointer) not in self._taken:
+                self._taken.add(id(value.storage.pointer))
                 return value
-        given = lower.elements(value)
-        if given.size > SPILLED:
-            return lower.spilled(given, lane=lane, column=column)
-        return self._promoted(given, lane=lane, column=column)
+        if prod(value.shape) > SPILLED:
+            return lower.spilled(value, lane=lane, column=column)
+        return self._promoted(value, lane=lane, column=column)
 
     def _promoted(self, given: Value, *, lane: bool, column: bool) -> Value:
         elements = self.lower.elements(given)
@@ -115,10 +122,9 @@ class _Carry:
         for value, out, (lane, column) in zip(self.values, outs, self.kinds, strict=True):
             if isinstance(value, Memory):
                 if not isinstance(out, Memory) or out.storage is not value.storage:
-                    raise UnsupportedError(
-                        "a loop that carries an array and does not keep it in place"
-                    )
-                following.append(out)
+                    self.lower.store_rows(value, None, self.lower.elements(out))
+                    value.storage.version += 1
+                following.append(value)
             else:
                 following.append(self._promoted(out, lane=lane, column=column))
         return following
@@ -143,9 +149,13 @@ def _row(lower: Lowering, value: Value, number: ir.Value) -> Value:
 
 
 def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
-    """Return what a loop reads, in memory where it is long or read row by row."""
+    """Return what a loop reads, in memory where it is long or read row by row; for reading only."""
     if isinstance(value, np.ndarray) and value.size and (value.size > SPILLED or indexed):
-        return lower.spilled(value)
+        value = lower.spilled(value)
+    if isinstance(value, Memory) and value.storage.writable:
+        if value.version != value.storage.version:
+            raise UnsupportedError("an array that is read after it was changed in place")
+        return Memory(replace(value.storage, writable=False), value.shape, value.version)
     return value
 
 
@@ -181,7 +191,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     start = operands[consts : consts + carried]
     if once:
         return [*turn(constant(I64, 0), start), *into]
-    carry = _Carry(lower, start, lanes[:carried], columns[:carried])
+    kinds = list(zip(lanes[:carried], columns[:carried], strict=True))
+    carry = _Carry(lower, start, kinds, [*fixed, *rows])
     end = _counted(lower, lower.size(length), carry, turn)
     return [*end, *into]
 
@@ -221,7 +232,8 @@ def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> l
     of_cond, of_body = operands[:conds], operands[conds : conds + consts]
     lanes = dependent_in_while(p, [_is_lanes(v) for v in operands])
     columns = dependent_in_while(p, [_is_tangent(v) for v in operands])
-    carry = _Carry(lower, operands[conds + consts :], lanes, columns)
+    kinds = list(zip(lanes, columns, strict=True))
+    carry = _Carry(lower, operands[conds + consts :], kinds, operands[: conds + consts])
     before, head = b.block, b.function.append_basic_block("while")
     body, after = (b.function.append_basic_block(name) for name in ("turn", "after"))
     b.branch(head)
@@ -297,30 +309,46 @@ def _branched(
     blocks = [b.function.append_basic_block(name) for name in ("yes", "no", "end")]
     b.cbranch(flag, *blocks[:2])
     before = [storage.version for storage in lower.storages]
-    ends: list[tuple[list[Value], ir.Block, list[int]]] = []
+    ends: list[_End] = []
     for block, compute in zip(blocks[:2], (yes, no), strict=True):
         for storage, version in zip(lower.storages, before, strict=False):
             storage.version = version
         b.position_at_end(block)
         found = compute()
-        ends.append((found, b.block, [storage.version for storage in lower.storages]))
+        ends.append(_End(found, b.block, [storage.version for storage in lower.storages]))
+    stays = [
+        isinstance(x, Memory) and isinstance(y, Memory) and x.storage is y.storage
+        for x, y in zip(ends[0].values, ends[1].values, strict=True)
+    ]
+    for end in ends:
+        b.position_at_end(end.block)
+        for storage, version in zip(lower.storages, end.versions, strict=False):
+            storage.version = version
+        for number, (value, stay) in enumerate(zip(end.values, stays, strict=True)):
+            if not stay:
+                end.values[number] = lower.elements(value)
         b.branch(blocks[2])
-    for storage, *versions in zip(lower.storages, ends[0][2], ends[1][2], strict=False):
+    for storage, *versions in zip(lower.storages, ends[0].versions, ends[1].versions, strict=False):
         storage.version = max(versions)
     b.position_at_end(blocks[2])
     return [
-        _merged(lower, first, second, ends[0][1], ends[1][1])
-        for first, second in zip(ends[0][0], ends[1][0], strict=True)
+        _merged(lower, first, second, ends)
+        for first, second in zip(ends[0].values, ends[1].values, strict=True)
     ]
 
 
-def _merged(
-    lower: Lowering, first: Value, second: Value, after_first: ir.Block, after_second: ir.Block
-) -> Value:
+@dataclass
+class _End:
+    """What a branch comes to, the block in which it ends, and how often memory was written to."""
+
+    values: list[Value]
+    block: ir.Block
+    versions: list[int]
+
+
+def _merged(lower: Lowering, first: Value, second: Value, ends: Sequence[_End]) -> Value:
     """Return the value of one branch or the other, where both have ended."""
-    if isinstance(first, Memory) and isinstance(second, Memory):
-        if first.storage is not second.storage:
-            raise UnsupportedError("a condition that chooses between arrays in memory")
+    if isinstance(first, Memory):
         return Memory(first.storage, first.shape, first.storage.version)
     nodes = []
     for x, y in zip(_parts(first), _parts(second), strict=True):
@@ -328,8 +356,8 @@ def _merged(
             nodes.append(x)
             continue
         node = lower.b.phi(x.type)
-        node.add_incoming(x, after_first)
-        node.add_incoming(y, after_second)
+        for value, end in zip((x, y), ends, strict=True):
+            node.add_incoming(value, end.block)
         nodes.append(node)
     return _rebuilt(first, nodes)
 
@@ -368,7 +396,7 @@ def _is_number(lower: Lowering, which: ir.Value, number: int, count: int) -> ir.
 
 
 def _uniform(lower: Lowering, value: Value, *, lane: bool, column: bool) -> Value:
-    if isinstance(value, Memory):
+    if isinstance(value, Memory) and value.storage.writable:
         return value
     elements = lower.elements(value)
     return array_of(

@@ -167,8 +167,17 @@ class Lowering:
         if self._is_long(shape):
             arrays = [self.elements(o)[()] if not o.shape else o for o in operands]
 
+            def read(array: Any, index: Index) -> Element:
+                if not hasattr(array, "shape"):
+                    return array
+                zero = constant(I64, 0)
+                own = [
+                    zero if length == 1 else i for i, length in zip(index, array.shape, strict=True)
+                ]
+                return self.at(array, own)
+
             def at(index: Index) -> Element:
-                return of(*(self.at(a, index) if hasattr(a, "shape") else a for a in arrays))
+                return of(*(read(array, index) for array in arrays))
 
             return Deferred(tuple(shape), at, tuple(operands))
         given = [self.elements(o) for o in operands]
@@ -370,25 +379,41 @@ class Lowering:
 
     def store_rows(self, memory: Memory, number: ir.Value | None, rows: Value) -> None:
         """Write an array, or one row of it, if the memory's guard says so."""
-        storage, given = memory.storage, self.elements(rows)
-        guard = storage.guard
+        storage, first = memory.storage, constant(I64, 0)
+        guard, own = storage.guard, storage.strides if number is None else storage.strides[1:]
+        if storage.scattered and number is not None:
+            first = self._product(number, storage.strides[0])
         with nullcontext() if guard is None else self.b.if_then(guard):
+            if storage.scattered and not isinstance(rows, np.ndarray) and self._is_long(rows.shape):
+
+                def row(index: Index) -> None:
+                    part = array_of(
+                        [
+                            self.at(rows, [*index, *(constant(I64, i) for i in place)])
+                            for place in np.ndindex(rows.shape[1:])
+                        ],
+                        rows.shape[1:],
+                    )
+                    self._scatter(storage, self._sum(first, self._product(index[0], own[0])), part)
+
+                self.for_each(rows.shape[:1], row)
+                return
+            given = self.elements(rows)
             if storage.scattered:
-                self._scatter(storage, number, given)
+                self._scatter(storage, first, given)
                 return
             for place in np.ndindex(given.shape):
                 index = [constant(I64, i) for i in place]
                 self.store(memory, index if number is None else [number, *index], given[place])
 
-    def _scatter(self, storage: Storage, number: ir.Value | None, given: Elements) -> None:
-        """Write a row of an output, whose numbers lie side by side in each lane's own part."""
+    def _scatter(self, storage: Storage, first: ir.Value, given: Elements) -> None:
+        """Write numbers of an output that lie side by side, from ``first``, in each lane's part."""
         parts: list[ir.Value] = []
         for element in given.ravel():
             if storage.column_stride is None and isinstance(element, tuple):
                 raise UnsupportedError("a tangent where none is expected")
             count = 1 if storage.column_stride is None else self.columns
             parts += element if isinstance(element, tuple) else (element,) * count
-        first = constant(I64, 0) if number is None else self._product(number, storage.strides[0])
         stored, width = storage.pointer.type.pointee, self.e.width
         if storage.kind == BOOL:
             parts = [self.b.zext(p, self.e.vector(stored)) for p in map(self.e.splat, parts)]
@@ -444,14 +469,57 @@ class Lowering:
         return Memory(storage, shape)
 
     def spilled(self, value: Value, *, lane: bool = False, column: bool = False) -> Memory:
-        """Return an array as memory of this lowering's own."""
-        given = self.elements(value)
+        """Return an array as memory of this lowering's own, a copy of what lies elsewhere."""
+        if not isinstance(value, np.ndarray):
+            return self._copied(value, lane=lane, column=column)
+        given = value
         flat = [x for e in given.ravel() for x in (e if isinstance(e, tuple) else (e,))]
         lane = lane or any(map(is_vector, flat))
         column = column or any(isinstance(e, tuple) for e in given.ravel())
         memory = self.local(given.shape, base(flat[0].type), lane=lane, column=column)
         self.store_rows(memory, None, given)
         return memory
+
+    def _copied(self, value: Memory | Deferred, *, lane: bool, column: bool) -> Memory:
+        """Return memory that a loop fills with an array's elements."""
+        copies: list[Memory] = []
+
+        def copy(index: Index) -> None:
+            element = self.at(value, index)
+            parts = element if isinstance(element, tuple) else (element,)
+            if not copies:
+                copies.append(
+                    self.local(
+                        value.shape,
+                        base(parts[0].type),
+                        lane=lane or any(map(is_vector, parts)),
+                        column=column or isinstance(element, tuple),
+                    )
+                )
+            self.store(copies[0], index, element)
+
+        self.for_each(value.shape, copy)
+        return copies[0]
+
+    def for_each(self, shape: Sequence[int], body: Callable[[Index], None]) -> None:
+        """Write a loop over all indices of an array."""
+        b = self.b
+        before = b.block
+        inside, after = (b.function.append_basic_block(name) for name in ("each", "after"))
+        b.branch(inside)
+        b.position_at_end(inside)
+        number = b.phi(I64)
+        number.add_incoming(constant(I64, 0), before)
+        index: list[ir.Value] = []
+        rest = number
+        for length in reversed(shape):
+            index.insert(0, b.urem(rest, constant(I64, length)))
+            rest = b.udiv(rest, constant(I64, length))
+        body(index)
+        following = b.add(number, constant(I64, 1))
+        number.add_incoming(following, b.block)
+        b.cbranch(b.icmp_signed("<", following, constant(I64, prod(shape))), inside, after)
+        b.position_at_end(after)
 
     def start_within(self, start: ir.Value, length: int, size: int) -> ir.Value:
         """Return where a slice begins, moved so that it lies in its array."""
@@ -664,7 +732,7 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
             column=any(isinstance(e, tuple) for e in update.ravel()),
         )
     if not isinstance(value, Memory) or not value.storage.writable:
-        raise UnsupportedError("a change in place of what belongs to the caller")
+        value = lower.spilled(value)
     if any(map(is_vector, starts)):
         raise UnsupportedError("a change in place at an index of each lane's own")
     if value.version != value.storage.version:

@@ -36,6 +36,10 @@ TASKS_A_CORE = 4
 """Pieces of work a core: their sizes differ."""
 WASTE = 0.15
 """Share of lanes left empty from which blocks take several passes of columns."""
+REPEATED = 2**27
+"""bytes of arguments up to which they are laid out once for every pass."""
+ONE_BY_ONE = 64
+"""Lanes up to which they are copied one after the other."""
 FEW = 512
 """Blocks without a loop that are computed sooner than another thread begins."""
 
@@ -269,16 +273,20 @@ class _Compiled:
         # Each lane takes one pass of columns over what is its own: few segments fill a block with
         # several passes, many have a block for themselves and another one for each pass.
         own_lanes = -(-lanes // width) * width
-        if passes > 1 and own_lanes - lanes > WASTE * lanes:
+        tables = sum(
+            leaf.nbytes for leaf, a in zip(leaves, program.arguments, strict=True) if a.lanes
+        )
+        if passes > 1 and own_lanes - lanes > WASTE * lanes and tables * passes <= REPEATED:
             own_lanes = lanes
         total = own_lanes * passes
         blocks = -(-total // width)
         place = np.minimum(np.arange(blocks * width), total - 1)
-        segment, turn = place % own_lanes, place // own_lanes
+        # lanes that fill a block up compute, and write, the last one's again
+        segment, turn = np.minimum(place % own_lanes, lanes - 1), place // own_lanes
         own_blocks = blocks if own_lanes % width else own_lanes // width
-        taken = np.minimum(segment[: own_blocks * width], lanes - 1)
+        taken = segment[: own_blocks * width]
         given = [
-            np.ascontiguousarray(leaf[..., taken] if a.lanes else leaf)
+            _side_by_side(leaf, taken, lanes) if a.lanes else np.ascontiguousarray(leaf)
             for leaf, a in zip(leaves, program.arguments, strict=True)
         ]
         for number, t in zip(program.moving, tangents, strict=True):
@@ -293,7 +301,7 @@ class _Compiled:
             if moved:
                 axis = 1 if is_laid_by_loop(shape, self.lengths) else 0
                 own = (*own[:axis], passes, *own[axis:], at_once)
-            found.append(np.empty((own_lanes, *own), shape.dtype))
+            found.append(np.empty((lanes, *own), shape.dtype))
         ins, outs = _addresses(given), _addresses(found)
         values = (ctypes.c_int64 * max(len(self.lengths), 1))(
             *[lengths[name] for name in self.lengths]
@@ -320,10 +328,9 @@ class _Compiled:
             work(tasks[0])
         else:
             list(_threads().map(work, tasks))
-        cut = [array[:lanes] for array in found]
         if not program.moving:
-            return Run(jax.tree.unflatten(self.structure, cut), None)
-        half = len(cut) // 2
+            return Run(jax.tree.unflatten(self.structure, found), None)
+        half = len(found) // 2
         structure = self.structure.children()[0]
         by_column = [
             None
@@ -332,12 +339,24 @@ class _Compiled:
             if is_laid_by_loop(shape, self.lengths)
             else joined(array, columns)
             for array, moved, shape in zip(
-                cut[half:], self.moved[half:], self.outputs[half:], strict=True
+                found[half:], self.moved[half:], self.outputs[half:], strict=True
             )
         ]
         return Run(
-            jax.tree.unflatten(structure, cut[:half]), jax.tree.unflatten(structure, by_column)
+            jax.tree.unflatten(structure, found[:half]), jax.tree.unflatten(structure, by_column)
         )
+
+
+def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> NDArray[Any]:
+    """Return an array whose last axis holds the lanes of all blocks."""
+    if len(taken) == lanes:
+        return np.ascontiguousarray(leaf)
+    if lanes > ONE_BY_ONE or leaf.ndim == 1:
+        return np.ascontiguousarray(leaf[..., taken])
+    laid = np.empty((*leaf.shape[:-1], len(taken)), leaf.dtype)
+    for place, lane in enumerate(taken.tolist()):
+        laid[..., place] = leaf[..., lane]
+    return laid
 
 
 def _is_real(dtype: Any) -> bool:

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import Array, lax
 from jaxtyping import Float
 
 from sim_jax.crash import AIRBORNE
@@ -22,7 +22,7 @@ from sim_jax.rollout import begun
 from sim_jax.rotation import Quaternion
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import State
-from sim_jax.trees import replaced
+from sim_jax.trees import replaced, row_of
 from sim_jax.vector import Vec3
 from tuner.filter_error.disturbances import (
     Processes,
@@ -30,6 +30,7 @@ from tuner.filter_error.disturbances import (
     processes_of,
 )
 from tuner.filter_error.recorded import Sampled
+from tuner.model import Model
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.flight import beginning_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
@@ -96,10 +97,14 @@ class Observer(eqx.Module):
     rate: float = eqx.field(static=True)
 
     @staticmethod
-    def of(simulator: Simulator, feed: Feed, expected: Expected) -> tuple[Observer, State]:
-        """Return the observer, and the state in which the segments begin."""
-        model, schedule = expected.tunable.at(expected.coefficients), simulator.schedule
-        units = units_of(simulator.conditions)
+    def of(
+        simulator: Simulator, feed: Feed, model: Model, strengths: Float[Array, "7 *F"]
+    ) -> tuple[Observer, State]:
+        """Return the observer of a model, and the state in which the segments begin.
+
+        ``strengths`` of the disturbances, each segment's own.
+        """
+        schedule, units = simulator.schedule, units_of(simulator.conditions)
         conditions = {
             name: feed.offsets[len(OFFSETS) + row] * units[row]
             for row, name in enumerate(simulator.conditions)
@@ -117,7 +122,7 @@ class Observer(eqx.Module):
             limits=AIRBORNE,  # a height that no sample corrects drifts, and ends no flight
         )
         rate = float(schedule.log_rate)
-        processes = processes_of(model.vehicle, expected.strengths, rate)
+        processes = processes_of(model.vehicle, strengths, rate)
         late = feed.offsets[: len(OFFSETS)] * OFFSET_UNIT
         return Observer(plant, processes, late, tuple(feed.widths), rate), state
 
@@ -127,8 +132,8 @@ class Observer(eqx.Module):
         line = state.reference_history
         if line is None or not in_flight:
             return rows
-        commands = line[self._slots(len(line), tick, in_flight)]
-        return jnp.concatenate([rows, commands.reshape(-1, rows.shape[-1])])
+        slots = self._slots(len(line), tick, in_flight)
+        return jnp.concatenate([rows, *(row_of(line, slot) for slot in slots)])
 
     def corrected(self, state: State, change: Array, tick: Array, in_flight: int) -> State:
         """Return a state moved by a change (n, F); its attitude stays a rotation."""
@@ -140,8 +145,11 @@ class Observer(eqx.Module):
         )
         line = state.reference_history
         if line is not None and in_flight:
-            by = change[len(leaves) :].reshape(in_flight, len(rotor_speed), -1)
-            line = line.at[self._slots(len(line), tick, in_flight)].add(by)
+            rotors = len(rotor_speed)
+            for number, slot in enumerate(self._slots(len(line), tick, in_flight)):
+                first = len(leaves) + number * rotors
+                row = row_of(line, slot) + change[first : first + rotors]
+                line = lax.dynamic_update_index_in_dim(line, row, slot, 0)
         return replaced(
             state,
             motion=motion,
@@ -151,10 +159,10 @@ class Observer(eqx.Module):
             reference_history=line,
         )
 
-    def _slots(self, length: int, tick: Array, in_flight: int) -> Array:
+    def _slots(self, length: int, tick: Array, in_flight: int) -> list[Array]:
         """Return the places of the last commands in a delay line, the newest first."""
         step = self._step(tick)
-        return jnp.mod(step - 1 - jnp.arange(in_flight), length)
+        return [jnp.mod(step - 1 - number, length) for number in range(in_flight)]
 
     def _step(self, tick: Array) -> Array:
         """Return the step of physics that begins at a tick."""
@@ -162,8 +170,8 @@ class Observer(eqx.Module):
         return tick * round(schedule.physics_rate / schedule.log_rate)
 
     def next(self, state: State, pushed: Array, tick: Array) -> State:
-        """Return the state a tick later, pushed by the processes' values (D, F)."""
-        acting = disturbance_of(self.processes.acts[:, None] * pushed)
+        """Return the state a tick later, pushed by the processes' values (D, *F)."""
+        acting = disturbance_of((self.processes.acts * pushed.T).T)
         environment = eqx.tree_at(
             lambda e: (e.disturbance, e.draught),
             self.plant.environment,

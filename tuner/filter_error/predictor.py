@@ -41,6 +41,8 @@ LOST = 0.05
 """Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
 LEARNT_FROM = 18.0
 """s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
+SEGMENTS = 8
+"""That are filtered side by side while strengths are differentiated by."""
 NUMBERS = 57
 """Of a state and its disturbances that samples correct, with four commands on their way."""
 NOISIER = 1.05
@@ -149,18 +151,24 @@ class Predictor:
     ) -> Iterator[Likelihood]:
         """Return how likely the first ticks are with each of the strengths a step away, in turn.
 
-        All are filtered side by side: of few flights alone most operations take as long to begin as
-        to compute.
+        As many are filtered side by side as fill a kernel's block of segments.
         """
         count = self.feed.offsets.shape[-1]
         feed = self._fed(point)
         samples = jax.tree.map(lambda rows: rows[:ticks], feed.samples)
-        feed = jax.tree.map(lambda rows: np.tile(rows, len(steps)), replace(feed, samples=samples))
-        strengths = np.repeat(self.strengths[:, None] + np.diag(steps), count, axis=-1)
-        expected = self._expected(objective, point, strengths)
-        found = filtered(self.simulator, feed, expected, gains=False)
-        for first in range(0, len(steps) * count, count):
-            yield likelihood_of(found, ticks, slice(first, first + count))
+        strengths = self.strengths[:, None] + np.diag(steps)
+        together = max(SEGMENTS // count, 1)
+        for first in range(0, len(steps), together):
+            some = strengths[:, first : first + together]
+            tiled = jax.tree.map(
+                lambda rows, times=some.shape[1]: np.tile(rows, times),
+                replace(feed, samples=samples),
+            )
+            expected = self._expected(objective, point, np.repeat(some, count, axis=-1))
+            found = filtered(self.simulator, tiled, expected, gains=False)
+            for number in range(some.shape[1]):
+                segments = slice(number * count, (number + 1) * count)
+                yield likelihood_of(found, ticks, segments)
 
     def as_noisy(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor whose samples are as noisy as the innovations, or itself."""
@@ -309,14 +317,14 @@ class Predictor:
 
 def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:
     """Return what a filter makes of some segments' first ticks, row by row in each tick."""
-    loss, white, whitens = (
-        np.asarray(rows[:ticks, ..., segments]) for rows in (found.loss, found.white, found.whitens)
+    loss, white, factors = (
+        np.asarray(rows[:ticks, ..., segments]) for rows in (found.loss, found.white, found.factors)
     )
     wide = white.shape[1]
     return Likelihood(
         float(np.sum(loss)),
         np.moveaxis(white, -1, 1).reshape(-1, wide),
-        np.moveaxis(whitens, -1, 1).reshape(-1, wide, wide),
+        np.moveaxis(factors, -1, 1).reshape(-1, wide, wide),
     )
 
 

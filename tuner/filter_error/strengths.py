@@ -21,6 +21,8 @@ from tuner.filter_error.disturbances import MOST
 
 Array = NDArray[np.float64]
 
+AT_ONCE = 2**16
+"""Numbers of a row whose products are summed up at a time."""
 STEP = 0.02
 """Of a logarithm, over which is differentiated."""
 
@@ -34,14 +36,14 @@ class Likelihood(NamedTuple):
         Negative log-likelihood.
     white
         (n, m) innovations, whitened.
-    whitens
-        (n, m, m) what whitens them: the inverse of their covariance's triangular root. Both in
-        single precision where memory counts: no more than derivatives are made of them.
+    factors
+        (n, m, m) the triangular root of their covariance before. In single precision where memory
+        counts: no more than derivatives are made of it.
     """
 
     loss: float
     white: NDArray[np.floating]
-    whitens: NDArray[np.floating]
+    factors: NDArray[np.floating]
 
 
 class Slopes(NamedTuple):
@@ -79,14 +81,26 @@ def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> S
     steps
         (7,) see `steps_from`.
     """
-    slope, moves, rows = np.zeros(len(steps)), [], []
+    some = np.flatnonzero(here.white.any(axis=1))  # the others are as they were
+    wide = here.white.shape[1]
+    whitens, one = np.linalg.inv(here.factors[some].astype(float)), np.eye(wide)
+    moves = np.zeros((len(steps), *here.white.shape))
+    below = np.tril_indices(wide)
+    # of a symmetric matrix's squares those off the diagonal count twice, and all by a half
+    counts = np.where(below[0] == below[1], np.sqrt(0.5), 1.0)
+    slope, spreads = np.zeros(len(steps)), []
     for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
-        turn = here.whitens @ np.linalg.inv(there.whitens)
-        moved = (np.einsum("nij,nj->ni", turn, there.white) - here.white) / step
-        spread = (turn @ np.swapaxes(turn, 1, 2) - np.eye(turn.shape[1])) / step
-        moves.append(moved)
-        rows.append(np.concatenate([moved.ravel(), np.sqrt(0.5) * spread.ravel()]))
+        turn = whitens @ there.factors[some]
+        turned = np.matmul(turn, there.white[some, :, None])[..., 0]
+        moved = moves[number, some] = (turned - here.white[some]) / step
+        spread = counts * ((turn @ np.swapaxes(turn, 1, 2) - one) / step)[:, *below]
+        spreads.append(spread.astype(np.float32).ravel())
         ahead = (there.loss - here.loss) / step
-        slope[number] = ahead - 0.5 * step * (rows[-1] @ rows[-1])  # of a parabola where it begins
-    information = np.array([[row @ other for other in rows] for row in rows], float)
-    return Slopes(slope, information, np.array(moves, float))
+        bend = np.sum(moved**2) + np.sum(spread**2)
+        slope[number] = ahead - 0.5 * step * bend  # of a parabola where it begins
+    flat = moves.reshape(len(steps), -1)
+    information = flat @ flat.T
+    for first in range(0, len(spreads[0]), AT_ONCE):
+        part = np.array([spread[first : first + AT_ONCE] for spread in spreads], float)
+        information += part @ part.T
+    return Slopes(slope, information, moves)

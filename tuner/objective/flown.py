@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -117,7 +117,7 @@ def fly(
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
-        segments=_flown_part(segments),
+        segments=flown_part(segments),
         states=None if segments.freedom is None else states,
         conditions=dict(conditions),
     )
@@ -143,7 +143,7 @@ def fly(
     return Flown(logged, still if run.columns is None else run.columns[0], crash_time)
 
 
-def _flown_part(segments: Segments) -> Segments:
+def flown_part(segments: Segments) -> Segments:
     """Return what of segments is flown, not compared."""
     flown: Segments = replace(segments, measured={}, flight=jnp.zeros(segments.count, int))
     return flown
@@ -155,45 +155,34 @@ def _arguments(given: _Given, *, own_coefficients: bool, moves: bool) -> _Given:
     def shared(leaf: Any) -> Argument:
         return Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
 
-    def each(name: str) -> Any:
-        def of(leaf: Any) -> Argument:
-            shape = np.shape(leaf)[:-1]
-            return Argument((name, *shape[1:]) if name else shape, np.result_type(leaf), lanes=True)
-
-        return of
-
     def moving(leaf: Any, *, lanes: bool) -> Argument:
         shape = np.shape(leaf)[:-1] if lanes else np.shape(leaf)
         return Argument(shape, np.result_type(leaf), lanes=lanes, moves=moves)
 
-    parts = {
-        name: getattr(given.segments, name)
-        for name in (
-            "inlet",
-            "start",
-            "turning",
-            "begin",
-            "resting",
-            "log_voltage",
-            "wander",
-            "freedom",
-        )
-    }
-    segments = jax.tree.map(each(""), given.segments)
-    segments = eqx.tree_at(
-        lambda s: [s.inlet, s.log_voltage],
-        segments,
-        [_tables(given.segments.inlet), jax.tree.map(each("volts"), parts["log_voltage"])],
-        is_leaf=lambda leaf: leaf is None or isinstance(leaf, Argument),
-    )
     return _Given(
         model=jax.tree.map(shared, given.model),
         coefficients=jax.tree.map(
             lambda leaf: moving(leaf, lanes=own_coefficients), given.coefficients
         ),
-        segments=segments,
+        segments=laid_out(given.segments),
         states=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.states),
         conditions=jax.tree.map(lambda leaf: moving(leaf, lanes=True), given.conditions),
+    )
+
+
+def laid_out(segments: Segments) -> Any:
+    """Return how each leaf of what is flown of segments is laid out."""
+
+    def each(leaf: Any, name: str | None = None) -> Argument:
+        shape = np.shape(leaf)[:-1]
+        return Argument((name, *shape[1:]) if name else shape, np.result_type(leaf), lanes=True)
+
+    volts = jax.tree.map(partial(each, name="volts"), segments.log_voltage)
+    return eqx.tree_at(
+        lambda s: [s.inlet, s.log_voltage],
+        jax.tree.map(each, segments),
+        [_tables(segments.inlet), volts],
+        is_leaf=lambda leaf: leaf is None or isinstance(leaf, Argument),
     )
 
 

@@ -33,7 +33,7 @@ from tuner.objective.tunable import Tunable
 
 Array = NDArray[np.float64]
 
-MEMORY = 2**29
+MEMORY = 2**30
 """bytes that derivatives take at most by default while they are computed."""
 
 

@@ -20,7 +20,7 @@ from tuner.service.database import Database
 from tuner.service.tables import EventRow, FileRow, JobRow, PointRow, State
 
 MOST_EVENTS = 20_000
-"""Of one job; of what comes after, only messages and states are kept, as many again."""
+"""Of one job; what would come after is not kept."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,6 @@ class Claim:
         Name of each recording in the job -> its digest.
     checkpoint
         Name -> digest of what a search elsewhere has put into the store.
-    said
-        Messages of earlier attempts: one begins as the one before it did.
     """
 
     number: int
@@ -52,7 +50,6 @@ class Claim:
     request: Mapping[str, Any]
     flights: Mapping[str, str]
     checkpoint: Mapping[str, str]
-    said: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -115,13 +112,8 @@ class Queue:
             row.started = row.started or now
             flights = {flight.name: flight.sha256 for flight in row.flights}
             add_event(session, row.number, "state", {"state": State.RUNNING})
-            messages = select(EventRow.content).where(
-                EventRow.job == row.number, EventRow.kind == "message"
-            )
-            said = frozenset(str(content["text"]) for content in session.scalars(messages))
-            checkpoint = row.checkpoint or {}
             return Claim(
-                row.number, row.id, word, row.deaths, row.request, flights, checkpoint, said
+                row.number, row.id, word, row.deaths, row.request, flights, row.checkpoint or {}
             )
 
     def report(
@@ -136,8 +128,6 @@ class Queue:
             if not _change(session, claim, {**standing, "lease": lease}):
                 return False
             for kind, content in events:
-                if kind == "message" and content["text"] in claim.said:
-                    continue
                 add_event(session, claim.number, kind, content)
             return True
 
@@ -232,6 +222,6 @@ def add_event(session: Session, job: int, kind: str, content: Mapping[str, Any])
         .execution_options(synchronize_session=False)
     )
     assert number is not None
-    if number <= MOST_EVENTS * (2 if kind in ("message", "state") else 1):
+    if number <= MOST_EVENTS:
         row = {"job": job, "number": number, "kind": kind, "content": dict(content)}
         session.execute(insert(EventRow), [row])

@@ -297,7 +297,8 @@ def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> 
     problem, predictor, point = fitted
     strict = replace(predictor.simulator, limits=Limits(floor=5.0))  # above what is flown
     expected = predictor._expected(problem, point)
-    observer, state = Observer.of(strict, predictor.feed, expected)
+    model = expected.tunable.at(expected.coefficients)
+    observer, state = Observer.of(strict, predictor.feed, model, expected.strengths)
     after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
     assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
 
@@ -330,8 +331,9 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
     stepped = predictor._stepped(finer, point)
     here, there = (np.asarray(of.found.gains.gain) for of in (stepped, own))
-    on_their_way = here[:, -COUNT - 16 : -COUNT - 4] - there[:, -COUNT - 12 : -COUNT]
-    assert np.std(on_their_way) < 0.01 * np.std(there[:, -COUNT - 12 : -COUNT])
+    expected = there[:, :, -COUNT - 12 : -COUNT]
+    on_their_way = here[:, :, -COUNT - 16 : -COUNT - 4] - expected
+    assert np.std(on_their_way) < 0.01 * np.std(expected)
     coarse = predictor.jacobian(late, point, []).residuals
     found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))
     for channel in ("position", "attitude"):  # the others hardly change: rates are fed in

@@ -41,10 +41,10 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
     samples = rng.standard_normal((SAMPLES, WIDE)) @ root(truth).T
 
     def filtered(strengths: np.ndarray) -> Likelihood:
-        whitens = np.linalg.inv(root(strengths))
-        white = samples @ whitens.T
-        loss = 0.5 * np.sum(white**2) - SAMPLES * np.log(np.diag(whitens)).sum()
-        return Likelihood(float(loss), white, np.broadcast_to(whitens, (SAMPLES, WIDE, WIDE)))
+        factor = root(strengths)
+        white = np.linalg.solve(factor, samples.T).T
+        loss = 0.5 * np.sum(white**2) + SAMPLES * np.log(np.diag(factor)).sum()
+        return Likelihood(float(loss), white, np.broadcast_to(factor, (SAMPLES, WIDE, WIDE)))
 
     return filtered
 
