@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from tuner.config import ControllerFile, VehicleFile
+from tuner.disk import exists
 from tuner.engine import engine_for
 from tuner.flights.flight import Array
 from tuner.result import Run, read_run
@@ -121,7 +122,7 @@ def export(
     Parameters
     ----------
     run
-        A run, or its result folder.
+        A run, its result folder, or a vehicle file, whose numbers no flight has been compared with.
     format
         The name of a target, as ``yaml``, ``sdf`` or ``px4``.
     into
@@ -142,9 +143,20 @@ def export(
     """
     configure()
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
+    from tuner.exporters.export import export_vehicle  # noqa: PLC0415
     from tuner.exporters.refly import refly  # noqa: PLC0415
     from tuner.job.effective_of_run import kept_effective  # noqa: PLC0415
 
+    if not isinstance(run, Run) and exists(Path(run)) and Path(run).is_file():
+        return export_vehicle(
+            Path(run),
+            format,
+            today=date.today(),
+            into=None if into is None else Path(into),
+            out=None if out is None else Path(out),
+            simulator=simulator,
+            accept=accept,
+        )
     return export_run(
         run if isinstance(run, Run) else read_run(run),
         format,

@@ -45,9 +45,15 @@ COMMANDS = {
         "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --out c.html",
     ),
     "export": (
-        "Write the coefficients of a run for a simulator, once they fly there as in the run.",
+        "Write the coefficients of a run, or of a vehicle file, for a simulator.",
         "tune export runs/x --format sdf --into models/quad.sdf",
-        "tune export runs/x --format px4 --out quad.params",
+        "tune export runs/x --format mujoco --out quad.xml",
+        "tune export quad.yaml --format px4 --simulator gz-sim --out quad.params",
+    ),
+    "audit": (
+        "Check a simulator's model against itself, PX4's parameters and physics.",
+        "tune audit models/x500/model.sdf --params x500.params",
+        "tune audit models/quad.sdf --run runs/x",
     ),
     "sensitivity": (
         "Report the effect of each coefficient, how well it is known, and what to fly next.",

@@ -1,4 +1,4 @@
-"""``tune export``: a run's coefficients into a simulator."""
+"""``tune export``: the coefficients of a run, or of a vehicle file, into a simulator."""
 
 from __future__ import annotations
 
@@ -21,15 +21,19 @@ def export(
     accept: Annotated[str, Parameter(name="--accept")] = "",
     quiet: Quiet = False,
 ) -> None:
-    """Write the coefficients of a run for a simulator, once its flights fly there as in the run.
+    """Write the coefficients of a run, or a vehicle file, for a simulator.
+
+    A run's are written once its flights fly there as in the run.
 
     Parameters
     ----------
     run
-        Export from this result folder.
+        Export from this result folder, or this vehicle file, which no flight is compared with.
     format
-        Write a vehicle file with confidence intervals (yaml), a model of Gazebo classic (sdf) or
-        gz-sim (gz-sim; or sdf, where the model is one), or parameters of PX4 (px4).
+        Write a vehicle file with confidence intervals (yaml), numbers with units (json), a model of
+        Gazebo classic (sdf) or gz-sim (gz-sim; or sdf, where the model is one), parameters of PX4
+        (px4), MuJoCo's MJCF (mujoco), parameters of crazyflow (drone-models) or RotorPy (rotorpy),
+        or arguments of Isaac Lab's multirotor (isaaclab).
     into
         Put the coefficients into this model (.sdf or .sdf.jinja), and into what it includes from
         folders beside its own. Default: write the tags alone.

@@ -40,10 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     TYPED.set(shlex.join(["tune", *given]))
     logging.basicConfig(level=logging.WARNING, format="tune: %(message)s", stream=sys.stderr)
     logging.captureWarnings(True)
+    status = DONE
     try:
         _know_the_command(given)
-        app(given)
+        answer = app(given)
         sys.stdout.flush()
+        status = answer if isinstance(answer, int) else DONE  # of a command that answers by it
     except ServerFaultError as error:
         return _say(str(error), OUR_FAULT)
     except InputError as error:
@@ -56,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.close()  # whoever read our output has gone; nothing is left to say
     except Exception as error:
         return _unforeseen(error)
-    return DONE
+    return status
 
 
 def _unforeseen(error: Exception) -> int:

@@ -67,7 +67,11 @@ def print_export(done: Exported) -> None:
     """Print which conditions were met, what was done, and where the file is."""
     screen = console()
     for gate in done.gates:
-        screen.print(f"{'yes' if gate.passed else 'NO '}  {gate.name}", markup=False)
+        met = "yes" if gate.passed else "NO "
+        name = (
+            gate.name if gate.ran else f"{gate.name} (not looked at: it needs a run's recordings)"
+        )
+        screen.print(f"{met if gate.ran else '---'}  {name}", markup=False)
         for objection in gate.objections:
             screen.print(f"     {objection}", markup=False)
     for note in done.notes:

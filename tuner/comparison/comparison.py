@@ -11,7 +11,7 @@ likeliest start for the vehicle that flies, and with the likeliest trim, is anot
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -36,7 +36,7 @@ from tuner.model import Model, model_of, schedule_of, with_terms_computed
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.flight import MOTION, TURNED
-from tuner.objective.flown import fly
+from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
@@ -117,7 +117,11 @@ class Comparison:
         return {name: errors[name] for name in self._names if name in errors}
 
     def fly(
-        self, vehicle: VehicleFile, *, computed: Collection[str] = ()
+        self,
+        vehicle: VehicleFile,
+        *,
+        computed: Collection[str] = (),
+        flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
 
@@ -128,6 +132,8 @@ class Comparison:
         computed
             Coefficients of terms that are computed although the vehicle may lack them, so that
             vehicles with and without them share a program.
+        flier
+            What flies segments: another simulator than this project's.
 
         Raises
         ------
@@ -136,7 +142,7 @@ class Comparison:
         """
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
-            errors |= group.fly(vehicle, computed=computed)
+            errors |= group.fly(vehicle, computed=computed, flier=flier)
         return {name: errors[name] for name in self._names}
 
 
@@ -199,6 +205,7 @@ class _Group:
         *,
         fitted_starts: bool = False,
         computed: Collection[str] = (),
+        flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
         if self._has_mixer:
@@ -223,6 +230,7 @@ class _Group:
             limits=self._limits,
             states=states,
             stride=self._stride,
+            flier=flier,
         )
         errors, first = {}, 0
         for recording, windows in zip(self._recordings, self._windows, strict=True):
@@ -342,6 +350,7 @@ def _flown(
     limits: Limits,
     states: Array | None,
     stride: int,
+    flier: Callable[..., Flown],
 ) -> tuple[dict[str, Array], dict[str, Array], Array]:
     """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
 
@@ -350,7 +359,7 @@ def _flown(
     A stamp that is so late that it was taken before the simulation begins, or so early that it was
     taken behind its end, is compared with the simulation's first or last sample.
     """
-    flown = fly(
+    flown = flier(
         model,
         segments,
         schedule,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tuner.config import VehicleFile
 from tuner.disk import make_folder, whole_file
@@ -20,15 +21,19 @@ TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class Gate:
-    """One condition: what it is, and what stands against it (nothing if it is met)."""
+    """One condition: what it is, and what stands against it (nothing if it is met).
+
+    One that could not be looked at has not ``ran``.
+    """
 
     name: str
     objections: tuple[str, ...]
+    ran: bool = True
 
     @property
     def passed(self) -> bool:
-        """Whether nothing stands against it."""
-        return not self.objections
+        """Whether it was looked at and nothing stands against it."""
+        return self.ran and not self.objections
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,9 @@ class Draft:
         Conditions of the format's own.
     others
         Further files -> their text, where a model is split over several.
+    flier
+        Flies it in its own simulator, as of `tuner.exporters.elsewhere.flier`; None where that is
+        not installed.
     """
 
     text: str
@@ -58,6 +66,7 @@ class Draft:
     faults: Callable[..., Sequence[str]]
     gates: tuple[Gate, ...] = ()
     others: Mapping[Path, str] = field(default_factory=dict)
+    flier: Callable[..., Any] | None = None
 
 
 def differences(wanted: Mapping[str, float], read: Mapping[str, float]) -> list[str]:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
+from tuner.config import read_vehicle
 from tuner.config.job import ExportSettings
 from tuner.disk import check_file, file_name, inside
 from tuner.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, Gate, write
-from tuner.exporters.gates import Refly, check, check_hover
-from tuner.exporters.provenance import Refit, exported_vehicle, in_simulator, provenance
+from tuner.exporters.gates import Refly, check, check_elsewhere, check_hover, not_flown
+from tuner.exporters.provenance import (
+    Refit,
+    exported_vehicle,
+    in_simulator,
+    provenance,
+    provenance_of_file,
+)
 from tuner.exporters.target import (
     Choices,
     check_every_coefficient,
@@ -96,6 +103,9 @@ def export(
     target = target_of(kind)
     if into is not None and not target.patches:
         raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
+    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
+    if out is None or out.suffix:  # before anything is computed
+        check_file(out or into or inside(run.folder, own), folder_is_made=True)
     choices = Choices(into, simulator)
     target = target.chosen(choices)
     physical, (run, effective) = run, in_simulator(run, target, refit)
@@ -111,24 +121,92 @@ def export(
             *what_is_lost(effective, target.entry, target.simulator.deviations),
         )
     draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
-    own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if into is not None and copies is not None and out is None:
         out = copies if draft.others else inside(copies, into.name)
-    path, others = _places(draft, out or into or inside(run.folder, own), into)
+    places = _places(draft, out or into or inside(run.folder, own), into)
     gates = (
         *draft.gates,
         check_hover(target.flown(vehicle), draft.vehicle),
         *check(run, draft.vehicle, refly),
     )
+    flown: tuple[str, ...] = ()
+    if draft.flier is not None and target.simulator is not None and run.result.flights:
+        gate, sentence = check_elsewhere(run, draft, refly, target.simulator.title)
+        gates, flown = (*gates, gate), (sentence,)
+    refuse(run.folder, gates, accept, "fit again")
+    write(draft, *places)
+    notes = (*decided, *flown, *draft.notes, *not_carried(vehicle, target))
+    return Exported(places[0], gates, notes)
+
+
+def export_vehicle(
+    file: Path,
+    kind: str,
+    *,
+    today: date,
+    into: Path | None = None,
+    out: Path | None = None,
+    simulator: str = "",
+    accept: str = "",
+) -> Exported:
+    """Write the coefficients of a vehicle file in a format: no flight says that they are right.
+
+    Parameters
+    ----------
+    file
+        Of the vehicle; what its ``source`` says of each number is handed on.
+    out
+        Where to write; by default the model itself, or beside the vehicle file.
+    kind, today, into, simulator, accept
+        As of `export`.
+
+    Raises
+    ------
+    ConfigError
+        The file is no vehicle's.
+    ExportError, OutputError
+        As of `export`.
+    """
+    vehicle, target = read_vehicle(file), target_of(kind)
+    if into is not None and not target.patches:
+        raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
+    choices = Choices(into, simulator)
+    target = target.chosen(choices)
+    check_every_coefficient(vehicle, target)
+    line, sources = provenance_of_file(vehicle, file, today, accept)
+    draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
+    beside = file.with_name(f"{file.stem}{target.suffix}")
+    if beside.name == file.name:
+        beside = file.with_name(f"{file.stem}_exported{target.suffix}")
+    places = _places(draft, out or into or beside, into)
+    gates = (
+        *draft.gates,
+        check_hover(target.flown(vehicle), draft.vehicle),
+        *not_flown(),
+    )
+    refuse(file, gates, accept, "correct the vehicle file or the model")
+    write(draft, *places)
+    computed = () if target.simulator is None else target.simulator.deviations
+    lacks = tuple(f"{target.simulator_name} computes otherwise: {what}" for what in computed)
+    notes = (*sources, *draft.notes, *not_carried(vehicle, target), *lacks)
+    return Exported(places[0], gates, notes)
+
+
+def refuse(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> None:
+    """Refuse numbers against which something stands, unless a reason accepts them.
+
+    Raises
+    ------
+    ExportError
+        They are refused.
+    """
     refused = [objection for gate in gates for objection in gate.objections]
     if refused and not accept:
         raise ExportError(
-            run.folder,
+            subject,
             f"its numbers are not fit to export: {'; '.join(refused)}",
-            "fit again, or export with --accept 'REASON'",
+            f"{remedy}, or export with --accept 'REASON'",
         )
-    write(draft, path, others)
-    return Exported(path, gates, (*decided, *draft.notes, *not_carried(vehicle, target)))
 
 
 def _places(draft: Draft, path: Path, into: Path | None) -> tuple[Path, dict[Path, Path]]:

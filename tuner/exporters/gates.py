@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from tuner.config import VehicleFile
 from tuner.errors import InputError
-from tuner.exporters.draft import Gate
+from tuner.exporters.draft import Draft, Gate
 from tuner.exporters.hover import hover_command, thrust_to_weight
 from tuner.result import RMSE_UNITS, AxesRmse, Run
 
@@ -20,8 +20,19 @@ ON_BOUND = 1e-4
 WORSE = 0.01
 #: What a re-flown RMSE may differ from the run's: relative, or in m and degrees.
 SAME_RELATIVE, SAME_ABSOLUTE = 0.01, 1e-4
+#: By how much its own simulator may miss a flight by more than this project's simulation of it:
+#: a factor, and in m and degrees.
+ELSEWHERE, ELSEWHERE_M, ELSEWHERE_DEG = 2.0, 0.02, 2.0
 #: What the throttle of the hover, 0..1, may differ.
 SAME_THROTTLE = 0.005
+
+#: What is asked of a run.
+OF_FLIGHTS = (
+    "every trajectory of the run is flown without a crash",
+    "the exported numbers fly as the run says",
+    "no held-out flight is worse than before",
+    "no coefficient sits on a bound",
+)
 
 POSITION = ("x", "y", "z")
 ATTITUDE = ("roll", "pitch", "yaw")
@@ -34,12 +45,37 @@ def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
         differing = _differing(run, flown)
     except InputError as error:
         flown, differing = {}, [f"the flights cannot be flown again ({error})"]
-    return (
-        Gate("every trajectory of the run is flown without a crash", tuple(_crashes(flown))),
-        Gate("the exported numbers fly as the run says", tuple(differing)),
-        Gate("no held-out flight is worse than before", tuple(_worse(run))),
-        Gate("no coefficient sits on a bound", tuple(_on_bounds(run))),
+    objections = (_crashes(flown), differing, _worse(run), _on_bounds(run))
+    return tuple(Gate(name, tuple(o)) for name, o in zip(OF_FLIGHTS, objections, strict=True))
+
+
+def check_elsewhere(
+    run: Run, draft: Draft, refly: Callable[..., Mapping[str, AxesRmse]], title: str
+) -> tuple[Gate, str]:
+    """Check what is exported by flying it in its own simulator, which is installed.
+
+    Returns the condition, and in a sentence by how much the flights are missed there.
+    """
+    there = refly(run, draft.vehicle, draft.flier)
+    objections = list(_crashes(there))
+    for flight in run.result.flights:
+        own, other = flight.rmse_best, there[flight.name]
+        for axes, slack, unit in ((POSITION, ELSEWHERE_M, "m"), (ATTITUDE, ELSEWHERE_DEG, "deg")):
+            expected, found = _length(own, axes), _length(other, axes)
+            if math.isfinite(found) and found > expected * ELSEWHERE + slack:
+                objections.append(
+                    f"{flight.name} is missed by {found:.3g} {unit}, expected {expected:.3g}"
+                )
+    missed = "; ".join(
+        f"{name} {1000 * _length(rmse, POSITION):.3g} mm, {_length(rmse, ATTITUDE):.2g}°"
+        for name, rmse in there.items()
     )
+    return Gate(f"{title} itself flies it so", tuple(objections)), f"flown in {title}: {missed}"
+
+
+def not_flown() -> tuple[Gate, ...]:
+    """Return the conditions of a run, for a vehicle without one."""
+    return tuple(Gate(name, (), ran=False) for name in OF_FLIGHTS)
 
 
 def check_hover(wanted: VehicleFile, there: VehicleFile) -> Gate:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 
 from tuner.config import VehicleFile
-
-GRAVITY = 9.81
-"""m/s², as it acts on the vehicle in the simulation."""
+from tuner.numerics import GRAVITY
 
 
 def rotor_speed(vehicle: VehicleFile, command: float) -> float:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import date
+from pathlib import Path
 
 from pydantic import JsonValue
 
-from tuner.coefficients import REGISTRY, Written
-from tuner.config import VehicleFile
+from tuner.coefficients import COEFFICIENTS, REGISTRY, Written
+from tuner.config import VehicleFile, values_of
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
-from tuner.exporters.target import Target
+from tuner.exporters.target import Target, quantity
 from tuner.result import EffectiveResult, Run
 from tuner.wording.verdicts import judgement_in_words
 
@@ -37,6 +38,23 @@ def provenance(run: Run, today: date, accepted: str = "") -> str:
     fitted = [flight.name for flight in run.result.flights if flight.split == "fit"]
     line = f"fitted to {', '.join(fitted)}; run {run.folder.resolve().name}; {today.isoformat()}"
     return f"{line}; exported against a refusal: {accepted}" if accepted else line
+
+
+def provenance_of_file(
+    vehicle: VehicleFile, file: Path, today: date, accepted: str = ""
+) -> tuple[str, tuple[str, ...]]:
+    """Return a line on where a vehicle file's numbers come from, and one on each that it says."""
+    how = vehicle.source.get("method", "as the vehicle file has it")
+    line = f"{file.name}: {how}; no flight was compared; {today.isoformat()}"
+    if accepted:
+        line = f"{line}; exported against a refusal: {accepted}"
+    values = values_of(vehicle)
+    sources = tuple(
+        f"{name} {quantity(values[name], COEFFICIENTS[name])}: {text}"
+        for name, text in vehicle.source.items()
+        if name in values
+    )
+    return " ".join(line.split()), sources
 
 
 def _source(run: Run, today: date) -> dict[str, JsonValue]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -14,7 +15,9 @@ from tuner.recordings import Recording, read_usable, with_conditions, with_input
 from tuner.result import AxesRmse, Run, RunResult
 
 
-def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
+def refly(
+    run: Run, vehicle: VehicleFile, flier: Callable[..., Any] | None = None
+) -> Mapping[str, AxesRmse]:
     """Return flight name to RMSE of a run's recordings, simulated whole with a vehicle.
 
     Parameters
@@ -23,6 +26,8 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
         Gives the recordings, the controller that flew, and each flight's clock offset.
     vehicle
         What flies now.
+    flier
+        Flies it in another simulator, as of `tuner.exporters.elsewhere.flier`.
 
     Raises
     ------
@@ -33,7 +38,8 @@ def refly(run: Run, vehicle: VehicleFile) -> Mapping[str, AxesRmse]:
         return {}
     settings, recordings = recordings_of(run)
     window = settings.job.search.window
-    flown = Comparison(recordings, settings.controller, window=window).fly(vehicle)
+    comparison = Comparison(recordings, settings.controller, window=window)
+    flown = comparison.fly(vehicle) if flier is None else comparison.fly(vehicle, flier=flier)
     return {name: errors.rmse for name, errors in flown.items()}
 
 

@@ -15,13 +15,13 @@ from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried, Written
 from tuner.coefficients.registry import NO_LOSS
 from tuner.config import VehicleFile, values_of, with_values
 from tuner.exporters.hover import (
-    GRAVITY,
     full_thrust,
     hover_command,
     hover_speed,
     rotor_speed,
     thrust_at,
 )
+from tuner.numerics import GRAVITY
 
 Entry = Written | NotCarried
 Laws = Callable[[VehicleFile], VehicleFile]
@@ -325,3 +325,164 @@ SIH = Simulator(
     fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
     start=linear_at_hover,
 )
+
+_NOT_DRAWN = "{} has no such term"
+_MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
+_NO_ROLLING = {"rolling_moment_coefficient": NotCarried(_NOT_DRAWN.format("it"), 0.0)}
+_NO_AIRSPEED = {
+    "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS)
+}
+_BODY = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
+_LINEAR = ("linear_drag_x", "linear_drag_y", "linear_drag_z")
+_ANGULAR = ("angular_drag_x", "angular_drag_y", "angular_drag_z")
+
+
+def _held(*groups: tuple[str, ...], **keys: str) -> dict[str, str]:
+    """Return coefficient -> key, of groups under their own names and of others under theirs."""
+    return {name: name for group in groups for name in group} | keys
+
+
+def _mujoco_laws(vehicle: VehicleFile) -> VehicleFile:
+    return linear_in(_mean_lag(vehicle), idle=True)
+
+
+def _isaac_laws(vehicle: VehicleFile) -> VehicleFile:
+    return _one_damping(_same_drag(vehicle))
+
+
+def _dragging_at_hover(vehicle: VehicleFile) -> VehicleFile:
+    return _dragging(vehicle, drag_at_hover(vehicle))
+
+
+def _square_x(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotors sit in a square about the centre of mass, at its height."""
+    arm = fmean(abs(rotor.position[axis]) for rotor in vehicle.rotors for axis in (0, 1))
+
+    def side(x: float) -> float:
+        return arm if x > 0 else -arm
+
+    rotors = tuple(
+        rotor.replace(position=(side(rotor.position[0]), side(rotor.position[1]), 0.0))
+        for rotor in vehicle.rotors
+    )
+    return vehicle.replace(rotors=rotors)
+
+
+MUJOCO = Simulator(
+    name="mujoco",
+    title="MuJoCo",
+    version="MuJoCo 3.3 to 4.0",
+    source="mujoco.readthedocs.io, XMLreference: actuator/general, dyntype filterexact",
+    deviations=(
+        "each rotor's thrust is an actuator's, which lags the control in N by one time constant",
+        "drag is linear in the velocity of the rotors' centre, at the hover's rotor speed",
+    ),
+    entry=entries(
+        _held(
+            _BODY,
+            _LINEAR,
+            _ANGULAR,
+            _MOTORS,
+            time_constant_up="dynprm",
+            time_constant_down="dynprm",
+            motor_constant="gainprm, ctrlrange",
+            moment_constant="gear",
+            rotor_drag_coefficient="biasprm",
+            thrust_inflow_coefficient="biasprm",
+            rotor_drag_ratio_y="biasprm",
+        ),
+        _NO_ROLLING | _NO_AIRSPEED,
+        title="MuJoCo",
+    ),
+    laws=_mujoco_laws,
+    ties=(("time_constant_up", "time_constant_down"),),
+    fixed=_MOTORS,
+)
+ROTORPY = Simulator(
+    name="rotorpy",
+    title="RotorPy",
+    version="RotorPy 3.0.0",
+    source="rotorpy/vehicles/multirotor.py",
+    deviations=("one time constant, up and down",),
+    entry=entries(
+        _held(
+            _BODY,
+            _MOTORS,
+            time_constant_up="tau_m",
+            time_constant_down="tau_m",
+            motor_constant="k_eta",
+            moment_constant="k_m",
+            rotor_drag_coefficient="k_d",
+            thrust_inflow_coefficient="k_z",
+            fuselage_drag="c_Dx, c_Dy, c_Dz",
+            flapping_moment_coefficient="k_flap",
+        ),
+        _NO_ROLLING | _NO_AIRSPEED,
+        title="RotorPy",
+    ),
+    laws=_mean_lag,
+    ties=(("time_constant_up", "time_constant_down"),),
+)
+DRONE_MODELS = Simulator(
+    name="drone-models",
+    title="crazyflow (drone-models)",
+    version="drone-models 0.1.0, crazyflow 0.4.0",
+    source="drone_models/first_principles/model.py",
+    deviations=(
+        "drag is linear in the body's velocity, at the centre of mass",
+        "rotors sit in a square at the height of the centre of mass",
+        "the gyroscopic moment about forward has the other sign",
+    ),
+    entry=entries(
+        _held(
+            _BODY,
+            _LINEAR,
+            _MOTORS,
+            time_constant_up="rotor_dyn_coef",
+            time_constant_down="rotor_dyn_coef",
+            motor_constant="rpm2thrust",
+            moment_constant="rpm2torque",
+            rotor_drag_coefficient="drag_matrix",
+            rotor_inertia="prop_inertia",
+        ),
+        _NO_ROLLING | _NO_AIRSPEED,
+        title="drone-models",
+    ),
+    laws=lambda vehicle: _square_x(_dragging_at_hover(vehicle)),
+    free=("linear_drag_x", "linear_drag_y"),
+)
+ISAAC_LAB = Simulator(
+    name="isaaclab",
+    title="Isaac Lab",
+    version="Isaac Lab 2.3 to 3.0 (1ab6d6cf)",
+    source="isaaclab_contrib/actuators/thruster.py, assets/multirotor",
+    deviations=(
+        "one drag in all directions, linear in the velocity and at the centre of mass",
+        "one damping of rotation about all axes",
+    ),
+    entry=entries(
+        _held(
+            _BODY,
+            _LINEAR,
+            _ANGULAR,
+            _MOTORS,
+            time_constant_up="tau_inc_range",
+            time_constant_down="tau_dec_range",
+            motor_constant="thrust_const_range",
+            moment_constant="torque_to_thrust_ratio",
+            rotor_drag_coefficient="linear_damping",
+        ),
+        _NO_ROLLING | _NO_AIRSPEED,
+        title="Isaac Lab",
+    ),
+    laws=_isaac_laws,
+    free=_LINEAR,
+    ties=(_LINEAR,),
+)
+SIMULATORS = {
+    simulator.name: simulator
+    for simulator in (
+        GAZEBO_CLASSIC, GZ_SIM, SIH, MUJOCO, ROTORPY, DRONE_MODELS, ISAAC_LAB,
+    )
+}  # fmt: skip
+"""Name -> simulator."""

@@ -73,7 +73,7 @@ def _vehicle(
     ]
     full = estimates["input_scaling"].value + estimates["zero_position_armed"].value
     motor = template.motor.replace(max_rotor_velocity=_rounded(HEADROOM * full))
-    source = {"made_by": f"{PROGRAM} {installed()}"}
+    source = {"made_by": f"{PROGRAM} {installed()}", "method": "by scaling laws, not measured"}
     source |= {name: estimate.source for name, estimate in estimates.items()}
     vehicle = template.replace(
         name=name, mass=airframe.mass, rotors=rotors, motor=motor, source=source

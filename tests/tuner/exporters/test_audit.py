@@ -1,0 +1,136 @@
+"""Twelve models with one planted fault each, and models without."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.tuner.exporters.conftest import MODELS
+from tuner.cli import main
+from tuner.errors import ExportError
+from tuner.exporters.audit import audit
+from tuner.exporters.px4_parameters import parameters_text
+from tuner.exporters.simulators import GZ_SIM
+from tuner.exporters.targets.px4 import parameters
+
+CLASSIC, GZ = MODELS / "quad_x.sdf", MODELS / "quad_x_gz.sdf"
+SHIPPED = Path(__file__).resolve().parents[4] / "shared" / "models"
+
+#: What is planted -> how (pattern, replacement, how often), and what the line must say.
+PLANTED = {
+    "slowdown left out": (
+        r" *<rotorVelocitySlowdownSim>.*\n", "", 0, "rotorVelocitySlowdownSim is missing",
+    ),
+    "limit in rpm": (
+        r"<maxRotVelocity>1100<", "<maxRotVelocity>10504<", 0, "is it in rpm? that would be 1100",
+    ),
+    "moment constant by kV": (
+        # 60/(2 pi kV) of a 30 kV motor
+        r"<momentConstant>0.06<", "<momentConstant>0.318<", 0, "not 60/(2π kV)",
+    ),
+    "time constant in ms": (
+        r"<timeConstantUp>0.0125<", "<timeConstantUp>12.5<", 0, "is it in ms?",
+    ),
+    "one rotor's sense": (r"ccw</turn", "cw</turn", 1, "their torques do not cancel"),
+    "two neighbours alike": (
+        None, None, 0, "neighbouring rotors turn the same way",
+    ),
+    "inertia in g cm2": (
+        r"<ixx>0.021</ixx>", "<ixx>210000</ixx>", 1, "largest moment is more than the other two",
+    ),
+    "inertia ten times": (
+        r"<i(xx|yy|zz)>(0.021|0.04)<", r"<i\1>1\2<", 3, "is it in another unit?",
+    ),
+    "mass in g": (r"<mass>2.04</mass>", "<mass>2040</mass>", 1, "times the weight of 2040 kg"),
+    "thrust per rpm2": (
+        r"<motorConstant>8.55e-06<", "<motorConstant>9.4e-08<", 0, "not per rpm²",
+    ),
+    "one motor stronger": (
+        r"<motorConstant>8.55e-06<", "<motorConstant>1.71e-05<", 1, "motorConstant differs",
+    ),
+    "hover beyond reach": (
+        r"<mass>2.04</mass>", "<mass>3.3</mass>", 1, "hovers at a throttle of 0.8",
+    ),
+}  # fmt: skip
+
+
+def planted(name):
+    pattern, replacement, count, expected = PLANTED[name]
+    text = CLASSIC.read_text()
+    if pattern is None:  # front left and rear left change places in turning
+        plugins = re.split(r"(?=<plugin )", text)
+        swapped = [
+            p.replace(">ccw<", ">cw<") if "<motorNumber>1<" in p
+            else p.replace(">cw<", ">ccw<") if "<motorNumber>2<" in p
+            else p
+            for p in plugins
+        ]  # fmt: skip
+        return "".join(swapped), expected
+    changed = re.sub(pattern, replacement, text, count=count)
+    assert changed != text
+    return changed, expected
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_fault_is_found(name, tmp_path, capsys):
+    text, expected = planted(name)
+    (tmp_path / "m.sdf").write_text(text)
+    faults = audit(tmp_path / "m.sdf").faults
+    assert any(expected in fault for fault in faults), faults
+    assert len({re.sub(r"rotor \d: ", "", fault) for fault in faults}) == 1, faults
+    assert main(["audit", str(tmp_path / "m.sdf")]) == 1
+    assert capsys.readouterr().out.count("\n") == len(faults)
+
+
+@pytest.mark.parametrize("model", [CLASSIC, GZ, MODELS / "quad_x.sdf.jinja"], ids=lambda p: p.name)
+def test_nothing_is_found_in_a_good_model(model, capsys):
+    assert main(["audit", str(model)]) == 0
+    assert "no fault found, 2.079 kg" in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not SHIPPED.is_dir(), reason="PX4's models are not in ../shared/models")
+@pytest.mark.parametrize(
+    "name",
+    [
+        "classic/iris/iris.sdf.jinja",
+        "classic/typhoon_h480/typhoon_h480.sdf.jinja",
+        "gz/x500/model.sdf",
+        "gz/x500_depth/model.sdf",
+    ],
+)
+def test_nothing_is_found_in_px4s_models(name):
+    assert audit(SHIPPED / name).faults == ()
+
+
+def test_parameters_are_held_against_the_model(vehicle, tmp_path):
+    good = {p.name: p for p in parameters(vehicle.replace(mass=2.079), GZ_SIM)}
+    for name, value, expected in (
+        ("CA_ROTOR0_PX", -0.17678, "rotor 0 sits at 0.177 m"),
+        ("CA_ROTOR2_KM", 0.06, "says the other turning direction than cw"),
+        ("CA_ROTOR_COUNT", 6, "the model has 4 rotors"),
+        ("SIM_GZ_EC_MAX1", 1066, "PX4 accepts 0 to 1000"),
+        ("MPC_THR_HOVER", 0.2, "the model hovers at a throttle of"),
+    ):
+        changed = good | {name: type(good[name])(name, value)}
+        file = tmp_path / "x.params"
+        file.write_text(parameters_text(changed.values(), "by a test"))
+        faults = audit(GZ, file).faults
+        assert any(fault.startswith(name) and expected in fault for fault in faults), faults
+
+
+def test_coefficients_are_compared_with_a_runs(make_run, capsys):
+    run = make_run()
+    assert main(["audit", str(CLASSIC), "--run", str(run.folder), "--json"]) == 0
+    compared = json.loads(capsys.readouterr().out)["compared"]
+    assert "mass 2.079, fitted 2.243: -7.3%, 7.31 standard errors" in compared
+    (constant,) = [line for line in compared if line.startswith("motor_constant")]
+    assert constant == "motor_constant 8.55e-06, fitted 1.45e-05: -41.0%, 41 standard errors"
+
+
+def test_what_is_no_model_is_refused_in_a_line(tmp_path, capsys):
+    (tmp_path / "m.sdf").write_text("<sdf><world/></sdf>")
+    with pytest.raises(ExportError, match="holds no <model>"):
+        audit(tmp_path / "m.sdf")
+    assert main(["audit", str(tmp_path / "m.sdf")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1

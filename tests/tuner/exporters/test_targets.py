@@ -1,0 +1,138 @@
+"""Every target: written, read back, and where its simulator installs, flown there."""
+
+from datetime import date
+
+import numpy as np
+import pytest
+
+from tests.tuner.exporters.conftest import MODELS
+from tuner.cli import main
+from tuner.comparison.comparison import Comparison
+from tuner.config import ControllerFile, configs_folder, read_vehicle, values_of, write_vehicle
+from tuner.errors import ExportError
+from tuner.exporters.draft import write
+from tuner.exporters.elsewhere import flier
+from tuner.exporters.export import export_vehicle
+from tuner.exporters.hover import hover_command, thrust_to_weight
+from tuner.exporters.simulators import SIMULATORS
+from tuner.exporters.target import Choices, target_of
+from tuner.exporters.targets import NAMES
+from tuner.recordings import Recording
+
+TODAY = date(2024, 5, 6)
+EVERY = pytest.mark.parametrize("kind", NAMES)
+
+
+@EVERY
+def test_what_is_written_is_read_back_and_a_changed_number_is_seen(kind, vehicle, tmp_path):
+    target = target_of(kind)
+    draft = target.draft(vehicle, "by a test", Choices())
+    path = tmp_path / f"x{target.suffix}"
+    write(draft, path)
+    text = path.read_text()
+    assert "by a test" in text
+    assert "2.243" in text
+    path.write_text(text.replace("2.243", "2.244"))
+    assert draft.faults(path)
+
+
+@EVERY
+def test_laws_applied_twice_change_nothing(kind, vehicle):
+    target = target_of(kind)
+    vehicle = vehicle.replace(
+        effects={"linear_drag_x": 0.1, "fuselage_drag": 0.02, "angular_drag_z": 0.01},
+        motor=vehicle.motor.replace(quadratic=-20.0, input_offset=0.01),
+    )
+    once = target.flown(vehicle)
+    assert values_of(target.flown(once)) == pytest.approx(values_of(once), rel=1e-12)
+
+
+@EVERY
+def test_thrust_and_hover_are_carried(kind, vehicle):
+    flown = target_of(kind).flown(vehicle)
+    assert thrust_to_weight(flown) == pytest.approx(thrust_to_weight(vehicle), rel=1e-9)
+    if kind != "px4":  # whose thrust is linear in the command
+        assert hover_command(flown) == pytest.approx(hover_command(vehicle), abs=1e-3)
+
+
+@pytest.mark.parametrize("simulator", SIMULATORS.values(), ids=lambda s: s.name)
+def test_each_simulator_is_written_down_with_its_source(simulator):
+    assert simulator.version
+    assert "/" in simulator.source or "." in simulator.source
+    assert simulator.deviations
+
+
+@EVERY
+def test_a_vehicle_file_is_exported_without_a_run(kind, tmp_path):
+    assert not main(
+        "new-vehicle --mass 1.4 --wheelbase 0.45 --propeller 10x4.5 --motor-kv 920 --cells 3 "
+        f"--quiet --out {tmp_path}/quad.yaml".split()
+    )
+    done = export_vehicle(tmp_path / "quad.yaml", kind, today=TODAY)
+    assert done.path.parent == tmp_path
+    assert "by scaling laws, not measured; no flight was compared" in done.path.read_text()
+    assert any(note.startswith("motor_constant 1.459e-05") for note in done.notes)
+    not_run = [gate.name for gate in done.gates if not gate.ran]
+    assert "the exported numbers fly as the run says" in not_run
+    hover = next(gate for gate in done.gates if gate.name.startswith("thrust to weight"))
+    assert hover.passed
+
+
+def test_a_vehicle_file_goes_into_a_model_that_fits_it(tmp_path, capsys):
+    model, file = tmp_path / "quad.sdf", tmp_path / "v.yaml"
+    model.write_text((MODELS / "quad_x.sdf").read_text())
+    vehicle = read_vehicle(configs_folder() / "vehicles" / "hovergames_updated.yaml")
+    write_vehicle(vehicle, file)
+    assert main(["export", str(file), "--format", "sdf", "--into", str(model)]) == 0
+    assert "<motorConstant>1.45e-05<" in model.read_text()
+    assert "---  the exported numbers fly as the run says (not looked at" in capsys.readouterr().out
+    write_vehicle(vehicle.replace(mass=8.0), file)
+    before = model.read_text()
+    with pytest.raises(ExportError, match="cannot hover"):
+        export_vehicle(file, "sdf", today=TODAY, into=model)
+    assert model.read_text() == before
+
+
+class Gliding:
+    """A body that keeps its velocity."""
+
+    def __init__(self, step):
+        self.period, self.state, self.speeds = step, None, None
+
+    def begin(self, state, rotor_speed):
+        self.state, self.speeds = state.copy(), rotor_speed
+
+    def step(self, asked):
+        self.speeds = asked
+        self.state[:3] += self.period * self.state[3:6]
+        return self.state
+
+    def rotor_speed(self):
+        return self.speeds
+
+
+def test_another_simulators_body_is_what_moves(flight, updated):
+    errors = Comparison([Recording(flight)], ControllerFile()).fly(updated, flier=flier(Gliding))
+    (missed,) = errors.values()
+    start = flight.signals["position"][0]
+    flown = missed.position.recorded + missed.position.error
+    steps = np.diff(flown, axis=0) / np.diff(missed.position.time)[:, None]
+    np.testing.assert_allclose(flown[0], start, atol=0.01)
+    np.testing.assert_allclose(steps, steps[0] * np.ones_like(steps), atol=1e-6)
+
+
+def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
+    pytest.importorskip("mujoco", reason="MuJoCo is not installed: the extra simulators")
+
+    draft = target_of("mujoco").draft(updated, "by a test", Choices())
+    comparison = Comparison([Recording(flight)], ControllerFile())
+    own = comparison.fly(draft.vehicle)["small_circle"].rmse
+    there = comparison.fly(draft.vehicle, flier=draft.flier)["small_circle"].rmse
+    for axis in ("x", "y", "z"):
+        assert getattr(there, axis) == pytest.approx(getattr(own, axis), abs=0.003)
+    for axis in ("roll", "pitch", "yaw"):
+        assert getattr(there, axis) == pytest.approx(getattr(own, axis), abs=0.3)
+    heavy = draft.vehicle.replace(mass=1.3 * draft.vehicle.mass)
+    wrong = target_of("mujoco").draft(heavy, "by a test", Choices())
+    worse = comparison.fly(draft.vehicle, flier=wrong.flier)["small_circle"].rmse
+    assert worse.z > there.z + 0.01

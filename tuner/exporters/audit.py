@@ -1,0 +1,334 @@
+"""Whether a simulator's model agrees with itself, with PX4's parameters, and with physics.
+
+Each fault is a line: where it is, what is wrong, what would be right. What is judged are ranges far
+wider than vehicles differ, and numbers that must agree with each other.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tuner.config import values_of
+from tuner.errors import ExportError
+from tuner.exporters.draft import read_file
+from tuner.exporters.px4_parameters import outside_range, read_parameters
+from tuner.exporters.sdf.composite import Array, Inertial, together
+from tuner.exporters.sdf.includes import assembled
+from tuner.exporters.sdf.model import Model, inertials, read_model
+from tuner.exporters.sdf.spans import Element, number
+from tuner.exporters.sdf.template import rendered
+from tuner.numerics import GRAVITY
+from tuner.result import Run
+
+RPM = 2 * math.pi / 60
+"""rad/s of one rpm."""
+MOST_ROTORS = 12
+THRUST_TO_WEIGHT = (1.2, 12.0)
+"""Of vehicles that fly; SITL models sit between 1.5 and 5."""
+HOVER = (0.1, 0.8)
+"""Throttle that PX4 accepts as ``MPC_THR_HOVER``."""
+TIME_CONSTANT = (0.002, 0.5)
+"""s, of brushed and brushless motors with propellers from 2 to 30 inch."""
+MOMENT_CONSTANT = (0.003, 0.12)
+"""m: drag torque over thrust of propellers from 2 to 30 inch, PX4's 0.06 of its iris among them."""
+RADIUS_OF_GYRATION = (0.1, 1.0)
+"""Of the longest arm: a body that is all hub, and one that is all motors."""
+SLOWDOWN = (1.0, 100.0)
+TIP_SPEED = 343.0
+"""m/s: no propeller's tips are faster than sound."""
+FASTEST = 6000.0
+"""rad/s, of a propeller of one inch."""
+SAME_PLACE = 0.02
+"""m within which allocation and model agree."""
+SAME_SHARE = 0.1
+"""Part by which numbers that should agree may differ."""
+
+
+@dataclass(frozen=True)
+class Rotor:
+    """One motor plugin with its rotor."""
+
+    number: int
+    place: Array
+    turns: str
+    numbers: Mapping[str, float]
+    radius: float | None
+
+
+@dataclass(frozen=True)
+class Audited:
+    """A model as it was read, and what is wrong with it, a line each."""
+
+    path: Path
+    mass: float
+    faults: tuple[str, ...]
+    compared: tuple[str, ...] = ()
+
+
+def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Audited:
+    """Audit a model: SDF of Gazebo classic or gz-sim, split over files or not.
+
+    Parameters
+    ----------
+    path
+        The model.
+    params
+        PX4's parameters that fly it.
+    run
+        A fit to hold its numbers against.
+
+    Raises
+    ------
+    ExportError
+        A file cannot be read, or is no multirotor's.
+    """
+    text = assembled(path, read_file, rendered).text
+    model = read_model(text, path, MOST_ROTORS)
+    rotors = _rotors(model)
+    if not rotors:
+        raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
+    given = {} if params is None else {p.name: p.value for p in read_parameters(params)}
+    whole = together([body for _, body in inertials(model)])
+    bodies = [*_of_bodies(model)]
+    hover = [*_of_hover(whole, rotors, _speeds(model, rotors, given))]
+    faults = [*bodies, *_of_rotors(rotors, model), *_of_layout(whole, rotors), *hover]
+    if not bodies and not any("times the weight" in fault for fault in hover):
+        faults += _of_whole(whole, rotors)  # which else follows from those
+    if params is not None:
+        faults += outside_range(read_parameters(params))
+        faults += _of_parameters(given, whole, rotors, _speeds(model, rotors, given))
+    compared = () if run is None else tuple(_against(run, whole, rotors))
+    return Audited(path, whole.mass, tuple(dict.fromkeys(faults)), compared)
+
+
+def _rotors(model: Model) -> list[Rotor]:
+    links = model.rotor_links()
+    motors = {model.motor_number(motor): motor for motor in model.motors()}
+    rotors = []
+    for index, (link, turns) in sorted(links.items()):
+        numbers = {}
+        for child in motors[index].children:
+            value = number(child, model.text)
+            if value is not None:
+                numbers[child.tag] = value
+        place = model.pose_of_link(link).position
+        rotors.append(Rotor(index, place, turns, numbers, _radius(link, model.text)))
+    return rotors
+
+
+def _radius(link: Element, text: str) -> float | None:
+    """Return the radius in m of a rotor's collision disc."""
+    for collision in link.all("collision"):
+        for radius in collision.all("radius"):
+            return number(radius, text)
+    return None
+
+
+def _of_bodies(model: Model) -> Iterator[str]:
+    """Yield links whose mass or inertia no body has."""
+    for link, body in inertials(model):
+        name = link.attributes.get("name", "")
+        moments = np.linalg.eigvalsh(body.inertia)
+        if body.mass <= 0:
+            yield f"link {name}: its mass {body.mass:g} kg is not positive"
+        elif moments[0] <= 0:
+            yield f"link {name}: no body has a moment of inertia of {moments[0]:.3g} kg m²"
+        elif moments[2] > (moments[0] + moments[1]) * 1.001:
+            yield (
+                f"link {name}: no body has the inertia {_listed(moments)} kg m²: the largest "
+                "moment is more than the other two together"
+            )
+
+
+def _of_whole(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield what is wrong with the inertia of the whole for its size."""
+    arm = max(float(np.hypot(*(r.place - whole.pose.position)[:2])) for r in rotors)
+    if arm <= 0:
+        return
+    shares = np.sqrt(np.maximum(np.diag(whole.inertia), 0.0) / whole.mass) / arm
+    low, high = RADIUS_OF_GYRATION
+    if shares.min() < low or shares.max() > high:
+        yield (
+            f"inertia {_listed(np.diag(whole.inertia))} kg m²: radii of gyration of "
+            f"{_listed(shares)} arms of {arm:.3g} m, vehicles have {low} to {high}: is it in "
+            "another unit?"
+        )
+
+
+def _of_rotors(rotors: list[Rotor], model: Model) -> Iterator[str]:
+    """Yield what is wrong with single motors, or differs between them."""
+    for rotor in rotors:
+        where, given = f"rotor {rotor.number}", rotor.numbers
+        for tag in ("motorConstant", "momentConstant", "timeConstantUp", "timeConstantDown"):
+            if tag not in given:
+                yield f"{where}: it has no {tag}, and the plugin's default flies"
+        for tag in ("timeConstantUp", "timeConstantDown"):
+            value = given.get(tag)
+            if value is not None and not TIME_CONSTANT[0] <= value <= TIME_CONSTANT[1]:
+                hint = ": is it in ms?" if value > TIME_CONSTANT[1] else ""
+                yield f"{where}: {tag} {value:g} s is no motor's ({_range(TIME_CONSTANT)} s){hint}"
+        moment = given.get("momentConstant")
+        if moment is not None and not MOMENT_CONSTANT[0] <= moment <= MOMENT_CONSTANT[1]:
+            yield (
+                f"{where}: momentConstant {moment:g} m is no propeller's "
+                f"({_range(MOMENT_CONSTANT)} m): it is drag torque over thrust, not 60/(2π kV)"
+            )
+        limit = given.get("maxRotVelocity")
+        tip = None if limit is None or rotor.radius is None else limit * rotor.radius
+        if limit is not None and (limit > FASTEST or (tip is not None and tip > TIP_SPEED)):
+            yield (
+                f"{where}: maxRotVelocity {limit:g} rad/s is too fast for its propeller; is it in "
+                f"rpm? that would be {limit * RPM:.4g} rad/s"
+            )
+        slow = given.get("rotorVelocitySlowdownSim")
+        if slow is None or not SLOWDOWN[0] <= slow <= SLOWDOWN[1]:
+            shown = "is missing" if slow is None else f"{slow:g} is not {_range(SLOWDOWN)}"
+            yield f"{where}: rotorVelocitySlowdownSim {shown} (PX4's models have 10)"
+        if rotor.turns not in ("ccw", "cw"):
+            yield f"{where}: turningDirection is '{rotor.turns}', not ccw or cw"
+    for tag in sorted({tag for rotor in rotors for tag in rotor.numbers} - {"motorNumber"}):
+        values = {rotor.numbers.get(tag) for rotor in rotors}
+        known = [value for value in values if value is not None]
+        if known and (None in values or max(known) - min(known) > SAME_SHARE * abs(max(known))):
+            found = ", ".join(f"rotor {r.number} {r.numbers.get(tag)}" for r in rotors)
+            yield f"{tag} differs between rotors: {found}"
+    fewer = len(model.motors()) - len(rotors)
+    if fewer > 0:
+        yield f"{fewer} motor plugins share a motorNumber with another, or name no link"
+
+
+def _of_layout(whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield what is wrong with where rotors sit and how they turn."""
+    senses = [rotor.turns for rotor in rotors]
+    if senses.count("ccw") != senses.count("cw"):
+        yield (
+            f"turningDirection: {senses.count('ccw')} rotors turn ccw and {senses.count('cw')} cw: "
+            "their torques do not cancel"
+        )
+        return
+    arms = np.array([rotor.place - whole.pose.position for rotor in rotors])
+    if len(rotors) == 4:
+        angle = np.arctan2(arms[:, 1], arms[:, 0])
+        order = [rotors[i] for i in np.argsort(angle)]
+        if any(a.turns == b.turns for a, b in zip(order, order[1:] + order[:1], strict=True)):
+            yield "turningDirection: neighbouring rotors turn the same way: no yaw is commanded"
+    off = arms[:, :2].mean(axis=0)
+    reach = float(np.abs(arms[:, :2]).max())
+    if np.hypot(*off) > max(SAME_PLACE, 0.1 * reach):
+        yield (
+            f"the centre of mass is {_listed(off)} m off the middle of the rotors along x and y, "
+            f"with arms of {reach:.3g} m"
+        )
+
+
+def _speeds(
+    model: Model, rotors: list[Rotor], given: Mapping[str, float]
+) -> tuple[float, float] | None:
+    """Return the rotor speeds in rad/s at no and at full command; None where nothing says them."""
+    limit = min((r.numbers.get("maxRotVelocity", math.inf) for r in rotors), default=math.inf)
+    for channel in model.channels():
+        numbers = {child.tag: number(child, model.text) for child in channel.children}
+        scaling, zero = numbers.get("input_scaling"), numbers.get("zero_position_armed")
+        if scaling is not None and zero is not None:
+            low = (numbers.get("input_offset") or 0.0) * scaling + zero
+            return low, min(low + scaling, limit)
+    least, most = given.get("SIM_GZ_EC_MIN1"), given.get("SIM_GZ_EC_MAX1")
+    if most is not None:
+        return float(least or 0.0), min(float(most), limit)
+    return None if math.isinf(limit) else (0.0, limit)
+
+
+def _of_hover(
+    whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
+) -> Iterator[str]:
+    """Yield what is wrong with thrust to weight and with the hover."""
+    if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
+        return
+    constant = sum(rotor.numbers["motorConstant"] for rotor in rotors)
+    low, high = speeds
+    if constant <= 0 or high <= low:
+        yield f"motorConstant and speeds of {low:g} to {high:g} rad/s give no thrust"
+        return
+    weight = whole.mass * GRAVITY
+    ratio = constant * high**2 / weight
+    if not THRUST_TO_WEIGHT[0] <= ratio <= THRUST_TO_WEIGHT[1]:
+        yield (
+            f"full thrust is {ratio:.3g} times the weight of {whole.mass:.4g} kg, vehicles have "
+            f"{_range(THRUST_TO_WEIGHT)}: mass, motorConstant (N s²/rad², not per rpm²) or speeds "
+            "are off"
+        )
+        return
+    hover = (math.sqrt(weight / constant) - low) / (high - low)
+    if not HOVER[0] <= hover <= HOVER[1]:
+        yield (
+            f"it hovers at a throttle of {hover:.2f}, with rotors of {low:g} to {high:g} rad/s; "
+            f"PX4 accepts {_range(HOVER)}"
+        )
+
+
+def _of_parameters(
+    given: Mapping[str, float],
+    whole: Inertial,
+    rotors: list[Rotor],
+    speeds: tuple[float, float] | None,
+) -> Iterator[str]:
+    """Yield where PX4's parameters and the model disagree."""
+    count = given.get("CA_ROTOR_COUNT")
+    if count is not None and count != len(rotors):
+        yield f"CA_ROTOR_COUNT is {count:g}, the model has {len(rotors)} rotors"
+    for rotor in rotors:
+        name = f"CA_ROTOR{rotor.number}"
+        arm = rotor.place - whole.pose.position
+        for key, expected in (("PX", arm[0]), ("PY", -arm[1])):
+            value = given.get(f"{name}_{key}")
+            if value is not None and abs(value - expected) > SAME_PLACE:
+                yield f"{name}_{key} is {value:g} m, rotor {rotor.number} sits at {expected:.3g} m"
+        turn = given.get(f"{name}_KM")
+        if turn and rotor.turns in ("ccw", "cw") and (turn > 0) != (rotor.turns == "ccw"):
+            yield f"{name}_KM {turn:g} says the other turning direction than {rotor.turns}"
+    mass = given.get("SIH_MASS")
+    if mass is not None and not math.isclose(mass, whole.mass, rel_tol=SAME_SHARE):
+        yield f"SIH_MASS is {mass:g} kg, the model weighs {whole.mass:.4g} kg"
+    hover = given.get("MPC_THR_HOVER")
+    constant = sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
+    if hover is not None and speeds is not None and constant > 0 and "SIH_T_MAX" not in given:
+        low, high = speeds
+        there = (math.sqrt(whole.mass * GRAVITY / constant) - low) / (high - low)
+        if abs(hover - there) > SAME_SHARE:
+            yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
+
+
+def _against(run: Run, whole: Inertial, rotors: list[Rotor]) -> Iterator[str]:
+    """Yield how far each number is from the fitted one."""
+    fitted = values_of(run.vehicle)
+    first = rotors[0].numbers
+    there = {
+        "mass": whole.mass,
+        **{f"inertia_{a}{a}": float(whole.inertia[i, i]) for i, a in enumerate("xyz")},
+        "motor_constant": first.get("motorConstant"),
+        "moment_constant": first.get("momentConstant"),
+        "time_constant_up": first.get("timeConstantUp"),
+        "time_constant_down": first.get("timeConstantDown"),
+        "rotor_drag_coefficient": first.get("rotorDragCoefficient"),
+    }
+    for name, value in there.items():
+        if value is None or not fitted.get(name):
+            continue
+        row = run.result.coefficients.get(name)
+        error = None if row is None else row.std_error
+        beyond = f", {abs(value - fitted[name]) / error:.3g} standard errors" if error else ""
+        share = value / fitted[name] - 1
+        yield f"{name} {value:.4g}, fitted {fitted[name]:.4g}: {share:+.1%}{beyond}"
+
+
+def _listed(values: Iterable[float]) -> str:
+    return "(" + ", ".join(f"{value:.3g}" for value in values) + ")"
+
+
+def _range(limits: tuple[float, float]) -> str:
+    return f"{limits[0]:g} to {limits[1]:g}"

@@ -1,0 +1,161 @@
+"""Parameters of drone-models, which crazyflow flies: a table of its ``params.toml``."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.config import VehicleFile
+from tuner.disk import file_name
+from tuner.exporters.draft import Draft, Gate, differences, read_file
+from tuner.exporters.elsewhere import flier
+from tuner.exporters.hover import rotor_speed, thrust_at
+from tuner.exporters.simulators import DRONE_MODELS
+from tuner.exporters.target import Choices, Target
+from tuner.numerics import GRAVITY
+from tuner.yaml_files.document import commented
+
+Array = NDArray[np.float64]
+
+RPM = 2 * math.pi / 60
+"""rad/s of one rpm."""
+PLACES_AGREE = 0.005
+"""m within which arms count as alike."""
+
+
+def params(vehicle: VehicleFile) -> dict[str, Any]:
+    """Return the parameters of its first-principles model, of a vehicle as it flies it."""
+    aero, motor, inertia = vehicle.aerodynamics, vehicle.motor, vehicle.inertia
+    thrust = aero.motor_constant * RPM**2
+    x, y = ([math.copysign(1.0, r.position[axis]) for r in vehicle.rotors] for axis in (0, 1))
+    drag = [-vehicle.effects.get(f"linear_drag_{axis}", 0.0) for axis in "xyz"]
+    return {
+        "gravity_vec": [0.0, 0.0, -GRAVITY],
+        "mass": vehicle.mass,
+        "L": abs(vehicle.rotors[0].position[0]),
+        "J": _diagonal([inertia.xx, inertia.yy, inertia.zz]),
+        "rpm2thrust": [0.0, 0.0, thrust],
+        "rpm2torque": [0.0, 0.0, thrust * aero.moment_constant],
+        "thrust2torque": aero.moment_constant,
+        "rotor_dyn_coef": [1 / motor.time_constant_up, 0.0, 1 / motor.time_constant_down, 0.0],
+        "mixing_matrix": [
+            y,
+            [-side for side in x],
+            [-1.0 if rotor.spin == "ccw" else 1.0 for rotor in vehicle.rotors],
+        ],
+        "drag_matrix": _diagonal(drag),
+        "thrust_min": thrust_at(vehicle, rotor_speed(vehicle, 0.0)),
+        "thrust_max": thrust_at(vehicle, rotor_speed(vehicle, 1.0)),
+        "prop_inertia": vehicle.effects.get("rotor_inertia", 0.0),
+    }
+
+
+def _diagonal(values: list[float]) -> list[list[float]]:
+    return [[v if i == j else 0.0 for j in range(3)] for i, v in enumerate(values)]
+
+
+def flattened(content: dict[str, Any]) -> dict[str, float]:
+    """Return key and place -> number of parameters that may be lists."""
+    numbers: dict[str, float] = {}
+    for name, value in content.items():
+        if isinstance(value, list):
+            numbers |= flattened({f"{name}[{i}]": item for i, item in enumerate(value)})
+        else:
+            numbers[name] = float(value)
+    return numbers
+
+
+def drone_models_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+    """Return a table to put into drone-models' ``data/params.toml``."""
+    flown = DRONE_MODELS.flown(vehicle)
+    wanted, key = params(flown), file_name(vehicle.name, "")
+    lines = "".join(f"{name} = {value!r}\n" for name, value in wanted.items())
+
+    def faults(path: Path) -> list[str]:
+        return differences(flattened(wanted), flattened(tomllib.loads(read_file(path))[key]))
+
+    text = f'{commented(provenance)}["{key}"]\n{lines}'
+    arms = [abs(r.position[axis]) for r in vehicle.rotors for axis in (0, 1)]
+    apart = max(arms) - min(arms)
+    other = (f"its rotors sit in no square: arms of {min(arms):g} to {max(arms):g} m",)
+    counts = () if vehicle.is_quad else ("it has four rotors",)
+    square = other if apart > PLACES_AGREE else ()
+    return Draft(
+        text,
+        flown,
+        (),
+        faults,
+        gates=(Gate("the simulator has such rotors", square or counts),),
+        flier=_flier(wanted),
+    )
+
+
+def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
+    """Return what flies parameters with drone-models' dynamics; None where it is not installed.
+
+    It flies with the environment variable SCIPY_ARRAY_API=1, without which it refuses to load.
+    Its functions give derivatives: a step is one of Runge and Kutta's of fourth order.
+    """
+    try:
+        from drone_models.first_principles import dynamics  # noqa: PLC0415
+    except (ImportError, RuntimeError):  # it wants SCIPY_ARRAY_API=1 from the start
+        return None
+    names = ("mass", "L", "prop_inertia", "gravity_vec", "J", "rpm2thrust", "rpm2torque")
+    arrays = {
+        name: np.asarray(content[name])
+        for name in (*names, "mixing_matrix", "drag_matrix", "rotor_dyn_coef")
+    }
+    inverse = np.linalg.inv(arrays["J"])
+
+    class Flying:
+        """As of `tuner.exporters.elsewhere.Body`."""
+
+        def __init__(self, step: float) -> None:
+            self.period, self.state = step, np.zeros(17)
+
+        def begin(self, state: Array, rotor_speed: Array) -> None:
+            # position, attitude x y z w, velocity, body rate, rotor speeds in rpm
+            order = [0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]
+            self.state = np.concatenate([state[order], rotor_speed / RPM])
+
+        def step(self, asked: Array) -> Array:
+            def change(s: Array) -> Array:
+                found = dynamics(
+                    s[:3], s[3:7], s[7:10], s[10:13], asked / RPM, s[13:], J_inv=inverse, **arrays
+                )
+                found = list(found)
+                found[1] = _turning(s[3:7], s[10:13])
+                return np.concatenate(found)
+
+            state, period = self.state, self.period
+            first = change(state)
+            second = change(state + 0.5 * period * first)
+            third = change(state + 0.5 * period * second)
+            fourth = change(state + period * third)
+            state = state + period / 6 * (first + 2 * second + 2 * third + fourth)
+            state[3:7] /= np.linalg.norm(state[3:7])
+            self.state = state
+            return state[[0, 1, 2, 7, 8, 9, 6, 3, 4, 5, 10, 11, 12]]
+
+        def rotor_speed(self) -> Array:
+            return self.state[13:] * RPM
+
+    return flier(Flying)
+
+
+def _turning(attitude: Array, rate: Array) -> Array:
+    """Return the change of a quaternion (x, y, z, w); that of drone-models is not to be used."""
+    vector, scalar = attitude[:3], attitude[3]
+    change = scalar * rate + np.cross(vector, rate)
+    return 0.5 * np.append(change, -vector @ rate)
+
+
+TARGET = Target(
+    "drone-models", ".toml", drone_models_draft, DRONE_MODELS.entry, simulator=DRONE_MODELS
+)

@@ -1,0 +1,114 @@
+"""Isaac Lab's multirotor: a Python module with keyword arguments of its configuration classes."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+from typing import Any
+
+from tuner.config import VehicleFile
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.hover import hover_speed, rotor_speed, thrust_at
+from tuner.exporters.simulators import ISAAC_LAB
+from tuner.exporters.target import Choices, Target
+from tuner.exporters.targets.drone_models import flattened
+from tuner.yaml_files.document import commented
+
+TURN = 2 * math.pi
+"""rad of a turn: Isaac Lab counts rotor speeds in turns per second."""
+_USE = """
+# from isaaclab_contrib.actuators import ThrusterCfg
+# from isaaclab_contrib.assets import MultirotorCfg
+# thruster = ThrusterCfg(dt=SIMULATION_STEP, thruster_names_expr=[PROPELLER_JOINTS], **THRUSTER)
+# cfg = MultirotorCfg(actuators={"thrusters": thruster}, **MULTIROTOR)
+# mass and inertia go into the USD's MassAPI, RIGID_PROPS into RigidBodyPropertiesCfg
+"""
+
+
+def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
+    """Return name of a class's arguments -> them, of a vehicle as Isaac Lab flies it.
+
+    Ranges that are sampled from are a number twice; ``--draws`` gives wider ones.
+    """
+    motor, aero, inertia = vehicle.motor, vehicle.aerodynamics, vehicle.inertia
+    constant = aero.motor_constant * TURN**2
+    spins = [1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors]
+    x, y = ([rotor.position[axis] for rotor in vehicle.rotors] for axis in (0, 1))
+    none = [0.0] * len(vehicle.rotors)
+    return {
+        "THRUSTER": {
+            "thrust_range": [
+                thrust_at(vehicle, rotor_speed(vehicle, command)) for command in (0.0, 1.0)
+            ],
+            "thrust_const_range": [constant, constant],
+            "tau_inc_range": [motor.time_constant_up] * 2,
+            "tau_dec_range": [motor.time_constant_down] * 2,
+            "torque_to_thrust_ratio": aero.moment_constant,
+            "use_discrete_approximation": False,
+            "integration_scheme": "rk4",
+        },
+        "MULTIROTOR": {
+            "rotor_directions": [int(-spin) for spin in spins],
+            "allocation_matrix": [
+                none,
+                none,
+                [1.0] * len(vehicle.rotors),
+                y,
+                [-arm for arm in x],
+                [-spin * aero.moment_constant for spin in spins],
+            ],
+        },
+        "RIGID_PROPS": {
+            # PhysX damps v' = -damping v, in 1/s
+            "linear_damping": vehicle.effects.get("linear_drag_x", 0.0) / vehicle.mass,
+            "angular_damping": vehicle.effects.get("angular_drag_x", 0.0) / inertia.xx,
+        },
+        "BODY": {
+            "mass": vehicle.mass,
+            "diagonal_inertia": [inertia.xx, inertia.yy, inertia.zz],
+            "hover_rps": hover_speed(vehicle) / TURN,
+        },
+    }
+
+
+def read_configuration(path: Path) -> dict[str, dict[str, Any]]:
+    """Read what this target wrote; nothing is run."""
+    return {
+        statement.targets[0].id: ast.literal_eval(statement.value)
+        for statement in ast.parse(read_file(path)).body
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name)
+    }
+
+
+def _numbers(content: dict[str, dict[str, Any]]) -> dict[str, float]:
+    return {
+        f"{section}.{name}": number
+        for section, values in content.items()
+        for name, number in flattened(
+            {name: value for name, value in values.items() if not isinstance(value, str)}
+        ).items()
+    }
+
+
+def isaaclab_text(content: dict[str, dict[str, Any]], provenance: str) -> str:
+    """Return the module."""
+    pieces = []
+    for section, values in content.items():
+        lines = "".join(f"    {name!r}: {value!r},\n" for name, value in values.items())
+        pieces.append(f"{section} = {{\n{lines}}}\n")
+    return commented(provenance) + "\n".join(pieces) + _USE
+
+
+def isaaclab_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+    """Return arguments of ``ThrusterCfg`` and ``MultirotorCfg`` for a vehicle."""
+    flown = ISAAC_LAB.flown(vehicle)
+    wanted = configuration(flown)
+
+    def faults(path: Path) -> list[str]:
+        return differences(_numbers(wanted), _numbers(read_configuration(path)))
+
+    return Draft(isaaclab_text(wanted, provenance), flown, (), faults)
+
+
+TARGET = Target("isaaclab", "_isaaclab.py", isaaclab_draft, ISAAC_LAB.entry, simulator=ISAAC_LAB)

@@ -1,0 +1,43 @@
+"""JSON of a vehicle for a simulator of one's own: every number, its unit, and what follows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tuner.coefficients import COEFFICIENTS, Written
+from tuner.config import VehicleFile, values_of
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.hover import full_thrust, hover_command, hover_speed, thrust_to_weight
+from tuner.exporters.target import Choices, Target
+
+
+def json_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+    """Return coefficients with units, rotors (forward, left, up; m), and thrust and hover."""
+    values = values_of(vehicle) | {"max_rotor_velocity": vehicle.motor.max_rotor_velocity}
+    content = {
+        "name": vehicle.name,
+        "provenance": provenance,
+        "frame": "body: x forward, y left, z up; spin seen from above",
+        "coefficients": values,
+        "units": {
+            name: COEFFICIENTS[name].unit if name in COEFFICIENTS else "rad/s" for name in values
+        },
+        "meanings": {name: COEFFICIENTS[name].meaning for name in values if name in COEFFICIENTS},
+        "rotors": [rotor.model_dump(mode="json") for rotor in vehicle.rotors],
+        "derived": {
+            "full_thrust_of_one_rotor_N": full_thrust(vehicle),
+            "thrust_to_weight": thrust_to_weight(vehicle),
+            "hover_rotor_speed_rad_s": hover_speed(vehicle),
+            "hover_command": hover_command(vehicle),
+        },
+    }
+
+    def faults(path: Path) -> list[str]:
+        return differences(values, json.loads(read_file(path))["coefficients"])
+
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return Draft(text, vehicle, (), faults)
+
+
+TARGET = Target("json", ".json", json_draft, lambda row: Written(".".join(row.place)))

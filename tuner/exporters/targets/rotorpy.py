@@ -1,0 +1,121 @@
+"""RotorPy's parameters: a Python module with ``quad_params``, as its vehicles have."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.config import VehicleFile
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.elsewhere import flier
+from tuner.exporters.hover import rotor_speed
+from tuner.exporters.simulators import ROTORPY
+from tuner.exporters.target import Choices, Target
+from tuner.yaml_files.document import commented
+
+Array = NDArray[np.float64]
+
+
+def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
+    """Return RotorPy's parameters of a vehicle as it flies it, its arrays as lists.
+
+    Its commands are rotor speeds; a command 0..1 asks for ``input_scaling``·u +
+    ``zero_position_armed`` of them.
+    """
+    inertia, motor, aero = vehicle.inertia, vehicle.motor, vehicle.aerodynamics
+    drag = vehicle.effects.get("fuselage_drag", 0.0)
+    return {
+        "mass": vehicle.mass,
+        "Ixx": inertia.xx, "Iyy": inertia.yy, "Izz": inertia.zz,
+        "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0,
+        "num_rotors": len(vehicle.rotors),
+        "rotor_pos": {f"r{i + 1}": list(r.position) for i, r in enumerate(vehicle.rotors)},
+        "rotor_directions": [-1 if rotor.spin == "ccw" else 1 for rotor in vehicle.rotors],
+        "rI": [0.0, 0.0, 0.0],
+        "c_Dx": drag, "c_Dy": drag, "c_Dz": drag,
+        "k_eta": aero.motor_constant,
+        "k_m": aero.motor_constant * aero.moment_constant,
+        "k_d": aero.rotor_drag_coefficient,
+        "k_z": vehicle.effects.get("thrust_inflow_coefficient", 0.0),
+        "k_h": 0.0,
+        "k_flap": vehicle.effects.get("flapping_moment_coefficient", 0.0),
+        "tau_m": motor.time_constant_up,
+        "rotor_speed_min": rotor_speed(vehicle, 0.0),
+        "rotor_speed_max": rotor_speed(vehicle, 1.0),
+        "motor_noise_std": 0.0,
+    }  # fmt: skip
+
+
+def read_params(path: Path) -> dict[str, Any]:
+    """Read ``quad_params`` of a module that this target wrote; nothing is run."""
+    for statement in ast.parse(read_file(path)).body:
+        if isinstance(statement, ast.Assign) and getattr(statement.targets[0], "id", "") == "_P":
+            params: dict[str, Any] = ast.literal_eval(statement.value)
+            return params
+    return {}
+
+
+def rotorpy_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
+    """Return a Python module that RotorPy's ``Multirotor`` takes ``quad_params`` from."""
+    flown = ROTORPY.flown(vehicle)
+    params = quad_params(flown)
+    wanted = {name: value for name, value in params.items() if isinstance(value, float)}
+    lines = "".join(f"    {name!r}: {value!r},\n" for name, value in params.items())
+    text = (
+        f"{commented(provenance)}import numpy as np\n\n_P = {{\n{lines}}}\nquad_params = {{\n"
+        "    **_P,\n    'rotor_pos': {name: np.array(r) for name, r in _P['rotor_pos'].items()},\n"
+        "    'rotor_directions': np.array(_P['rotor_directions']),\n"
+        "    'rI': np.array(_P['rI']),\n}\n"
+    )
+    return Draft(
+        text,
+        flown,
+        (),
+        lambda path: differences(wanted, read_params(path)),
+        flier=_flier(params),
+    )
+
+
+def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
+    """Return what flies parameters in RotorPy; None where that is not installed."""
+    try:
+        from rotorpy.vehicles.multirotor import Multirotor  # noqa: PLC0415
+    except ImportError:
+        return None
+    arrays = params | {
+        "rotor_pos": {name: np.array(place) for name, place in params["rotor_pos"].items()},
+        "rotor_directions": np.array(params["rotor_directions"]),
+        "rotor_speed_min": 0.0,
+        "rotor_speed_max": 10.0 * params["rotor_speed_max"],  # what is asked for is in its range
+    }
+
+    class Flying:
+        """As of `tuner.exporters.elsewhere.Body`."""
+
+        def __init__(self, step: float) -> None:
+            self.vehicle, self.period = Multirotor(arrays), step
+            self.state: dict[str, Array] = {}
+
+        def begin(self, state: Array, rotor_speed: Array) -> None:
+            x, v, q, w = state[:3], state[3:6], state[[7, 8, 9, 6]], state[10:13]
+            wind = np.zeros(3)
+            self.state = {"x": x, "v": v, "q": q, "w": w, "wind": wind, "rotor_speeds": rotor_speed}
+
+        def step(self, asked: Array) -> Array:
+            control = {"cmd_motor_speeds": asked}
+            self.state = self.vehicle.step(self.state, control, self.period)
+            x, v, q, w = (self.state[key] for key in "xvqw")
+            return np.concatenate([x, v, q[[3, 0, 1, 2]], w])
+
+        def rotor_speed(self) -> Array:
+            return self.state["rotor_speeds"]
+
+    return flier(Flying)
+
+
+TARGET = Target("rotorpy", "_params.py", rotorpy_draft, ROTORPY.entry, simulator=ROTORPY)
