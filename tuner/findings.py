@@ -55,6 +55,9 @@ class Code(StrEnum):
     SEES_MARKERS = "sees_markers"  # seen: 1 if position and attitude control see them, else 0
     CLOCK_OFFSET = "clock_offset"  # seconds; names: the clock
     TURNING_UNEXPLAINED = "turning_unexplained"  # explained (share)
+    TURNING_REGRESSED = "turning_regressed"  # explained_AXIS (shares), gain_AXIS, seconds
+    TURNING_NOT_PREDICTED = "turning_not_predicted"  # likewise, no seconds
+    HOLDING_BETTER = "holding_better"  # seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
     INERTIA_BALANCED = "inertia_balanced"  # error, NAME_fitted, NAME_balanced; names: NAMEs
     INERTIA_NOT_BALANCED = "inertia_not_balanced"  # likewise
     DISTURBANCES_FOLLOWED = "disturbances_followed"  # gust, thrust (shares), both _seconds

@@ -149,9 +149,9 @@ class FlightResult(Part):
     rmse_fitted_starts
         With the best coefficients where each window's start and trim are fitted to the window: how
         well it can be met, not how well it is predicted. None for a flight simulated whole.
-    predicted_initial, predicted_best
-        Open-loop predictions with the initial and the best coefficients, by how far they look
-        ahead; empty for a flight simulated whole.
+    predicted_initial, predicted_best, predicted_holding
+        Open-loop predictions with the initial and the best coefficients, and that the state stays
+        as it is, by how far they look ahead; empty for a flight simulated whole.
     """
 
     name: str
@@ -169,6 +169,7 @@ class FlightResult(Part):
     rmse_fitted_starts: AxesRmse | None = None
     predicted_initial: tuple[PredictedErrors, ...] = ()
     predicted_best: tuple[PredictedErrors, ...] = ()
+    predicted_holding: tuple[PredictedErrors, ...] = ()
 
 
 class SearchResult(Part):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeAlias
 
+import jax.numpy as jnp
+
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms import body, inflow, rotor
 from sim_jax.terms.air import Air
@@ -49,7 +51,8 @@ def total_wrench(vehicle: Vehicle, motion: Motion, rotor_speed: PerRotor, air: A
         force, moment = force + at_rotor, moment + arm.cross(at_rotor)
     for wrench in wrenches:
         force, moment = force + wrench.force, moment + wrench.moment
-    return Wrench(force, moment)
+    unseen = _unseen(vehicle, motion, moment)
+    return Wrench(force, moment if unseen is None else moment + unseen)
 
 
 def wrench_of_each_term(
@@ -61,11 +64,14 @@ def wrench_of_each_term(
     add up to `total_wrench`.
     """
     acting = {term.__name__: term(vehicle, motion, rotor_speed, air) for term in TERMS}
-    return {
+    wrenches = {
         name: _about_center_of_mass(wrench, air)
         for name, wrench in acting.items()
         if wrench is not None
     }
+    zero = Vec3.zeros(air.velocity.x)
+    unseen = _unseen(vehicle, motion, sum((w.moment for w in wrenches.values()), start=zero))
+    return wrenches if unseen is None else wrenches | {"torque_gain": Wrench(zero, unseen)}
 
 
 def _about_center_of_mass(wrench: Wrench, air: Air) -> Wrench:
@@ -73,3 +79,19 @@ def _about_center_of_mass(wrench: Wrench, air: Air) -> Wrench:
     for arm, at_rotor in zip(air.arms, wrench.at_rotors, strict=False):
         force, moment = force + at_rotor, moment + arm.cross(at_rotor)
     return Wrench(force, moment)
+
+
+def _unseen(vehicle: Vehicle, motion: Motion, moment: Vec3) -> Vec3 | None:
+    """Return (torque_gain - 1)·(M - ω × Iω), axis by axis: what of a moment is not seen to turn.
+
+    No physics: a loop's rotors answer what disturbs the vehicle. Where their speeds are recorded
+    and what they answer is not, less than all of the angular acceleration that they stand for
+    predicts how the vehicle turns (Ljung, System Identification, 13.4).
+    """
+    names = [f"torque_gain_{axis}" for axis in "xyz"]
+    if not any(name in vehicle.effects for name in names):
+        return None
+    body, rate, whole = vehicle.body, motion.body_rate, jnp.ones_like(moment.x)
+    momentum = rate.scaled_by(Vec3(body.inertia_xx, body.inertia_yy, body.inertia_zz))
+    x, y, z = (vehicle.effects.get(name, whole) - 1.0 for name in names)
+    return Vec3(x, y, z).scaled_by(moment - rate.cross(momentum))

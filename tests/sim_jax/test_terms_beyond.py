@@ -13,7 +13,7 @@ from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover_speed
 from sim_jax.terms.air import Air
-from sim_jax.terms.total import total_wrench
+from sim_jax.terms.total import total_wrench, wrench_of_each_term
 from tests.sim_jax.support import quaternion, vec, vehicle
 from tuner.coefficients import REGISTRY
 
@@ -152,3 +152,21 @@ def test_the_battery_scales_reference_speeds_and_declines():
     assert float(falling) == pytest.approx(1 - 0.01 * 8 / 400)
     assert Environment().speed_factor(jnp.asarray(0.8), step, schedule) is None
     assert Environment(log_voltage=volts).speed_factor(None, step, schedule) is None
+
+
+def test_gains_are_shares_of_the_angular_acceleration_about_each_axis():
+    def turning(craft):
+        air = Air.around(craft, MOVING, Environment(), ACCELERATIONS)
+        moment = total_wrench(craft, MOVING, SPEEDS, air).moment
+        return np.asarray(angular_acceleration(craft.body, MOVING.body_rate, moment).stacked())
+
+    gains = {"torque_gain_x": 0.4, "torque_gain_z": 0.9}
+    np.testing.assert_allclose(turning(with_effects(**gains)), [0.4, 1.0, 0.9] * turning(CRAFT))
+
+
+def test_terms_add_up_with_gains():
+    craft = with_effects(torque_gain_y=0.3, flapping_moment_coefficient=1e-5)
+    air = Air.around(craft, MOVING, Environment(), ACCELERATIONS)
+    whole = total_wrench(craft, MOVING, SPEEDS, air).moment.stacked()
+    each = wrench_of_each_term(craft, MOVING, SPEEDS, air).values()
+    np.testing.assert_allclose(sum(one.moment.stacked() for one in each), whole, rtol=1e-12)

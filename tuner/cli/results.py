@@ -198,16 +198,26 @@ def _predictions(result: RunResult) -> Table:
     """Return the open-loop predictions' errors, before and after the fit."""
     from tuner.wording.result import PREDICTED
 
-    title = "Open-loop predictions from recorded states: mean error, initial → best coefficients"
+    title = (
+        "Open-loop predictions from recorded states: mean error, initial → best coefficients (of a "
+        "state that stays)"
+    )
     errors = [f"{name.replace('_', ' ')} {unit}" for name, unit in PREDICTED.items()]
     table = columns_of(title, left=("flight",), right=("after", *errors))
     for flight in result.flights:
         held_out = " (held out)" if flight.split == "holdout" else ""
-        for before, after in zip(flight.predicted_initial, flight.predicted_best, strict=True):
+        rows = zip(
+            flight.predicted_initial,
+            flight.predicted_best,
+            flight.predicted_holding or (None,) * len(flight.predicted_best),
+            strict=True,
+        )
+        for before, after, held in rows:
             cells = [
                 NOT_SIMULATED
                 if getattr(before, name) is None and getattr(after, name) is None
                 else f"{_number(getattr(before, name))} → {_number(getattr(after, name))}"
+                + ("" if held is None else f" ({_number(getattr(held, name))})")
                 for name in PREDICTED
             ]
             table.add_row(flight.name + held_out, f"{after.seconds:g} s", *cells)

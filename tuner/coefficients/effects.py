@@ -267,4 +267,24 @@ EFFECT_ROWS = (
             ("z", 0.003, "blades that turn against the air, not the body: -c·ω, c = 2·k_m·k_f·ΣΩ"),
         )
     ),
+    *(
+        Coefficient(
+            name=f"torque_gain_{axis}",
+            unit="",
+            meaning=f"share of the angular acceleration about {direction} that predicts turning",
+            source="Ljung, System Identification, 13.4: inputs that answer unseen disturbances",
+            place=(EFFECTS, f"torque_gain_{axis}"),
+            bounds=50.0,
+            prior_sd=0.7,
+            step=0.2,
+            neutral=1.0,
+            exported_as={
+                target: NotCarried(
+                    "a simulated loop's rotors answer what it simulates, and no more"
+                )
+                for target in ("sdf", "px4")
+            },
+        )
+        for axis, direction in _AXES.items()
+    ),
 )

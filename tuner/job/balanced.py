@@ -170,7 +170,11 @@ def with_inputs_balanced(
     segments = objective.segments
     model = objective.tunable.at(jnp.asarray(fitted.point.coefficients))
     moved = bool(objective.conditions) or markers_of(model.vehicle) is not None
-    if moved or any(inlet != "rotor_speed" for inlet in job.inlets):
+    if (
+        moved
+        or job.accelerations is not None
+        or any(inlet != "rotor_speed" for inlet in job.inlets)
+    ):
         return fitted, examination, ()
     on_message("Balancing the recorded motion and the rotor speeds.")
     balance = balance_of(objective, fitted.point, job.fitted)

@@ -11,9 +11,11 @@ from tuner.coefficients import COEFFICIENTS
 from tuner.comparison.errors import FlightErrors, Pose
 from tuner.config import VehicleFile
 from tuner.findings import Code, Finding, Level
+from tuner.job.held_out import Validation
 from tuner.job.prepare import Job
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
+from tuner.prediction.predict import UNITS
 from tuner.search.fitted import Fitted
 from tuner.search.loop import Loop, loop_of
 from tuner.uncertainty.estimates import Uncertainty
@@ -196,6 +198,28 @@ def flights_worse(
                 findings.append(
                     Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
                 )
+    return tuple(findings)
+
+
+def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
+    """Return what of a flight is predicted no better than by leaving it as it is, in the mean."""
+    findings = []
+    for recording in job.recordings:
+        name = recording.flight.name
+        pairs = zip(
+            validation.predicted_best.get(name, ()),
+            validation.predicted_holding.get(name, ()),
+            strict=True,
+        )
+        for best, held in pairs:
+            numbers = {"seconds": best.seconds}
+            for quantity in UNITS:
+                of_best, of_held = getattr(best, quantity), getattr(held, quantity)
+                if of_best is not None and of_held is not None and of_best > of_held:
+                    numbers |= {quantity: of_best, f"{quantity}_held": of_held}
+            lost = tuple(quantity for quantity in UNITS if quantity in numbers)
+            if lost:
+                findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
     return tuple(findings)
 
 

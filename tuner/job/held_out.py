@@ -7,7 +7,7 @@ fitted to it, the starts of windows and their trims, makes another number with a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -39,6 +39,8 @@ class Validation:
         As ``best``, but windows start where the vehicle meets them best; flights in windows only.
     predicted_initial, predicted_best
         Open-loop predictions; flights in windows only.
+    predicted_holding
+        That the state stays as it was recorded, at the times of these predictions.
     turning_explained
         Share of the squared change of body rate that the fitted vehicle predicts; flights in
         windows only.
@@ -49,12 +51,13 @@ class Validation:
     fitted_starts: Mapping[str, FlightErrors] = field(default_factory=dict)
     predicted_initial: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     predicted_best: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
+    predicted_holding: Mapping[str, tuple[PredictedErrors, ...]] = field(default_factory=dict)
     turning_explained: Mapping[str, float] = field(default_factory=dict)
 
 
 def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
     """Fly every flight with the initial and with the fitted vehicle."""
-    comparison, initial = comparison_of(job, fitted), job.settings.vehicle
+    comparison, initial = comparison_of(job, fitted), job.given.vehicle
     predictions = _predictions(job, fitted, vehicle)
     return Validation(
         initial=comparison.fly(initial),
@@ -62,6 +65,7 @@ def validate(job: Job, fitted: Fitted, vehicle: VehicleFile) -> Validation:
         fitted_starts=comparison.fly_from_fitted_starts(vehicle),
         predicted_initial=_errors(_predictions(job, fitted, initial)),
         predicted_best=_errors(predictions),
+        predicted_holding=_errors(_held(job, predictions)),
         turning_explained={
             recording.flight.name: _turning_explained(recording.flight, predicted)
             for recording in job.recordings
@@ -87,6 +91,17 @@ def _predictions(job: Job, fitted: Fitted, vehicle: VehicleFile) -> dict[str, Pr
             input_late=recording.input_late,
         )
     return predicted
+
+
+def _held(job: Job, predictions: Mapping[str, Predictions]) -> dict[str, Predictions]:
+    """Return flight -> what is off if its state stays, of what its predictions predict."""
+    held = {}
+    for flight in job.flights:
+        if (of := predictions.get(flight.name)) is not None:
+            naive = hold(flight, of.begins, of.ahead)
+            same = {name: naive.errors[name] for name in of.errors}
+            held[flight.name] = replace(naive, errors=same)
+    return held
 
 
 def _errors(

@@ -13,6 +13,7 @@ from tuner.coefficients.space import Space, space_of
 from tuner.comparison.errors import limits_of
 from tuner.config import CHANNELS, JobFile, Settings
 from tuner.config.job import InletName
+from tuner.equation_error.estimate import Estimate
 from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
 from tuner.model import model_of, schedule_of
@@ -56,6 +57,11 @@ class Job:
         all do.
     first_terms
         Groups of terms that are free from the beginning of the search.
+    asked
+        The user's settings, where others are searched with.
+    accelerations
+        What a regression of the flights' accelerations said, where physical coefficients are its
+        (`tuner.job.accelerations`).
     """
 
     settings: Settings
@@ -65,6 +71,13 @@ class Job:
     objective: Objective
     windows: Objective | None = None
     first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    asked: Settings | None = None
+    accelerations: Estimate | None = None
+
+    @property
+    def given(self) -> Settings:
+        """The user's settings."""
+        return self.settings if self.asked is None else self.asked
 
     @property
     def flights(self) -> tuple[Flight, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from tuner.coefficients import COEFFICIENTS
-from tuner.config import VehicleFile, write_vehicle
+from tuner.config import VehicleFile, initial_values, write_vehicle
 from tuner.design.log_proposal import LogProposal
 from tuner.disk import write_text
 from tuner.files import csv_text
@@ -25,6 +25,7 @@ from tuner.job.best_fit import (
 )
 from tuner.job.held_out import Validation
 from tuner.job.prepare import Job
+from tuner.numerics import Z95
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS, whole
 from tuner.objective.inlets import INLETS, window_seconds
@@ -45,7 +46,7 @@ from tuner.result import (
 from tuner.search.fitted import Fitted
 from tuner.search.normal_equations import normal_equations
 from tuner.selection.table import SelectionRow
-from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
@@ -54,6 +55,7 @@ from tuner.uncertainty.verdict import (
     Verdict,
     judge_after_holding,
     judge_impossible_inertia,
+    judge_regressed,
 )
 from tuner.versions import PROGRAM, versions
 from tuner.wording.verdicts import judgement_in_words
@@ -160,12 +162,20 @@ def _coefficients(
         for name, ratio in parameter.ratios.items()
     }
     coefficients = {}
-    for name, initial in initial_of(job).items():
+    began = initial_values(job.given.vehicle, job.given.controller, job.space.free)
+    errors = {} if job.accelerations is None else job.accelerations.errors
+    for name, value in initial_of(job).items():
+        initial, regressed = began.get(name, value), None
+        if name in errors:
+            regressed = _regressed(name, initial, best.get(name, value), errors[name])
         if name not in best:
-            coefficients[name] = _fixed(name, initial)
+            coefficients[name] = regressed or _fixed(name, value)
+            continue
+        estimate = None if uncertainty is None else uncertainty.estimates[name]
+        if regressed is not None and estimate is not None and _rougher(regressed, estimate):
+            coefficients[name] = regressed
             continue
         lower, upper = bounds[name]
-        estimate = None if uncertainty is None else uncertainty.estimates[name]
         verdict, reason = judgements[name]
         coefficients[name] = CoefficientResult(
             unit=COEFFICIENTS[name].unit,
@@ -225,6 +235,34 @@ def with_errors_of_refits(
     return result.model_copy(update={"coefficients": coefficients})
 
 
+def _rougher(regressed: CoefficientResult, estimate: Estimate) -> bool:
+    return (regressed.std_error or 0.0) > estimate.std_error
+
+
+def _regressed(name: str, initial: float, best: float, error: float) -> CoefficientResult:
+    """Return a coefficient by regression of accelerations, its error that of the scaled number."""
+    row = COEFFICIENTS[name]
+    if row.scale == "log":
+        std_error = best * error
+        interval = (best * float(np.exp(-Z95 * error)), best * float(np.exp(Z95 * error)))
+    else:
+        std_error = error
+        interval = (best - Z95 * error, best + Z95 * error)
+    verdict, reason = judge_regressed(std_error, best, row.unit, relative=row.scale == "log")
+    return CoefficientResult(
+        unit=row.unit,
+        initial=initial,
+        best=best,
+        fitted=True,
+        std_error=std_error,
+        ci95=interval,
+        identifiable=reason.identifiable,
+        verdict=verdict,
+        reason=reason,
+        note=judgement_in_words(verdict, reason),
+    )
+
+
 def _fixed(name: str, value: float) -> CoefficientResult:
     return CoefficientResult(
         unit=COEFFICIENTS[name].unit,
@@ -264,6 +302,7 @@ def _flight(job: Job, fitted: Fitted, recording: Recording, validation: Validati
         rmse_fitted_starts=None if met is None else met.rmse,
         predicted_initial=validation.predicted_initial.get(name, ()),
         predicted_best=validation.predicted_best.get(name, ()),
+        predicted_holding=validation.predicted_holding.get(name, ()),
     )
 
 

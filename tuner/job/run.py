@@ -22,6 +22,7 @@ from tuner.examination.examination import Examination
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.refly import refly
 from tuner.findings import Finding
+from tuner.job.accelerations import with_accelerations
 from tuner.job.balanced import with_inputs_balanced
 from tuner.job.best_fit import vehicle_fitted
 from tuner.job.bootstrap import bootstrap, check_bootstrap
@@ -36,6 +37,7 @@ from tuner.job.findings import (
     finer_than_steps,
     flights_worse,
     ground_conflicts,
+    holding_better,
     inputs_late,
     turning_unexplained,
     voltage_taken,
@@ -223,8 +225,9 @@ def _prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
         recordings, left_out = read_usable(settings)
     with span("check"):
         recordings = with_inputs_on_time(recordings, settings.vehicle)
-        job = with_first_terms(job_of(settings, recordings))
-        return job, (*left_out, *inputs_late(job), *check_recordings(job))
+        job, said = with_accelerations(job_of(settings, recordings))
+        job = with_first_terms(job)
+        return job, (*left_out, *inputs_late(job), *said, *check_recordings(job))
 
 
 def _fitted(
@@ -295,6 +298,7 @@ def _of_flights(
     """
     return (
         *flights_worse(validation.initial, validation.best),
+        *holding_better(job, validation),
         *(inertia or turning_unexplained(job, validation.turning_explained)),
     )
 

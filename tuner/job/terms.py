@@ -80,7 +80,8 @@ def _selected(
         return Selected(job, fitted, named)
     candidates = candidates_of(job)
     if not candidates:
-        return Selected(job, fitted)
+        rows = () if job.accelerations is None else job.accelerations.rows
+        return Selected(job, fitted, rows)
     return Selection(job, fitted, candidates, on_progress, on_message).run()
 
 

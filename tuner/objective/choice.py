@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from tuner.config import ControllerFile, VehicleFile
 from tuner.config.job import InletName
+from tuner.equation_error.turning import predicts_turning
 from tuner.errors import RecordingError
 from tuner.findings import Code, Finding
 from tuner.flights.flight import Flight
@@ -20,7 +21,8 @@ from tuner.objective.setpoints import match_setpoints, setpoint_findings
 EXPLAINS = 0.15
 """Correlation of torque and angular acceleration about roll and pitch from which a recording of the
 rotors can be fed into a simulation that turns: real 100 Hz logs of commands that fly well have 0.3
-to 0.5, one at 41 Hz of a faster loop has 0.0."""
+to 0.5, one at 41 Hz of a faster loop has 0.0. Measured speeds may also explain it only together
+with what air does to rotors (`tuner.equation_error.turning`)."""
 
 REFERENCE = ("reference_position", "reference_velocity", "reference_acceleration")
 DROPPED = (
@@ -88,7 +90,12 @@ def choose_inlet(
         if not INLETS[name].can_be_fed(flight):
             continue
         told = explained(flight, vehicle, source)
-        if told is None or told.tilting >= EXPLAINS:
+        measured = source == "rotor_speed"
+        if (
+            told is None
+            or told.tilting >= EXPLAINS
+            or (measured and predicts_turning(flight, vehicle))
+        ):
             return Choice(name, None if doubt is None else _finding(flight, name, doubt, vehicle))
         doubt = doubt or told
     assert doubt is not None

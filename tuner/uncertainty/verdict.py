@@ -65,6 +65,8 @@ class ReasonCode(StrEnum):
     """Ground measurements determine it together with ``correlated_with`` only."""
     MEASURED_ROUGHLY = "measured_roughly"
     """Ground measurements determine it no better than ``half_width``."""
+    REGRESSED = "regressed"
+    """A regression of recorded accelerations determines it, to ``half_width``."""
     NOT_FITTED = "not_fitted"
     """It is fixed."""
     NOT_EXAMINED = "not_examined"
@@ -120,7 +122,8 @@ class Reason(Part):
     @property
     def identifiable(self) -> bool:
         """Whether the flights determine the coefficient."""
-        return self.code is ReasonCode.INTERVAL and self.given_held is None
+        determined = (ReasonCode.INTERVAL, ReasonCode.REGRESSED)
+        return self.code in determined and self.given_held is None
 
 
 NOT_FITTED = Reason(code=ReasonCode.NOT_FITTED)
@@ -230,6 +233,27 @@ def judge_after_holding(
     if verdict is Verdict.TIED:
         return verdict, reason
     return Verdict.HELD if stand_in == name else Verdict.NOT_IDENTIFIABLE, reason
+
+
+def judge_regressed(
+    std_error: float, value: float, unit: str, *, relative: bool
+) -> tuple[Verdict, Reason]:
+    """Return the judgement on a coefficient by regression of accelerations.
+
+    ``relative``: whether its half-width is given as a share of its value.
+    """
+    size = max(abs(value), 1e-300)
+    half_width = Z95 * std_error / (size if relative else 1.0)
+    shown = None if relative else unit
+    if std_error / size > IDENTIFIABLE_ERROR:
+        return Verdict.NOT_IDENTIFIABLE, _told(ReasonCode.WIDE_INTERVAL, half_width, shown)
+    well = Z95 * std_error / size < WELL_KNOWN
+    verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN
+    return verdict, _told(ReasonCode.REGRESSED, half_width, shown)
+
+
+def _told(code: ReasonCode, half_width: float, unit: str | None) -> Reason:
+    return Reason(code=code, half_width=half_width, unit=unit)
 
 
 def judge_impossible_inertia(fitted_value: float) -> tuple[Verdict, Reason]:

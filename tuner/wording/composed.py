@@ -13,6 +13,7 @@ from tuner.flights.damage import Cause, Damage
 from tuner.flights.notes import Note, NoteCode
 from tuner.wording.notes import damage_sentence, note_in_words
 from tuner.wording.phrases import as_sentence, listed
+from tuner.wording.result import PREDICTED
 
 WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
 """Words with which an error begins that says something of the file which it names."""
@@ -86,6 +87,23 @@ def setpoints_foreign(finding: Finding) -> str:
     return (
         "The recorded rate set-points do not follow from reference, state and controller file "
         f"(correlation {alike}): another controller flew, or another reference."
+    )
+
+
+def holding_better(finding: Finding) -> str:
+    """Return what is predicted worse than by holding the recorded state."""
+    numbers = finding.numbers
+    lost = listed(
+        [
+            f"{name.replace('_', ' ')} to {numbers[name]:.3g} {unit} instead of "
+            f"{numbers[f'{name}_held']:.3g} {unit}"
+            for name, unit in PREDICTED.items()
+            if name in finding.names
+        ]
+    )
+    return (
+        f"That the state stays as it is predicts this flight, {numbers['seconds']:g} s ahead, "
+        f"better than the fitted coefficients do: {lost} in the mean."
     )
 
 

@@ -129,6 +129,30 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         ),
         "Log inputs at the rate loop's rate, or measure the inertia on the ground (tune bench).",
     ),
+    Code.TURNING_REGRESSED: (
+        (
+            "Rotor speeds and forces of the air explain {explained_x_percent}, "
+            "{explained_y_percent} and {explained_z_percent} of the angular acceleration about "
+            "forward, left and up: the rest is not recorded, and the loop's rotors answer it. "
+            "Moments of inertia and other physical coefficients are those of a regression of "
+            "accelerations that the answer does not bend. Torque gains, damping and steady torque "
+            "are not physical, but what predicts up to {seconds:g} s ahead best."
+        ),
+        "Fly faster and less evenly, or measure the inertia on the ground (tune bench).",
+    ),
+    Code.TURNING_NOT_PREDICTED: (
+        (
+            "Rotor speeds and forces of the air explain {explained_x_percent}, "
+            "{explained_y_percent} and {explained_z_percent} of the angular acceleration about "
+            "forward, left and up, too little to predict roll and pitch 0.1 s ahead better than "
+            "that they stay. Physical coefficients are those of a regression of accelerations."
+        ),
+        "Feed the attitude in (inlet: attitude), or log what the loop is told to do.",
+    ),
+    Code.HOLDING_BETTER: (
+        composed.holding_better,
+        "Predict less far ahead, or with more recorded.",
+    ),
     Code.INPUT_LATE: (
         (
             "What is fed into the simulation is stamped {milliseconds:+.2f} ms late against the "
@@ -366,7 +390,8 @@ def _values(finding: Finding) -> dict[str, object]:
         if all(name.isdecimal() for name in names):
             values["order"] = order_in_words([int(name) for name in names])
     seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
-    values["explained_percent"] = percent(max(numbers.get("explained", 0.0), 0.0))
+    for share in ("explained", *(f"explained_{axis}" for axis in "xyz")):
+        values[f"{share}_percent"] = percent(max(numbers.get(share, 0.0), 0.0))
     values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
     mixer = (
         "desaturates and a rate integrator that stops"

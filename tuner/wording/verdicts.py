@@ -77,6 +77,7 @@ def _main_clause(reason: Reason) -> str:
     direction = reason.direction
     return {
         ReasonCode.INTERVAL: f"±{_half_width(reason)} (95 %){source}",
+        ReasonCode.REGRESSED: f"±{_half_width(reason)} (95 %), by regression of accelerations",
         ReasonCode.NULL_DIRECTION: "the flights do not identify it: "
         f"{'' if direction is None else direction_in_words(direction)} "
         f"The interval is that of {prior}",

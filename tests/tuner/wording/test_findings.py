@@ -138,6 +138,25 @@ MADE = {
     Code.TURNING_UNEXPLAINED: Finding(
         Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", {"explained": 0.41}
     ),
+    Code.TURNING_REGRESSED: Finding(
+        Code.TURNING_REGRESSED,
+        "warning",
+        "moments of inertia",
+        {"explained_x": 0.54, "explained_y": 0.22, "explained_z": 0.94, "seconds": 0.5},
+    ),
+    Code.TURNING_NOT_PREDICTED: Finding(
+        Code.TURNING_NOT_PREDICTED,
+        "warning",
+        "moments of inertia",
+        {"explained_x": 0.1, "explained_y": 0.0, "explained_z": 0.3},
+    ),
+    Code.HOLDING_BETTER: Finding(
+        Code.HOLDING_BETTER,
+        "warning",
+        "a",
+        {"seconds": 0.1, "body_rate": 1.2, "body_rate_held": 0.9},
+        ("body_rate",),
+    ),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
     Code.FLIGHT_UNMATCHED: Finding(

@@ -1,0 +1,112 @@
+"""Regression of accelerations, on fast flights half of whose turning no recording shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks import fast_flights
+from tuner.config import Options, settle
+from tuner.equation_error.estimate import GAINS
+from tuner.equation_error.measured import measured
+from tuner.equation_error.turning import predicts_turning, regressors
+from tuner.flights.flight import Series
+from tuner.job.accelerations import with_accelerations
+from tuner.job.prepare import job_of
+from tuner.recordings import read_usable
+
+SECONDS = 7.0
+TILTING = ("inertia_xx", "inertia_yy")
+
+
+@pytest.fixture(scope="module")
+def racer():
+    vehicle = fast_flights.drawn(4)
+    return vehicle, fast_flights.fly(vehicle, seed=4, seconds=SECONDS)
+
+
+@pytest.fixture(scope="module", params=[400.0, 100.0], ids=["400 Hz", "100 Hz"])
+def flown(request, racer, tmp_path_factory):
+    """The racer, settings of a job that begins with a new vehicle's laws, and the recordings."""
+    folder, rate = tmp_path_factory.mktemp("fast"), request.param
+    vehicle, signals = racer
+    paths = fast_flights.write(vehicle, signals, folder, seed=4, rotor_rate=rate)
+    settings = settle(Options([str(path) for path in paths], config=str(folder / "tune.yaml")))
+    recordings, _ = read_usable(settings)
+    return vehicle, settings, recordings
+
+
+@pytest.fixture(scope="module")
+def begun(flown):
+    racer, settings, recordings = flown
+    job, findings = with_accelerations(job_of(settings, recordings))
+    return racer, job, findings
+
+
+def test_what_rotors_answer_makes_no_vehicle_heavy(begun):
+    racer, job, _ = begun
+    found = job.accelerations
+    for name in (*TILTING, "inertia_zz", "motor_constant"):
+        error = np.log(found.values[name] / racer.values[name])
+        assert abs(error) < 0.15
+        assert abs(error) < 3.0 * found.errors[name]
+
+
+def test_a_plain_regression_takes_the_answer_for_inertia(flown):
+    racer, settings, recordings = flown
+    steps = [measured(r.flight) for r in recordings if not r.holdout]
+    for axis, name in enumerate(TILTING):
+        matrix = np.concatenate([regressors(one, settings.vehicle)[axis] for one in steps])
+        turning = np.concatenate([one.accelerations[:, 3 + axis] for one in steps])
+        gain = np.linalg.lstsq(matrix, turning, rcond=None)[0][0]
+        assert racer.values["motor_constant"] / gain > 1.25 * racer.values[name]
+
+
+def test_the_search_begins_there_and_leaves_inertia_alone(flown, begun):
+    _, settings, _ = flown
+    _, job, (finding,) = begun
+    assert job.given.vehicle == settings.vehicle
+    assert job.settings.vehicle.inertia.xx == job.accelerations.values["inertia_xx"]
+    assert set(GAINS) <= set(job.space.names)
+    assert not set(job.space.names) & {*TILTING, "inertia_zz", "moment_constant"}
+    assert job.settings.job.search.window == finding.numbers["seconds"]
+    assert 0.0 < finding.numbers["explained_x"] < 0.9
+
+
+def test_gains_are_less_than_all_of_the_turning(begun):
+    _, job, _ = begun
+    gains = [job.accelerations.values[name] for name in GAINS]
+    assert max(gains[:2]) < 0.8
+    assert 0.8 < gains[2] < 1.2
+
+
+def test_a_job_that_says_what_is_free_is_left_alone(flown):
+    _, settings, recordings = flown
+    asked = settings.job.model_copy(update={"terms": "none"})
+    job = job_of(replace(settings, job=asked), recordings)
+    assert with_accelerations(job) == (job, ())
+
+
+def test_rotors_that_belong_to_another_flight_predict_nothing(flown):
+    _, settings, recordings = flown
+    flight, other = (r.flight for r in recordings[:2])
+    assert predicts_turning(flight, settings.vehicle)
+    count = min(len(f.series["rotor_speed"].time) for f in (flight, other))
+    speeds = Series(
+        flight.series["rotor_speed"].time[:count], other.series["rotor_speed"].values[:count]
+    )
+    foreign = replace(flight, series={**flight.series, "rotor_speed": speeds})
+    assert not predicts_turning(foreign, settings.vehicle)
+
+
+def test_gaps_are_left_out(flown):
+    _, _, recordings = flown
+    flight = recordings[0].flight
+    rotors = flight.series["rotor_speed"]
+    hole = (rotors.time > 3.0) & (rotors.time < 3.5)
+    cut = Series(rotors.time[~hole], rotors.values[~hole])
+    steps = measured(replace(flight, series={**flight.series, "rotor_speed": cut}))
+    unknown = np.flatnonzero(~steps.known) * steps.step
+    assert 0.4 < np.ptp(unknown) < 0.6

@@ -1,0 +1,152 @@
+"""What a flight's recording says of its accelerations, step by step, and of what made them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sim_jax.numeric import GRAVITY
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.vector import Vec3
+from tuner.flights.flight import Array, Flight, Series
+from tuner.flights.states import filtered, states_at
+from tuner.objective.noise import white_noise
+
+Mask = NDArray[np.bool_]
+
+FASTEST = 100.0
+"""Hz of the steps at most: gyro and tachometers are averaged over each, which takes off noise. A
+loop answers what disturbs it later than that by most of a rotor's lag."""
+GAP = 2.5
+"""Gaps between samples beyond which a signal is unknown."""
+FEWEST = 100
+"""Steps below which nothing is said."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """N steps of one flight, or of several behind each other.
+
+    Attributes
+    ----------
+    step
+        s.
+    motion
+        At mid-step, leaves (N,); of the rotors' speed the mean over the step.
+    rotor_speed, rotor_acceleration
+        (N, 4) rad/s and rad/s².
+    accelerations
+        (N, 6) specific force in m/s² and angular acceleration in rad/s², body axes, over the step;
+        NaN where something was not recorded.
+    weights
+        (m + 1,) of the rotor's samples in a step's mean.
+    noise
+        rad/s, standard deviation of the white noise of a rotor's samples.
+    """
+
+    step: float
+    motion: Motion
+    rotor_speed: Array
+    rotor_acceleration: Array
+    accelerations: Array
+    weights: Array
+    noise: float
+
+    @property
+    def known(self) -> Mask:
+        """Of each step (N,), whether all of it was recorded."""
+        return np.asarray(np.isfinite(self.accelerations).all(axis=1))
+
+
+def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
+    """Return what a flight with rotor speeds and body rates says; None where it says too little.
+
+    Parameters
+    ----------
+    flight
+        With a pose.
+    input_late
+        s by which rotor speeds are stamped later than the state.
+    """
+    series = flight.series
+    if not {"position", "attitude", "body_rate", "rotor_speed"} <= set(series):
+        return None
+    gyro, rotors = series["body_rate"], series["rotor_speed"]
+    known = np.isfinite(rotors.values).all(axis=1)
+    if known.sum() < FEWEST or not np.isfinite(gyro.values).all():
+        return None
+    rotors = Series(rotors.time[known] - input_late, rotors.values[known])
+    rate = min(FASTEST, gyro.rate, rotors.rate)
+    inside = max(1, round(rotors.rate / rate))
+    begin = max(0.0, gyro.time[0], rotors.time[0])
+    end = min(flight.duration, gyro.time[-1], rotors.time[-1])
+    count = int((end - begin) * rate)
+    if count < FEWEST:
+        return None
+    edges = begin + np.arange(count + 1) / rate
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    weights = np.ones(inside + 1) / inside
+    weights[[0, -1]] *= 0.5
+    fine = edges[:-1, None] + np.arange(inside + 1) / inside / rate
+    speeds = _read(rotors, fine.ravel()).reshape(count, inside + 1, 4)
+    state = states_at(series, middle)
+    velocity, turned = (
+        _velocity(series, edges),
+        Rotation.from_quat(state.attitude, scalar_first=True),
+    )
+    pull = np.diff(velocity, axis=0) * rate + np.array([0.0, 0.0, GRAVITY])
+    turning = np.diff(_read(gyro, edges), axis=0) * rate
+    accelerations = np.hstack([turned.inv().apply(pull), turning])
+    unknown = ~(np.isfinite(speeds).all(axis=(1, 2)) & np.isfinite(state.body_rate).all(axis=1))
+    accelerations[unknown] = np.nan
+    return Measured(
+        step=1.0 / rate,
+        motion=Motion(
+            Vec3.of(jnp.asarray(state.position.T)),
+            Vec3.of(jnp.asarray(state.velocity.T)),
+            Quaternion.of(jnp.asarray(state.attitude.T)),
+            Vec3.of(jnp.asarray(np.nan_to_num(state.body_rate).T)),
+        ),
+        rotor_speed=np.nan_to_num(np.einsum("nir,i->nr", speeds, weights)),
+        rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) * rate),
+        accelerations=accelerations,
+        weights=weights,
+        noise=_noise(rotors),
+    )
+
+
+def _read(series: Series, times: Array) -> Array:
+    """Return a signal (n, k) between its samples; NaN in gaps."""
+    after = np.clip(np.searchsorted(series.time, times), 1, len(series.time) - 1)
+    gap = series.time[after] - series.time[after - 1]
+    table = np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
+    table[gap > GAP / series.rate] = np.nan
+    return np.asarray(table)
+
+
+def _velocity(series: Mapping[str, Series], edges: Array) -> Array:
+    """Return the velocity (n, 3) m/s at some times, world."""
+    if "velocity" in series and np.isfinite(series["velocity"].values).all():
+        return filtered(series["velocity"], edges)
+    return filtered(series["position"], edges, derivative=1)
+
+
+def _noise(rotors: Series) -> float:
+    """Return the standard deviation, rad/s, of the white noise of tachometers.
+
+    What is left of third differences is noise and what a rotor really does between samples. The
+    latter is at least twice as much in every second sample, as of a process of first order, so that
+    what both differ by tells the least that noise may be; the mean of both bounds is taken.
+    """
+    all_of, half = (
+        float(np.nanmedian(white_noise(Series(rotors.time[::n], rotors.values[::n]))))
+        for n in (1, 2)
+    )
+    least = np.sqrt(max(0.0, 2.0 * all_of**2 - half**2))
+    return float(0.5 * (all_of + min(least, all_of)))

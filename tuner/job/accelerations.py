@@ -1,0 +1,99 @@
+"""A job whose search begins with what its flights' accelerations say, where inputs explain little.
+
+Where disturbances that no input shows turn a vehicle, and its loop's rotors answer them, a fit of
+simulations takes the answer for a heavy vehicle. The regression of `tuner.equation_error` does
+not. So moments of inertia are its, the search of simulations begins where it ends and moves, beside
+the rest, what share of the turning is predicted, and nothing physical is known better than by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tuner.coefficients import COEFFICIENTS
+from tuner.coefficients.space import extended
+from tuner.config import VehicleFile, initial_values, with_values
+from tuner.equation_error.estimate import GAINS, Estimate, estimate
+from tuner.equation_error.measured import measured
+from tuner.errors import ConfigError
+from tuner.findings import Code, Finding
+from tuner.job.prepare import Job, job_of
+from tuner.selection.candidates import Groups, candidate_groups, start_of
+
+ENOUGH = 0.9
+"""Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""
+OF_INERTIA = (*(f"inertia_{axes}" for axes in ("xx", "yy", "zz")), "moment_constant")
+"""What a search of simulations could not tell from `GAINS`."""
+INFLOW = "max_relative_airspeed"
+"""No term that a vehicle may lack, but one whose law many vehicles do not follow."""
+
+
+def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
+    """Return the job that begins with what accelerations say, or as it is; what to say of it.
+
+    Only where all fitted flights enter by rotor speed, the job leaves the choice of coefficients
+    and terms, and little of the turning is explained.
+    """
+    settings = job.settings
+    free_choice = settings.job.terms == "auto" and settings.job.free is None
+    if not free_choice or any(inlet != "rotor_speed" for inlet in job.inlets):
+        return job, ()
+    parts = [measured(r.flight, input_late=r.input_late) for r in job.recordings if not r.holdout]
+    known = tuple(part for part in parts if part is not None)
+    if len(known) < len(parts):
+        return job, ()
+    candidates = _candidates(job)
+    names = [name for group in candidates.values() for name in group]
+    effects = start_of([n for n in (*names, *GAINS) if COEFFICIENTS[n].is_effect])
+    given = initial_values(settings.vehicle, settings.controller, names)
+    space = extended(job.space, [*names, *GAINS], settings.job, {**given, **effects})
+    found = estimate(job.objective.model, space, candidates, known)
+    if found.turning >= ENOUGH:
+        return job, ()
+    begun = _begun(job, found)
+    if begun is None:
+        return job, ()
+    return begun, (_finding(found),)
+
+
+def _candidates(job: Job) -> Groups:
+    groups = dict(candidate_groups(job.settings.vehicle, job.space, job.settings.job))
+    if INFLOW not in (*job.space.free, *job.settings.job.fixed):
+        groups[INFLOW] = (INFLOW,)
+    return groups
+
+
+def _begun(job: Job, found: Estimate) -> Job | None:
+    """Return the job with its search's coefficients, start and windows; None for no rigid body."""
+    settings = job.settings
+    moving = tuple(name for name in found.values if name not in OF_INERTIA)
+    try:
+        vehicle = with_values(settings.vehicle, found.values)
+    except ConfigError:
+        return None
+    if not _is_rigid(vehicle):
+        return None
+    search = settings.job.search
+    if search.window is None and found.horizon is not None:
+        search = search.model_copy(update={"window": found.horizon})
+    changed = settings.job.model_copy(update={"free": moving, "fixed": (), "search": search})
+    begun = job_of(replace(settings, vehicle=vehicle, job=changed), job.recordings)
+    return replace(begun, asked=job.settings, accelerations=found)
+
+
+def _is_rigid(vehicle: VehicleFile) -> bool:
+    moments = (vehicle.inertia.xx, vehicle.inertia.yy, vehicle.inertia.zz)
+    return 2.0 * max(moments) <= sum(moments)
+
+
+def _finding(found: Estimate) -> Finding:
+    """Return what is explained of the turning, and how far ahead it can be predicted."""
+    shares = np.clip(found.explained[3:], 0.0, 1.0).tolist()
+    numbers = {f"explained_{axis}": share for axis, share in zip("xyz", shares, strict=True)}
+    numbers |= {f"gain_{axis}": found.values.get(f"torque_gain_{axis}", 1.0) for axis in "xyz"}
+    if found.horizon is None:
+        return Finding(Code.TURNING_NOT_PREDICTED, "warning", "moments of inertia", numbers)
+    numbers["seconds"] = found.horizon
+    return Finding(Code.TURNING_REGRESSED, "warning", "moments of inertia", numbers)
