@@ -40,6 +40,8 @@ REPEATED = 2**27
 """bytes of arguments up to which they are laid out once for every pass."""
 ONE_BY_ONE = 64
 """Lanes up to which they are copied one after the other."""
+IN_CACHE = 2**18
+"""bytes that are laid out at a time."""
 FEW = 512
 """Blocks without a loop that are computed sooner than another thread begins."""
 
@@ -354,8 +356,11 @@ def _side_by_side(leaf: NDArray[Any], taken: NDArray[np.intp], lanes: int) -> ND
     if lanes > ONE_BY_ONE or leaf.ndim == 1:
         return np.ascontiguousarray(leaf[..., taken])
     laid = np.empty((*leaf.shape[:-1], len(taken)), leaf.dtype)
-    for place, lane in enumerate(taken.tolist()):
-        laid[..., place] = leaf[..., lane]
+    rows = max(IN_CACHE // max(laid[:1].nbytes, 1), 1)
+    for first in range(0, len(laid), rows):
+        some = slice(first, first + rows)
+        for place, lane in enumerate(taken.tolist()):
+            laid[some, ..., place] = leaf[some, ..., lane]
     return laid
 
 
