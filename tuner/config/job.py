@@ -30,6 +30,7 @@ CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acce
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed", "attitude"]
 InletChoice = Literal["auto", InletName]
 Method = Literal["auto", "gradient", "cma", "hybrid"]
+ErrorOf = Literal["auto", "output", "prediction"]
 
 
 def _known(word: str, known: tuple[str, ...], kind: str) -> str:
@@ -108,6 +109,10 @@ class Search(Section):
     ----------
     method
         ``gradient`` is Levenberg-Marquardt, ``cma`` is CMA-ES, ``hybrid`` is one after the other.
+    criterion
+        Whose error is minimised: ``prediction`` is that of open-loop predictions from recorded
+        states, ``output`` that of simulations whose starts are free; ``auto`` predicts where the
+        recordings hold the state, below rate control, and where little of the turning is explained.
     seed
         Of everything random.
     starts
@@ -123,6 +128,7 @@ class Search(Section):
     """
 
     method: Method = "auto"
+    criterion: ErrorOf = "auto"
     seed: Annotated[Whole, Ge(0)] = 0
     starts: Annotated[Whole, Interval(ge=1, le=1024)] = 1
     spread: Annotated[Number, Interval(gt=1, le=10)] = 2.0

@@ -37,7 +37,8 @@ def with_accelerations(job: Job) -> tuple[Job, tuple[Finding, ...]]:
     and terms, and little of the turning is explained.
     """
     settings = job.settings
-    free_choice = settings.job.terms == "auto" and settings.job.free is None
+    own = settings.job
+    free_choice = own.terms == "auto" and own.free is None and own.search.criterion != "output"
     if not free_choice or any(inlet != "rotor_speed" for inlet in job.inlets):
         return job, ()
     parts = [measured(r.flight, input_late=r.input_late) for r in job.recordings if not r.holdout]

@@ -12,9 +12,9 @@ from tuner.coefficients import conditions
 from tuner.coefficients.space import Space, space_of
 from tuner.comparison.errors import limits_of
 from tuner.config import CHANNELS, JobFile, Settings
-from tuner.config.job import InletName
+from tuner.config.job import ErrorOf, InletName
 from tuner.equation_error.estimate import Estimate
-from tuner.errors import RecordingError
+from tuner.errors import ConfigError, RecordingError
 from tuner.flights.flight import Flight
 from tuner.model import model_of, schedule_of
 from tuner.objective.battery import require_voltage, with_reference_voltage
@@ -190,7 +190,7 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         )
 
     seconds = window_seconds(inlets, job.search.window)
-    windows, free_starts = None, not all(INLETS[inlet].starts_recorded for inlet in inlets)
+    windows, free_starts = None, _free_starts(job.search.criterion, inlets)
     stride = None if free_starts else OVERLAP * seconds
     if not closed or not all(begins_gently(flight) for flight in fitted):
         segments = window_segments(
@@ -218,6 +218,27 @@ def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
         return Job(settings, recordings, noise, space, objective, windows)
     assert windows is not None
     return Job(settings, recordings, noise, space, windows)
+
+
+def _free_starts(criterion: ErrorOf, inlets: Sequence[InletName]) -> bool:
+    """Return whether windows begin where the vehicle meets them best, or at recorded states.
+
+    Raises
+    ------
+    ConfigError
+        Predictions are asked for, and no recording holds all that they begin with.
+    """
+    if criterion == "auto":
+        return not all(INLETS[inlet].starts_recorded for inlet in inlets)
+    for inlet in inlets:
+        if criterion == "prediction" and "rate_integral" not in INLETS[inlet].ignores:
+            raise ConfigError(
+                "search.criterion",
+                f"prediction begins at recorded states, and for the {inlet} inlet no recording "
+                "holds that of the rate controller",
+                "use inlet: actuator or rotor_speed, or criterion: output",
+            )
+    return criterion == "output"
 
 
 def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:

@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks import fast_flights
 from tuner.config import Options, settle
+from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.measured import measured
 from tuner.equation_error.turning import predicts_turning, regressors
@@ -82,9 +83,10 @@ def test_gains_are_less_than_all_of_the_turning(begun):
     assert 0.8 < gains[2] < 1.2
 
 
-def test_a_job_that_says_what_is_free_is_left_alone(flown):
+@pytest.mark.parametrize("own", [{"terms": "none"}, {"search": Search(criterion="output")}])
+def test_a_job_that_chooses_otherwise_is_left_alone(flown, own):
     _, settings, recordings = flown
-    asked = settings.job.model_copy(update={"terms": "none"})
+    asked = settings.job.model_copy(update=own)
     job = job_of(replace(settings, job=asked), recordings)
     assert with_accelerations(job) == (job, ())
 

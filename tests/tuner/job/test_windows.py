@@ -8,6 +8,7 @@ import pytest
 from tuner.comparison.comparison import Comparison
 from tuner.config import JobFile, Options, settle, values_of, with_values
 from tuner.config.job import FlightSettings, Search
+from tuner.errors import ConfigError
 from tuner.findings import Code
 from tuner.job.check import check
 from tuner.job.holding import with_undetermined_held
@@ -138,3 +139,32 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     truth = values_of(updated)["motor_constant"]
     assert float(values["motor_constant"]) == pytest.approx(truth, rel=0.02)
     assert not examination.uncertainty.estimates["motor_constant"].identifiable
+
+
+@pytest.mark.parametrize(
+    ("asked", "free"),
+    [
+        (("actuator", "auto"), False),
+        (("actuator", "output"), True),
+        (("attitude", "auto"), True),
+        (("attitude", "prediction"), False),
+    ],
+)
+def test_predictions_begin_at_recorded_states(asked, free, full_flight, full_bag, updated):
+    inlet, criterion = asked
+    job = job_through("actuator", full_flight, full_bag, updated, free=("motor_constant",))
+    search = Search(criterion=criterion, window=0.5)
+    own = job.settings.job.model_copy(update={"inlet": inlet, "search": search})
+    settings = replace(job.settings, job=own)
+    segments = job_of(settings, recordings_of(settings, [full_flight])).objective.segments
+    assert (segments.freedom is not None) == free
+
+
+def test_what_no_recording_holds_predicts_nothing(full_flight, full_bag, updated):
+    job = job_through("actuator", full_flight, full_bag, updated)
+    asked = job.settings.job.model_copy(
+        update={"inlet": "body_rate", "search": Search(criterion="prediction")}
+    )
+    settings = replace(job.settings, job=asked)
+    with pytest.raises(ConfigError, match=r"search\.criterion"):
+        job_of(settings, recordings_of(settings, [full_flight]))
