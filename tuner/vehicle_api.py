@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from tuner.config import ControllerFile, VehicleFile
 from tuner.disk import exists
 from tuner.engine import engine_for
+from tuner.errors import ExportError
 from tuner.flights.flight import Array
 from tuner.result import Run, read_run
 from tuner.runtime import configure
@@ -116,6 +117,7 @@ def export(
     out: Named | None = None,
     simulator: str = "",
     accept: str = "",
+    draws: int | None = None,
 ) -> Exported:
     """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
 
@@ -133,6 +135,8 @@ def export(
         Which of a format's simulators it is for, as of ``tune export``.
     accept
         A reason to export in spite of conditions that are not met.
+    draws
+        How many draws of the run's joint posterior are written besides, into the folder ``out``.
 
     Raises
     ------
@@ -143,10 +147,24 @@ def export(
     """
     configure()
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
-    from tuner.exporters.export import export_vehicle  # noqa: PLC0415
+    from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
     from tuner.exporters.refly import refly  # noqa: PLC0415
     from tuner.job.effective_of_run import kept_effective  # noqa: PLC0415
 
+    if draws is not None:
+        if into is not None:
+            raise ExportError("--draws", "do not go with --into", "leave one of them out")
+        return export_draws(
+            run if isinstance(run, Run) else read_run(run),
+            format,
+            draws,
+            refly=refly,
+            today=date.today(),
+            refit=kept_effective,
+            out=None if out is None else Path(out),
+            simulator=simulator,
+            accept=accept,
+        )
     if not isinstance(run, Run) and exists(Path(run)) and Path(run).is_file():
         return export_vehicle(
             Path(run),

@@ -48,6 +48,7 @@ COMMANDS = {
         "Write the coefficients of a run, or of a vehicle file, for a simulator.",
         "tune export runs/x --format sdf --into models/quad.sdf",
         "tune export runs/x --format mujoco --out quad.xml",
+        "tune export runs/x --format isaaclab --draws 100 --out draws",
         "tune export quad.yaml --format px4 --simulator gz-sim --out quad.params",
     ),
     "audit": (

@@ -19,6 +19,7 @@ def export(
     out: Path | None = None,
     simulator: str = "",
     accept: Annotated[str, Parameter(name="--accept")] = "",
+    draws: int | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the coefficients of a run, or a vehicle file, for a simulator.
@@ -45,10 +46,15 @@ def export(
         (px4). Default: the one that the model is for, or the first.
     accept
         Export although a condition is not met, and record this reason in the file.
+    draws
+        Also write so many draws of the joint posterior into the folder --out: a table, a file for
+        each in the format, and Isaac Lab's ranges. Default folder: export/draws of the result.
     """
     from tuner.api import export as export_run
 
-    done = export_run(run, format, into=into, out=out, simulator=simulator, accept=accept)
+    done = export_run(
+        run, format, into=into, out=out, simulator=simulator, accept=accept, draws=draws
+    )
     if not quiet:
         from tuner.cli.tables import print_export
 

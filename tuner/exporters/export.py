@@ -12,6 +12,7 @@ from tuner.config.job import ExportSettings
 from tuner.disk import check_file, file_name, inside
 from tuner.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, Gate, write
+from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.gates import Refly, check, check_elsewhere, check_hover, not_flown
 from tuner.exporters.provenance import (
     Refit,
@@ -20,6 +21,7 @@ from tuner.exporters.provenance import (
     provenance,
     provenance_of_file,
 )
+from tuner.exporters.simulators import ISAAC_LAB
 from tuner.exporters.target import (
     Choices,
     check_every_coefficient,
@@ -190,6 +192,62 @@ def export_vehicle(
     lacks = tuple(f"{target.simulator_name} computes otherwise: {what}" for what in computed)
     notes = (*sources, *draft.notes, *not_carried(vehicle, target), *lacks)
     return Exported(places[0], gates, notes)
+
+
+def export_draws(
+    run: Run,
+    kind: str,
+    count: int,
+    *,
+    refly: Refly,
+    today: date,
+    refit: Refit | None = None,
+    out: Path | None = None,
+    simulator: str = "",
+    accept: str = "",
+) -> Exported:
+    """Write draws of a run's joint posterior in a format, once the run itself may be exported.
+
+    Parameters
+    ----------
+    run, kind, refly, today, refit, simulator, accept
+        As of `export`.
+    count
+        How many.
+    out
+        Folder; by default ``export/draws`` in the result folder.
+
+    Raises
+    ------
+    InputError
+        As `export` raises, or the run has no covariance to draw from.
+    """
+    folder = out or run.folder / FOLDER / "draws"
+    draws = draws_of(run, count)
+    target = target_of(kind).chosen(Choices(simulator=simulator))
+    name = file_name(run.vehicle.name, target.suffix)
+    done = export(
+        run,
+        kind,
+        refly=refly,
+        today=today,
+        refit=refit,
+        out=inside(folder, name),
+        simulator=simulator,
+        accept=accept,
+    )
+    flying, _ = in_simulator(run, target, refit)
+    choices = Choices(simulator=target.simulator_name)
+    notes = write_draws(
+        draws,
+        flying.vehicle,
+        folder,
+        target.suffix,
+        lambda vehicle, line: target.draft(vehicle, line, choices),
+        provenance=f"draw of the posterior; {provenance(run, today, accept)}",
+        ranges=ISAAC_LAB.flown if target.simulator is ISAAC_LAB else None,
+    )
+    return replace(done, path=folder, notes=(*done.notes, *notes))
 
 
 def refuse(subject: Path, gates: Sequence[Gate], accept: str, remedy: str) -> None:

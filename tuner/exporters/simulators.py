@@ -395,8 +395,7 @@ MUJOCO = Simulator(
         title="MuJoCo",
     ),
     laws=_mujoco_laws,
-    ties=(("time_constant_up", "time_constant_down"),),
-    fixed=_MOTORS,
+    fixed=(*_MOTORS, "time_constant_up", "time_constant_down"),
 )
 ROTORPY = Simulator(
     name="rotorpy",

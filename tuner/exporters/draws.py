@@ -1,0 +1,228 @@
+"""Draws of a run's joint posterior: vehicles that its flights do not tell apart.
+
+Coefficients are normally distributed in the coordinate that the search moves, the logarithm or the
+number, with the covariance of ``sensitivity.json``: flights and priors together, errors of model
+and gusts included. What leaves the search's bounds, or is no rigid body, is drawn again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.coefficients import COEFFICIENTS
+from tuner.config import VehicleFile, values_of, with_values
+from tuner.disk import inside, make_folder, write_text
+from tuner.errors import ConfigError, ExportError, InputError
+from tuner.examination.sensitivity_json import Knowledge
+from tuner.exporters.draft import Draft, write
+from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
+from tuner.files import csv_text
+from tuner.numerics import symmetric_eigen
+from tuner.result import Run
+
+Array = NDArray[np.float64]
+
+MOST = 10_000
+"""Draws at a time."""
+TABLE = "draws.csv"
+RANGES = "ranges_isaaclab.py"
+CENTRAL = (2.5, 97.5)
+"""Percentiles between which Isaac Lab samples."""
+TRIES = 200
+"""Times as many vectors are drawn until enough are within the bounds."""
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Coefficients that were drawn together.
+
+    Attributes
+    ----------
+    names
+        K coefficients.
+    values
+        (N, K) in their units.
+    best
+        (K,) the run's.
+    is_log
+        (K,) whether they are drawn by their logarithm.
+    """
+
+    names: tuple[str, ...]
+    values: Array
+    best: Array
+    is_log: NDArray[np.bool_]
+
+    def vehicle(self, number: int, base: VehicleFile) -> VehicleFile:
+        """Return one draw of a vehicle that has the run's coefficients, or effective ones.
+
+        Raises
+        ------
+        ConfigError
+            Its inertia is no rigid body's.
+        """
+        held = values_of(base)
+        drawn = {}
+        for index, name in enumerate(self.names):
+            value, best = self.values[number, index], self.best[index]
+            if name in held and (not self.is_log[index] or held[name] != 0.0):
+                moved = (
+                    held[name] * value / best if self.is_log[index] else held[name] + value - best
+                )
+                drawn[name] = float(moved)
+        return with_values(base, drawn)
+
+
+def draws_of(run: Run, count: int) -> Draws:
+    """Return draws of a run's coefficients; the same for the same run.
+
+    Raises
+    ------
+    InputError
+        The result folder does not hold their covariance.
+    ExportError
+        Too many are asked for, or the bounds leave nothing to draw.
+    """
+    if not 1 <= count <= MOST:
+        raise ExportError("--draws", f"{count} are asked for", f"ask for 1 to {MOST}")
+    known = Knowledge.read(run.folder)
+    rows = run.result.coefficients
+    names = tuple(known.names)
+    if not names or any(name not in rows for name in names):
+        raise InputError(run.folder / Knowledge.FILE, "is of another run", "fit again")
+    best = np.array([rows[name].best for name in names])
+    is_log = np.array([_by_logarithm(run, name) for name in names])
+    unit = np.where(is_log, best, 1.0)
+    covariance = np.array(known.covariance) / np.outer(unit, unit)
+    values, vectors = symmetric_eigen(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    low = np.array([-np.inf if (b := rows[n].lower) is None else b for n in names])
+    high = np.array([np.inf if (b := rows[n].upper) is None else b for n in names])
+    generator = np.random.default_rng(run.result.seed)
+    kept: list[Array] = []
+    for _ in range(TRIES):
+        steps = generator.standard_normal((count, len(names))) @ root.T
+        drawn = np.where(is_log, best * np.exp(np.where(is_log, steps, 0.0)), best + steps)
+        inner = ((drawn >= low) & (drawn <= high)).all(axis=1)
+        kept += [row for row in drawn[inner] if _flies(run.vehicle, names, row)]
+        if len(kept) >= count:
+            break
+    else:
+        raise ExportError(
+            run.folder,
+            "has bounds that its posterior hardly meets",
+            "widen the bounds and fit again",
+        )
+    drawn = np.array(kept[:count])
+    tied = {
+        name: row.reason.tied_to
+        for name, row in known.coefficients.items()
+        if row.reason.tied_to in names and name not in names
+    }
+    ratios = [rows[name].best / rows[str(first)].best for name, first in tied.items()]
+    follow = [names.index(str(first)) for first in tied.values()]
+    return Draws(
+        (*names, *tied),
+        np.concatenate([drawn, drawn[:, follow] * np.array(ratios)], axis=1),
+        np.array([*best, *(rows[name].best for name in tied)]),
+        np.array([*is_log, *is_log[follow]]),
+    )
+
+
+def _by_logarithm(run: Run, name: str) -> bool:
+    """Return whether the search moved a coefficient's logarithm."""
+    job: Any = run.result.settings.get("job")
+    given = (job.get("coefficients") or {}).get(name) if isinstance(job, dict) else None
+    scale = (given or {}).get("scale") or COEFFICIENTS[name].scale
+    return bool(scale == "log" and run.result.coefficients[name].best > 0)
+
+
+def _flies(vehicle: VehicleFile, names: Sequence[str], row: Array) -> bool:
+    try:
+        with_values(vehicle, dict(zip(names, row.tolist(), strict=True)))
+    except ConfigError:
+        return False
+    return True
+
+
+def write_draws(
+    draws: Draws,
+    base: VehicleFile,
+    folder: Path,
+    suffix: str,
+    drafted: Callable[[VehicleFile, str], Draft],
+    *,
+    provenance: str,
+    ranges: Callable[[VehicleFile], VehicleFile] | None,
+) -> tuple[str, ...]:
+    """Write a table, a file for each draw, and what Isaac Lab samples between.
+
+    Parameters
+    ----------
+    draws, base
+        The draws, and the vehicle that they are draws of.
+    folder, suffix
+        Where the files lie, and what their names end with.
+    drafted
+        A vehicle and its provenance -> its file.
+    provenance
+        One line.
+    ranges
+        A vehicle -> as Isaac Lab flies it; None for another format.
+
+    Returns
+    -------
+    tuple
+        What was written, a note each.
+    """
+    make_folder(folder)
+    vehicles = []
+    for number in range(len(draws.values)):
+        try:
+            vehicles.append(draws.vehicle(number, base))
+        except ConfigError:  # of effective coefficients, whose moments are another body's
+            continue
+    rows = [(number + 1, *values_of(v).values()) for number, v in enumerate(vehicles)]
+    write_text(folder / TABLE, csv_text(("draw", *values_of(base)), rows))
+    for number, vehicle in enumerate(vehicles):
+        name = f"draw_{number + 1:05d}"
+        draft = drafted(vehicle.replace(name=f"{base.name}_{name}"), f"{provenance}; {name}")
+        write(draft, inside(folder, f"{name}{suffix}"))
+    notes = [f"{len(vehicles)} draws of the joint posterior are in {folder / TABLE}"]
+    if len(vehicles) < len(draws.values):
+        notes.append(f"{len(draws.values) - len(vehicles)} more are no rigid body and left out")
+    if ranges is not None:
+        text = isaaclab_text(_ranges([ranges(vehicle) for vehicle in vehicles]), provenance)
+        write_text(folder / RANGES, text)
+        notes.append(f"the central 95 % of each number are the ranges in {folder / RANGES}")
+    return tuple(notes)
+
+
+def _ranges(vehicles: Sequence[VehicleFile]) -> dict[str, dict[str, Any]]:
+    """Return Isaac Lab's configuration with ranges between percentiles of vehicles."""
+    configurations = [configuration(vehicle) for vehicle in vehicles]
+    middle: dict[str, dict[str, Any]] = {}
+    for section, values in configurations[0].items():
+        middle[section] = {}
+        for name, value in values.items():
+            if isinstance(value, bool | str):
+                middle[section][name] = value
+                continue
+            each = np.array([c[section][name] for c in configurations], float)
+            low, half, high = np.percentile(each, (CENTRAL[0], 50.0, CENTRAL[1]), axis=0)
+            if name.endswith("_range") and name != "thrust_range":
+                middle[section][name] = [float(low[0]), float(high[1])]
+            else:
+                middle[section][name] = half.tolist()
+                if section == "BODY":
+                    middle[section][f"{name}_range"] = [low.tolist(), high.tolist()]
+    ratio = [c["THRUSTER"]["torque_to_thrust_ratio"] for c in configurations]
+    middle["BODY"]["torque_to_thrust_ratio_range"] = np.percentile(ratio, CENTRAL).tolist()
+    middle["MULTIROTOR"]["rotor_directions"] = configurations[0]["MULTIROTOR"]["rotor_directions"]
+    return middle
