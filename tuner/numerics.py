@@ -167,6 +167,12 @@ class Inverse:
         scale = np.outer(self.unit, self.unit)
         return np.asarray((self.vectors / self.values) @ self.vectors.T * scale)
 
+    @property
+    def open(self) -> Array:
+        """The part (K, K) of the inverse along directions that flights leave to the prior."""
+        vectors = self.vectors[:, self.rounded] * self.unit[:, None]
+        return np.asarray((vectors / self.values[self.rounded]) @ vectors.T)
+
     def sandwiched(self, meat: Array, priors: Array) -> Array:
         """Return H⁻¹ (meat + priors) H⁻¹, the flights' meat without rounding errors."""
         scale = np.outer(self.unit, self.unit)

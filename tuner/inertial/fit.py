@@ -26,6 +26,7 @@ from sim_jax.vehicle import Motor
 from tuner.flights.flight import Array
 from tuner.inertial.response import Lags, rotor_speeds
 from tuner.inertial.signals import Stretch, blocks_of, derivative, smoothed
+from tuner.numerics import Inverse
 
 OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 """What is explained: three angular accelerations in rad/s², the specific force along z in m/s²."""
@@ -37,6 +38,9 @@ TAUS = (0.01, 0.02, 0.04, 0.07, 0.12)
 LATENCIES = (0.0, 0.01, 0.02)
 """s from which the search sets out; the likeliest of their pairs."""
 BOUNDS = ((np.log(0.002), np.log(0.5)), (np.log(0.002), np.log(0.5)), (0.0, 0.06))
+RESOLVED = 1e-4
+"""rad/s² and m/s² that no gyro or accelerometer resolves: a simulated log may hold no noise, and
+turn about no axis that it is not sent about."""
 NUDGE = (1e-3, 1e-3, 1e-5)
 """Steps of the lags' coordinates for derivatives."""
 
@@ -109,7 +113,8 @@ def fit_response(stretches: tuple[Stretch, ...], motor: Motor, levers: Array) ->
 
     def misfit(coordinates: Array) -> float:
         solved = _solved(problem, Lags.at(coordinates))
-        return float(sum(np.log(np.mean(left * left)) for _, _, left in solved.values()))
+        squares = [float(np.mean(left * left)) for _, _, left in solved.values()]
+        return float(np.log(np.add(squares, RESOLVED**2)).sum())
 
     starts = [Lags(tau, tau, late).coordinates for tau in TAUS for late in LATENCIES]
     best = min(starts, key=misfit)
@@ -132,7 +137,9 @@ def fit_response(stretches: tuple[Stretch, ...], motor: Motor, levers: Array) ->
         names=("up", "down", "late", *OUTPUTS, *STEADY),
         covariance=_covariance(problem, lags, solved),
         explained={
-            name: 1.0 - float(np.var(left) / np.var(measured[name]))
+            name: float(
+                (np.var(measured[name]) - np.var(left)) / (np.var(measured[name]) + RESOLVED**2)
+            )
             for name, (_, _, left) in solved.items()
         },
         curves={
@@ -204,7 +211,7 @@ def _covariance(problem: _Problem, lags: Lags, solved: Solved) -> Array:
     firsts = []
     for name, size in zip(OUTPUTS, sizes, strict=True):
         table, solution, left = solved[name]
-        scale = float(np.std(left))
+        scale = float(np.hypot(np.std(left), RESOLVED))
         slopes = [
             (moved[name][0] - table) @ solution / nudge
             for moved, nudge in zip(shifted, NUDGE, strict=True)
@@ -222,11 +229,12 @@ def _covariance(problem: _Problem, lags: Lags, solved: Solved) -> Array:
 
 
 def _sandwich(bread: Array, meat: Array, wanted: list[int]) -> Array:
-    """Return the wanted part of G⁻¹ Σ sᵀs G⁻¹, with few blocks made up for."""
-    size = np.sqrt(np.diag(bread)) + 1e-300
-    inverse = np.linalg.pinv(bread / np.outer(size, size), rcond=1e-12, hermitian=True)
-    scores = meat / size
-    count = len(scores)
-    covariance = inverse @ (scores.T @ scores) @ inverse * (count / max(1, count - len(size)))
-    scaled = covariance / np.outer(size, size)
-    return np.asarray(scaled[np.ix_(wanted, wanted)])
+    """Return the wanted part of G⁻¹ Σ sᵀs G⁻¹, with few blocks made up for.
+
+    What no sample tells of has a variance beyond any other.
+    """
+    nothing = np.zeros_like(bread)
+    inverse = Inverse.of(bread, nothing)
+    count, size = meat.shape
+    scattered = inverse.sandwiched(meat.T @ meat, nothing) * (count / max(1, count - size))
+    return np.asarray((scattered + inverse.open)[np.ix_(wanted, wanted)])

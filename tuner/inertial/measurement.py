@@ -70,6 +70,12 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     motor = model_of(vehicle, ControllerFile()).vehicle.motor
     response = fit_response(stretches, motor, arms)
     used = _used(response)
+    if not set(used) & set(OUTPUTS):
+        raise RecordingError(
+            flight.path,
+            "holds no pose, and nothing turns it or changes its thrust",
+            "record a flight that moves",
+        )
     wrong = [name for name in used if name in OUTPUTS and response.gains[name] <= 0.0]
     if wrong:
         raise RecordingError(

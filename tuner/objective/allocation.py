@@ -52,7 +52,8 @@ def with_commands(flight: Flight, vehicle: VehicleFile) -> Flight:
 def commands_of(wrench: Array, vehicle: VehicleFile) -> Array:
     """Return commands (n, 4) of thrust in N and torque in N m (n, 4), body FLU.
 
-    They are above 1 where the vehicle file's rotors are too weak for what was commanded.
+    They are above 1 where the vehicle file's rotors are too weak for what was commanded. The signs
+    of a quad-X's rotors, which a vehicle file must have, make the matrix regular.
     """
     shares = np.vstack([np.ones(4), levers(vehicle).T])
     lift = np.maximum(wrench @ np.linalg.inv(shares).T, 0.0)

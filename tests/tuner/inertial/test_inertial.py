@@ -50,17 +50,42 @@ def simulation(flown):
     return next(iter(simulate(flown, ControllerFile(), shape, duration=14.0, rate=400.0)))
 
 
-def log_file(simulation, path, *, order=ORDER):
+def log_file(simulation, path, *, order=ORDER, noise=1.0):
     """Write what a Crazyflie's memory card would hold, noise included, and nothing of the pose."""
     generator, signals = np.random.default_rng(3), simulation.signals
-    rate = np.degrees(signals["body_rate"]) + generator.normal(0.0, 0.1, (len(simulation.time), 3))
-    force = signals["acceleration"] / G + generator.normal(0.0, 0.02, rate.shape)
+    rate = np.degrees(signals["body_rate"]) + noise * generator.normal(
+        0.0, 0.1, (len(simulation.time), 3)
+    )
+    force = signals["acceleration"] / G + noise * generator.normal(0.0, 0.02, rate.shape)
     columns = {f"gyro.{axis}": ("f", rate[:, i]) for i, axis in enumerate("xyz")}
     columns |= {f"acc.{axis}": ("f", force[:, i]) for i, axis in enumerate("xyz")}
     for rotor, place in enumerate(order):
         pwm = 65535 * signals["command"][:, rotor]
         columns[f"motor.m{place}"] = ("I", pwm)
     return log_of(simulation.time, dict(sorted(columns.items())), path)
+
+
+@pytest.mark.parametrize("name", ["lemniscate", "straight", "hover"])
+def test_a_simulated_log_without_noise_is_fitted_or_refused(name, flown, tmp_path):
+    """A simulation turns about no axis that it is not sent about: a misfit is exactly zero."""
+    shape = TrajectorySettings(name=name, radius=1.0, omega=1.0, speed_scale=4.0)
+    simulation = next(iter(simulate(flown, ControllerFile(), shape, duration=14.0, rate=400.0)))
+    path = log_file(simulation, tmp_path / "log00", noise=0.0)
+    settings = settings_for(path, flown)
+    flights, _ = without_pose(settings)
+    if name == "hover":
+        with pytest.raises(RecordingError, match="nothing turns it"):
+            fit_without_pose(settings, flights, out=tmp_path / "run")
+        return
+    fitted = fit_without_pose(settings, flights, out=tmp_path / "run")
+    truth = dict.fromkeys(("torque_trim_x", "torque_trim_y", "torque_trim_z"), 0.0)
+    truth |= values_of(flown)
+    for coefficient, found in fitted.result.coefficients.items():
+        assert np.isfinite(found.best), coefficient
+        if found.std_error is not None:
+            assert found.std_error > 0.0
+            close = max(5.0 * found.std_error, 0.05 * abs(truth[coefficient]))
+            assert abs(found.best - truth[coefficient]) < close, coefficient
 
 
 TRIM = 0.02
