@@ -24,7 +24,7 @@ from tuner.job.run import run
 from tuner.recordings import read_usable
 from tuner.result import RunResult
 
-LABS = ((10, 400.0), (11, 400.0), (12, 100.0), (13, 100.0))
+LABS = ((10, 400.0), (11, 100.0), (12, 400.0))
 """Seeds, and Hz at which rotor speeds are recorded."""
 SECONDS = 10.0
 """s of each flight."""
@@ -64,7 +64,9 @@ def _row(seed: int, rate: float, folder: Path) -> Iterator[str]:
     yield f"{time.perf_counter() - clock:.0f} s"
     inside = []
     for name, truth in racer.values.items():
-        found = result.coefficients[name]
+        found = result.coefficients.get(name)
+        if found is None:  # a term that the flights do not call for
+            continue
         if found.ci95 is not None:
             inside.append(found.ci95[0] <= truth <= found.ci95[1])
         if name in PHYSICAL:
