@@ -28,6 +28,7 @@ from tuner.result import (
     FlightResult,
     LostTerm,
     PoseRmse,
+    PredictedErrors,
     RunResult,
     SearchResult,
     Status,
@@ -223,6 +224,9 @@ def _result(
             time_offset=0.0,
             rmse_initial=initial[name].rmse,
             rmse_best=best[name].rmse,
+            predicted_initial=(_ahead(3.0),),
+            predicted_best=(_ahead(1.25),),
+            predicted_holding=(_ahead(0.75),),
         )
         for number, name in enumerate(FLIGHTS)
     )
@@ -287,3 +291,7 @@ def _result(
             message=Ending.NO_FURTHER_GAIN,
         ),
     )
+
+
+def _ahead(rate):
+    return PredictedErrors(seconds=0.5, position=None, velocity=None, attitude=None, body_rate=rate)

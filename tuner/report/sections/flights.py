@@ -22,7 +22,8 @@ from tuner.report.chart import (
 )
 from tuner.report.contents import Contents
 from tuner.report.section import Section
-from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.result import RMSE_UNITS, AxesRmse, FlightResult
+from tuner.wording.result import PREDICTED
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
 CURVES = {
@@ -135,8 +136,47 @@ def errors(contents: Contents) -> Section | None:
         )
         for flight in contents.run.result.flights
     ]
-    values = {"axes": RMSE_UNITS, "rows": rows, "laps": _laps(contents)}
+    values = {
+        "axes": RMSE_UNITS,
+        "rows": rows,
+        "laps": _laps(contents),
+        "predicted": PREDICTED,
+        "predictions": [p for f in contents.run.result.flights for p in _predictions(f)],
+    }
     return Section("errors", "RMSE of each flight", values)
+
+
+@dataclass(frozen=True)
+class PredictedRow:
+    """Open-loop predictions of a flight so many s ahead.
+
+    ``errors`` are, quantity by quantity, those with the initial and the fitted coefficients, and of
+    a state that stays; None of what is not predicted.
+    """
+
+    name: str
+    seconds: float
+    errors: list[tuple[float | None, float | None, float | None]]
+
+
+def _predictions(flight: FlightResult) -> list[PredictedRow]:
+    held = flight.predicted_holding or (None,) * len(flight.predicted_best)
+    rows = zip(flight.predicted_initial, flight.predicted_best, held, strict=True)
+    return [
+        PredictedRow(
+            flight.name + (" (held out)" if flight.split == "holdout" else ""),
+            best.seconds,
+            [
+                (
+                    getattr(initial, n),
+                    getattr(best, n),
+                    None if naive is None else getattr(naive, n),
+                )
+                for n in PREDICTED
+            ],
+        )
+        for initial, best, naive in rows
+    ]
 
 
 def _pairs(before: AxesRmse, after: AxesRmse) -> list[tuple[float | None, float | None]]:
