@@ -597,7 +597,26 @@ def _transpose(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
 
 
 def _concatenate(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:
-    return np.concatenate([lower.elements(o) for o in operands], axis=eqn.params["dimension"])
+    axis, shape = eqn.params["dimension"], shape_of(eqn.outvars[0])
+    if not lower._is_long(shape):
+        return np.concatenate([lower.elements(o) for o in operands], axis=axis)
+    firsts = np.cumsum([0, *(o.shape[axis] for o in operands)]).tolist()
+
+    def at(index: Index) -> Element:
+        """Read every part at the place nearest to the one asked for, and choose."""
+        number, chosen = lower.as_index(index[axis]), None
+        for operand, first in zip(operands, firsts, strict=False):
+            own = lower.b.sub(number, lower.e.number(number, first))
+            own = lower.start_within(own, operand.shape[axis], 1)
+            read = lower.at(operand, [*index[:axis], own, *index[axis + 1 :]])
+            if chosen is None:
+                chosen = read
+                continue
+            behind = lower.b.icmp_signed(">=", number, lower.e.number(number, first))
+            chosen = lower.apply("select_n", {}, behind, chosen, read)
+        return chosen
+
+    return Deferred(shape, at, tuple(operands))
 
 
 def _stack(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Value:

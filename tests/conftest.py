@@ -18,7 +18,6 @@ from __future__ import annotations
 import logging
 import os
 from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -67,25 +66,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 class _NoFallback(logging.Handler):
-    """Fails a test in which something runs through XLA for want of a rule."""
+    """Fails what runs through XLA for want of a rule: every flight of every job is a kernel's."""
 
     def emit(self, record: logging.LogRecord) -> None:
         raise AssertionError(record.getMessage())
 
 
-@pytest.fixture(autouse=True)
-def kernels_alone(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Hold that every flight of every job runs as a kernel; `tests.lanes` tests what else does."""
-    if "tests/lanes" in request.node.path.as_posix():
-        yield
-        return
-    watched, handler = logging.getLogger("lanes.program"), _NoFallback(logging.DEBUG)
-    before = watched.level
-    watched.addHandler(handler)
-    watched.setLevel(logging.DEBUG)
-    yield
-    watched.removeHandler(handler)
-    watched.setLevel(before)
+KERNELS_ALONE = _NoFallback(logging.DEBUG)
+logging.getLogger("lanes.program").addHandler(KERNELS_ALONE)
+logging.getLogger("lanes.program").setLevel(logging.DEBUG)
 
 
 @pytest.hookimpl(trylast=True)

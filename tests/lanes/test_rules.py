@@ -185,6 +185,15 @@ ARRAYS = {
 }
 
 
+def test_long_arrays_are_joined_and_cut_without_being_laid_out():
+    def read(x, number):
+        long = jnp.concatenate([x * jnp.arange(300.0)[:, None], jnp.ones((400, 3)), x[None]])
+        return lax.dynamic_index_in_dim(long, number, 0), long[299:302]
+
+    numbers = np.array([0, 299, 300, 699, 700, 701, -1, 5, 301], np.int32)
+    agree(read, RANDOM.normal(size=(3, 9)), numbers)
+
+
 @pytest.mark.parametrize("name", ARRAYS)
 def test_functions_that_move_elements(name):
     agree(ARRAYS[name], RANDOM.normal(size=(6, 11)), each=4)
