@@ -32,6 +32,7 @@ class Code(StrEnum):
     CANNOT_HOVER = "cannot_hover"  # idle, full, weight (N), mass (kg)
     SPARSE_INPUT = "sparse_input"  # recorded, needed (Hz); names: the signal
     INLET_CHOSEN = "inlet_chosen"  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
+    MANOEUVRES_CHOSEN = "manoeuvres_chosen"  # fitted, flights; names: recording, numbers
     PX4_LOOPS = "px4_loops"  # names: the inlet
     LOGGED_GAINS = "logged_gains"  # names: what the log has otherwise, each as a clause
     LOGS_DIFFER = "logs_differ"  # names: the parameters

@@ -19,6 +19,7 @@ from tuner.findings import Code, Finding
 from tuner.flights.contradiction import noted_contradiction
 from tuner.flights.flight import Flight
 from tuner.flights.load import load_flights
+from tuner.flights.notes import NoteCode
 from tuner.flights.stale import is_stale
 from tuner.flights.ulog import parameters_of
 from tuner.objective.allocation import with_commands
@@ -148,6 +149,7 @@ def read_usable(
             if not exists(path):
                 raise
             left_out.append((path.stem, error))
+    flights, passed_over = _chosen(flights)
     names = [*(flight.name for flight in flights), *(name for name, _ in left_out)]
     for name in job.holdout:
         if name not in names:
@@ -169,9 +171,27 @@ def read_usable(
     recordings = [_as_fitted(recording, recordings, settings) for recording in recordings]
     chosen = (recording.because for recording in recordings if recording.because is not None)
     return tuple(recordings), (
+        *passed_over,
         *(left_out_of(name, error) for name, error in left_out),
         *chosen,
     )
+
+
+def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
+    """Return the flights without the manoeuvres of long recordings that are not fitted."""
+    chosen = {flight.name for flight in flights if not _is_passed_over(flight)}
+    findings = []
+    for path in dict.fromkeys(f.path for f in flights if f.name not in chosen):
+        of_path = [flight for flight in flights if flight.path == path]
+        fitted = [str(n) for n, flight in enumerate(of_path, 1) if flight.name in chosen]
+        numbers = {"fitted": float(len(fitted)), "flights": float(len(of_path))}
+        names = (of_path[0].name, *fitted)
+        findings.append(Finding(Code.MANOEUVRES_CHOSEN, "info", of_path[0].name, numbers, names))
+    return [flight for flight in flights if flight.name in chosen], findings
+
+
+def _is_passed_over(flight: Flight) -> bool:
+    return any(note.code is NoteCode.NOT_CHOSEN for note in flight.notes)
 
 
 def left_out_of(name: str, error: RecordingError) -> Finding:

@@ -24,6 +24,7 @@ from tuner.flights.locate import (
     unread,
     with_guesses,
 )
+from tuner.flights.manoeuvres import manoeuvres
 from tuner.flights.mission import Mission, find_missions
 from tuner.flights.notes import Note, NoteCode
 from tuner.flights.recording import Contents, Recording, Samples
@@ -325,7 +326,12 @@ def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list
 
 
 def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
-    missions = find_missions(series)
+    missions = manoeuvres(series, find_missions(series))
+    if sidecar.missions is not None:
+        numbers = sidecar.missions
+        missions = tuple(
+            replace(mission, fitted=number in numbers) for number, mission in enumerate(missions, 1)
+        )
     if sidecar.start is None and sidecar.end is None:
         return missions
     pose = series["position"].time

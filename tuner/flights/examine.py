@@ -260,6 +260,7 @@ def _mission(content: Content, index: int) -> MissionReport:
         level_held=spin is not None and spin.level_held,
         height=(_of(np.nanmin, position[:, 2]), _of(np.nanmax, position[:, 2])),
         known=float(known.mean()),
+        fitted=mission.fitted,
     )
 
 

@@ -107,6 +107,8 @@ class MissionReport:
         m, lowest and highest.
     known
         Part of the ticks with a pose.
+    fitted
+        Whether `tune` fits it.
     """
 
     start: float
@@ -121,6 +123,7 @@ class MissionReport:
     level_held: bool
     height: tuple[float, float]
     known: float
+    fitted: bool = True
 
 
 @dataclass(frozen=True)

@@ -111,7 +111,7 @@ def _missions(inspection: Inspection) -> Table:
 def _remark(mission: MissionReport) -> str:
     spin = mission.yaw_rate_setpoint
     if spin is None:
-        return ""
+        return "" if mission.fitted else "others show more: not fitted"
     return f"yaw spin at {spin:g} rad/s" + (", held level" if mission.level_held else "")
 
 

@@ -64,6 +64,8 @@ def make_flight(
     if len(content.missions) > 1:
         of, number = len(content.missions), {"number": index + 1}
         notes.append(Note(NoteCode.ONE_OF_SEVERAL, "info", count=of, numbers=number))
+    if not mission.fitted:
+        notes.append(Note(NoteCode.NOT_CHOSEN, "info"))
     signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
     notes.extend(gaps_in(signals, mission_series, rate))
     spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))

@@ -46,11 +46,14 @@ class Mission:
         Seconds in the time of the series.
     begins_with
         What marks its start, for the report.
+    fitted
+        Whether it is fitted: of a long recording only the manoeuvres that show most are.
     """
 
     start: float
     end: float
     begins_with: str
+    fitted: bool = True
 
 
 def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:

@@ -60,6 +60,7 @@ class NoteCode(StrEnum):
     VELOCITY_DOUBTED = "velocity_doubted"  # agreement
     CONTRADICTED = "contradicted"  # agreement; names: the signal, the signal that denies it
     COMMAND_DERIVED = "command_derived"
+    NOT_CHOSEN = "not_chosen"
     ONE_OF_SEVERAL = "one_of_several"  # number of the mission
 
 

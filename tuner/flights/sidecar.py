@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from tuner.motor_orders import MotorOrder
-from tuner.yaml_files.section import Number, Section, read_model
+from tuner.yaml_files.section import Number, Section, Whole, read_model
 
 
 class Sidecar(Section):
@@ -19,6 +19,9 @@ class Sidecar(Section):
         `TrajectorySettings`, which are checked where the simulator's shapes are known.
     start, end
         Seconds since the first pose between which the mission lies, instead of those found.
+    missions
+        Numbers, from 1, of those missions that are fitted, of a recording that holds several; None
+        for all, or of a long one for those that show most.
     topics
         The topic map of this recording: a file beside it, or a shipped map's name.
     namespace
@@ -30,6 +33,7 @@ class Sidecar(Section):
     trajectory: Mapping[str, str | Number] | None = None
     start: Number | None = None
     end: Number | None = None
+    missions: tuple[Whole, ...] | None = None
     topics: str | None = None
     namespace: str = ""
     motor_order: MotorOrder | None = None

@@ -324,6 +324,13 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
     ),
     Code.INLET_CHOSEN: (composed.inlet_chosen, composed.inlet_remedy),
+    Code.MANOEUVRES_CHOSEN: (
+        (
+            "It is long: {fitted:.0f} of its {flights:.0f} manoeuvres are fitted, those that show "
+            "most (missions {others})."
+        ),
+        "Name others under 'missions' in its side-car, {first}.yaml.",
+    ),
     Code.PX4_LOOPS: (
         (
             "PX4's own position and attitude control flew it, other loops than the geometric ones "
@@ -383,6 +390,7 @@ def _values(finding: Finding) -> dict[str, object]:
     names, numbers = [name.replace("_", " ") for name in finding.names], finding.numbers
     values: dict[str, object] = {"subject": finding.subject, **numbers}
     if names:
+        values["others"] = listed(names[1:] or names)
         values |= {"names": listed(names), "first": names[0], "last": names[-1]}
         values |= {"coefficients": listed(finding.names), "given": finding.names[0]}
         values["text"] = finding.names[-1]

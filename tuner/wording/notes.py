@@ -101,6 +101,10 @@ TEXTS: Mapping[NoteCode, str] = {
         "its motor commands are those that, by the vehicle file's arms and curve, give the "
         "commanded thrust and torque: what was found of thrust and inertia is relative to that"
     ),
+    NoteCode.NOT_CHOSEN: (
+        "it is not fitted: other manoeuvres of this long recording show more, or its side-car "
+        "names others"
+    ),
     NoteCode.ONE_OF_SEVERAL: "mission {number:.0f} of {count} in this recording",
 }
 PASSED_OVER = (NoteCode.LAYOUT_UNKNOWN, NoteCode.FIELD_MISSING)

@@ -35,6 +35,9 @@ MADE = {
         "quad",
         {"idle": 0.34, "full": 41.0, "weight": 0.33, "mass": 0.034},
     ),
+    Code.MANOEUVRES_CHOSEN: Finding(
+        Code.MANOEUVRES_CHOSEN, "info", "a", {"fitted": 2, "flights": 9}, ("a", "1", "4")
+    ),
     Code.PX4_LOOPS: Finding(Code.PX4_LOOPS, "info", "a", names=("body_rate",)),
     Code.LOGGED_GAINS: Finding(
         Code.LOGGED_GAINS, "info", "a", names=("rate.roll.p 0.15 (MC_ROLLRATE_P)", "rate.rate 800")
