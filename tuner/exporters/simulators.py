@@ -326,9 +326,9 @@ SIH = Simulator(
     start=linear_at_hover,
 )
 
-_NOT_DRAWN = "{} has no such term"
+_CENTRE = {f"center_of_mass_{axis}": "rotor positions" for axis in "xyz"}
 _MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
-_NO_ROLLING = {"rolling_moment_coefficient": NotCarried(_NOT_DRAWN.format("it"), 0.0)}
+_NO_ROLLING = {"rolling_moment_coefficient": NotCarried("it has no such term", 0.0)}
 _NO_AIRSPEED = {
     "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS)
 }
@@ -342,12 +342,27 @@ def _held(*groups: tuple[str, ...], **keys: str) -> dict[str, str]:
     return {name: name for group in groups for name in group} | keys
 
 
+def _about_centre(vehicle: VehicleFile) -> VehicleFile:
+    """Return a vehicle whose rotor positions count from its centre of mass."""
+    offset = [vehicle.effects.get(name, 0.0) for name in _CENTRE]
+    effects = {name: value for name, value in vehicle.effects.items() if name not in _CENTRE}
+    rotors = tuple(
+        rotor.replace(position=tuple(at - o for at, o in zip(rotor.position, offset, strict=True)))
+        for rotor in vehicle.rotors
+    )
+    return vehicle.replace(effects=effects, rotors=rotors)
+
+
 def _mujoco_laws(vehicle: VehicleFile) -> VehicleFile:
-    return linear_in(_mean_lag(vehicle), idle=True)
+    return linear_in(_mean_lag(_about_centre(vehicle)), idle=True)
+
+
+def _rotorpy_laws(vehicle: VehicleFile) -> VehicleFile:
+    return _mean_lag(_about_centre(vehicle))
 
 
 def _isaac_laws(vehicle: VehicleFile) -> VehicleFile:
-    return _one_damping(_same_drag(vehicle))
+    return _one_damping(_same_drag(_about_centre(vehicle)))
 
 
 def _dragging_at_hover(vehicle: VehicleFile) -> VehicleFile:
@@ -390,6 +405,7 @@ MUJOCO = Simulator(
             rotor_drag_coefficient="biasprm",
             thrust_inflow_coefficient="biasprm",
             rotor_drag_ratio_y="biasprm",
+            **_CENTRE,
         ),
         _NO_ROLLING | _NO_AIRSPEED,
         title="MuJoCo",
@@ -415,11 +431,12 @@ ROTORPY = Simulator(
             thrust_inflow_coefficient="k_z",
             fuselage_drag="c_Dx, c_Dy, c_Dz",
             flapping_moment_coefficient="k_flap",
+            **_CENTRE,
         ),
         _NO_ROLLING | _NO_AIRSPEED,
         title="RotorPy",
     ),
-    laws=_mean_lag,
+    laws=_rotorpy_laws,
     ties=(("time_constant_up", "time_constant_down"),),
 )
 DRONE_MODELS = Simulator(
@@ -470,6 +487,7 @@ ISAAC_LAB = Simulator(
             motor_constant="thrust_const_range",
             moment_constant="torque_to_thrust_ratio",
             rotor_drag_coefficient="linear_damping",
+            **_CENTRE,
         ),
         _NO_ROLLING | _NO_AIRSPEED,
         title="Isaac Lab",

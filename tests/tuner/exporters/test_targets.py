@@ -136,3 +136,11 @@ def test_mujoco_itself_flies_what_is_written_for_it(flight, updated):
     wrong = target_of("mujoco").draft(heavy, "by a test", Choices())
     worse = comparison.fly(draft.vehicle, flier=wrong.flier)["small_circle"].rmse
     assert worse.z > there.z + 0.01
+
+
+@pytest.mark.parametrize("kind", ["mujoco", "rotorpy", "isaaclab"])
+def test_rotors_are_placed_about_the_centre_of_mass(kind, vehicle):
+    off = vehicle.replace(effects={"center_of_mass_x": 0.004, "center_of_mass_z": -0.02})
+    flown = target_of(kind).flown(off)
+    assert flown.rotors[0].position == pytest.approx((0.17278, -0.17678, 0.08))
+    assert not any(name.startswith("center_of_mass") for name in flown.effects)

@@ -1,0 +1,55 @@
+"""Every export of a run, written, read back and flown: ``python -m benchmarks.targets runs/x``.
+
+A row a target: by how much the run's flights are missed with all terms, by the physical and by the
+effective coefficients in this project's simulation of the target's simulator, and in that simulator
+itself where it is installed (drone-models wants SCIPY_ARRAY_API=1).
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+from tuner.exporters.draft import write
+from tuner.exporters.refly import refly
+from tuner.exporters.target import Choices, target_of
+from tuner.exporters.targets import NAMES
+from tuner.job.effective import pose_rmse
+from tuner.job.effective_of_run import kept_effective
+from tuner.result import PoseRmse, read_run
+from tuner.runtime import configure
+from tuner.wording.result import rmse_in_words
+
+
+def main(folder: str) -> None:
+    configure()
+    run = read_run(folder)
+    spinning = {f.name for f in run.result.flights if "spin" in f.name}
+
+    def over_flights(flown: dict) -> str:
+        rmse = pose_rmse(axes for name, axes in flown.items() if name not in spinning)
+        return rmse_in_words(rmse)
+
+    best = over_flights({f.name: f.rmse_best for f in run.result.flights})
+    print("| target | all terms | physical there | effective there | in the simulator itself |")
+    print("|---|---|---|---|---|")
+    for kind in NAMES:
+        target = target_of(kind)
+        simulator = target.simulator
+        found = None if simulator is None else kept_effective(run, simulator)
+        vehicle = run.vehicle if found is None else found[0]
+        draft = target.draft(vehicle, "by a benchmark", Choices(simulator=target.simulator_name))
+        with tempfile.TemporaryDirectory() as place:
+            write(draft, Path(place) / f"x{target.suffix}")  # refused if it does not read back
+        unfitted = (
+            PoseRmse(position=None, attitude=None) if found is None else found[1].rmse_unfitted
+        )
+        own = over_flights(refly(run, draft.vehicle))
+        there = "–" if draft.flier is None else over_flights(refly(run, draft.vehicle, draft.flier))
+        physical = own if found is None else rmse_in_words(unfitted)
+        print(f"| {kind} | {best} | {physical} | {own} | {there} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
