@@ -2,16 +2,22 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
+FITS := $(VENV)/.fits
 READY := $(VENV)/.ready
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
 .PHONY: demo test test-all test-fast lint docs bench clean
 
-$(READY): pyproject.toml
+$(FITS): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -e '.[test,dev,docs,cluster,service]'
+	$(INSTALL) -e .
+	touch $(FITS)
+
+$(READY): $(FITS)
+	$(INSTALL) -e '.[test,dev,docs,cluster,service]'
 	touch $(READY)
 
-demo: $(READY)  ## fit the five recordings that ship with the project
+demo: $(FITS)  ## fit the five recordings that ship with the project
 	$(BIN)/tune --flights reference_flights/*.bag --out runs/demo
 
 test: $(READY)  ## every test but what is marked long: that repeats others at length
@@ -34,7 +40,7 @@ docs: $(READY)  ## reference pages from the code, then the site into build/site
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 bench: $(READY)  ## measure everything and write benchmarks/RESULTS.md; needs a quiet machine
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]' || true
+	$(INSTALL) -e '.[bench]' || true
 	$(BIN)/python -m benchmarks
 
 clean:
