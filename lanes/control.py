@@ -263,6 +263,8 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     branches = eqn.params["branches"]
     which = lower.elements(operands[0])[()]
     rest = operands[1:]
+    if is_vector(which):  # what one lane changes in place would change for all
+        rest = [_laid_before(lower, v, indexed=False) for v in rest]
     lanes = [False] * len(eqn.outvars)
     columns = [False] * len(eqn.outvars)
     for branch in branches:

@@ -144,6 +144,57 @@ def test_an_array_read_after_it_was_changed_in_place_is_refused_not_misread():
     np.testing.assert_array_equal(got.values, program.by_xla(values, turns=90).values)
 
 
+IN_PLACE = {
+    "a lane's own choice": lambda line, x, i: lax.cond(
+        x > 0.0, lambda: line.at[i % 40].set(x), lambda: line
+    ),
+    "a shared choice": lambda line, x, i: lax.cond(
+        i % 3 == 0, lambda: lax.dynamic_update_index_in_dim(line, x, i % 40, 0), lambda: line
+    ),
+    "a loop that reads what it was": lambda line, x, _: lax.fori_loop(
+        0,
+        40,
+        lambda j, new: lax.dynamic_update_index_in_dim(
+            new, x + lax.dynamic_index_in_dim(line, (j + 1) % 40, 0, keepdims=False), j, 0
+        ),
+        line,
+    ),
+    "a loop that changes what others read": lambda line, x, _: (
+        line
+        + lax.fori_loop(
+            0,
+            3,
+            lambda j, total: (
+                total
+                + lax.dynamic_index_in_dim(
+                    lax.dynamic_update_index_in_dim(line, x * j, 7, 0), 7, 0, keepdims=False
+                )
+            ),
+            jnp.zeros(()),
+        )
+        * lax.dynamic_index_in_dim(line, 7, 0, keepdims=False)
+    ),
+}
+
+
+@pytest.mark.parametrize("how", IN_PLACE)
+def test_an_array_changed_in_place_is_what_jax_makes_of_it(how):
+    """Or the function is refused: never another number."""
+
+    def function(x, lengths):
+        def turn(line, number):
+            line = IN_PLACE[how](line, x * jnp.cos(number * x), number)
+            return line, line[3] + line[7]
+
+        return lax.scan(turn, jnp.arange(40.0), jnp.arange(lengths["turns"]))[1]
+
+    program = Program(function, Argument((), float, lanes=True))
+    values = np.linspace(-2.0, 3.0, 11)
+    got = program(values, lanes=11, turns=50)
+    want = program.by_xla(values, turns=50)
+    np.testing.assert_allclose(got.values, want.values, rtol=1e-12, atol=1e-12)
+
+
 def test_what_has_no_rule_runs_through_xla_and_is_named(caplog):
     def sorted_(x, _):
         return jnp.sort(x)
