@@ -24,7 +24,7 @@ from tuner.job.run import run
 from tuner.recordings import read_usable
 from tuner.result import RunResult
 
-LABS = ((10, 400.0), (11, 100.0), (12, 400.0))
+LABS = ((10, 400.0), (11, 100.0))
 """Seeds, and Hz at which rotor speeds are recorded."""
 SECONDS = 10.0
 """s of each flight."""

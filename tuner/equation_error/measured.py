@@ -95,6 +95,7 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     weights[[0, -1]] *= 0.5
     fine = edges[:-1, None] + np.arange(inside + 1) / inside / rate
     speeds = _read(rotors, fine.ravel()).reshape(count, inside + 1, 4)
+    mean = np.einsum("nir,i->nr", speeds, weights)
     state = states_at(series, middle)
     velocity, turned = (
         _velocity(series, edges),
@@ -113,7 +114,8 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
             Quaternion.of(jnp.asarray(state.attitude.T)),
             Vec3.of(jnp.asarray(np.nan_to_num(state.body_rate).T)),
         ),
-        rotor_speed=np.nan_to_num(np.einsum("nir,i->nr", speeds, weights)),
+        # where it is unknown, one that some rotor might have: derivatives by none are not finite
+        rotor_speed=np.where(np.isfinite(mean), mean, np.nanmean(mean)),
         rotor_acceleration=np.nan_to_num((speeds[:, -1] - speeds[:, 0]) * rate),
         accelerations=accelerations,
         weights=weights,
