@@ -32,6 +32,7 @@ from tuner.flights.inspection import (
     SignalReport,
     TopicReport,
 )
+from tuner.flights.load import keep_flights
 from tuner.flights.locate import Place
 from tuner.flights.mission import yaw_spin
 from tuner.flights.motion import RATE, derivative, rotate, smooth
@@ -49,8 +50,17 @@ NO_DATE = 631_152_000_000_000_000
 LOOKED_AT = 3600.0
 
 
-def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) -> Inspection:
+def examine(
+    path: Path, topics: str | Path | TopicMap | None, namespace: str, *, keep: bool = False
+) -> Inspection:
     """Inspect a recording.
+
+    Parameters
+    ----------
+    path, topics, namespace
+        As of `tuner.flights.inspect_recordings`.
+    keep
+        Whether its flights are kept in the user's cache, for a fit.
 
     Raises
     ------
@@ -73,6 +83,8 @@ def examine(path: Path, topics: str | Path | TopicMap | None, namespace: str) ->
             # Its topics are listed nevertheless, so that the user sees what to map.
             recording = open_recording(path, given.messages if given else ())
             return _without_flight(recording, err)
+    if keep and content.missions:
+        keep_flights(path, content, settings, sidecar, given)
     return _with_flight(content, sidecar)
 
 

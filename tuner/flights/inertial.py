@@ -6,6 +6,7 @@ need none.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.content import Settings, Signals, given_map, read_signals
 from tuner.flights.flight import Series
+from tuner.flights.load import load_flights
 from tuner.flights.locate import require_pose
 from tuner.flights.mission import IDLE, stretches
 from tuner.flights.notes import Note
@@ -106,6 +108,9 @@ def read_inertial(
     ConfigError
         The topic map or the side-car is wrong.
     """
+    with contextlib.suppress(RecordingError):  # a fit reads them next, from the cache
+        load_flights(path, topics=topics, namespace=namespace)
+        return None
     settings, sidecar = Settings(topics, namespace), read_sidecar(path)
     with readable(path):
         given = given_map(path, settings, sidecar)

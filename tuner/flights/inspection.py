@@ -244,7 +244,7 @@ def _inspect(
             return dataclasses.replace(before, path=str(path))
     from tuner.flights.examine import examine  # noqa: PLC0415 (loads numpy and the readers)
 
-    result = examine(path, topics, namespace)
+    result = examine(path, topics, namespace, keep=cache)
     if kept is not None:
         store(kept, json.dumps(dataclasses.asdict(result)).encode())
     return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -176,11 +177,34 @@ def _read_flights(
             "nothing flies in it: no mission was found",
             "inspect it, or give 'start' and 'end' in a side-car",
         )
+    return _flights_of(path, content, settings, sidecar)
+
+
+def _flights_of(
+    path: Path, content: Content, settings: Settings, sidecar: Sidecar
+) -> tuple[Flight, ...]:
     sha256 = digest(path)
     return tuple(
         make_flight(path, content, i, sha256=sha256, sidecar=sidecar, rate=settings.rate)
         for i in range(len(content.missions))
     )
+
+
+def keep_flights(
+    path: Path, content: Content, settings: Settings, sidecar: Sidecar, given: TopicMap | None
+) -> None:
+    """Keep the flights of a recording that was read to be inspected: a long one takes a while.
+
+    Parameters
+    ----------
+    path, settings, sidecar, given
+        As of `read_content`, which returned the content.
+    content
+        What it holds.
+    """
+    kept = cached("flights", *reading_key(path, settings, sidecar, given))
+    with contextlib.suppress(RecordingError):
+        store(kept, to_parquet(_flights_of(path, content, settings, sidecar)))
 
 
 def load_flight(

@@ -143,6 +143,24 @@ def _records(path: Path, at: int) -> Iterator[tuple[int, bytes, int, int]]:
                 at = end
 
 
+def _blocks(path: Path, at: int) -> Iterator[tuple[bytes, list[int]]]:
+    """Yield blocks of a log, each with where its whole messages begin, and the end of the last."""
+    with path.open("rb") as stream:
+        stream.seek(at)
+        rest = b""
+        while block := stream.read(READ_AT_ONCE):
+            buffer, places, here = rest + block, [0], 0
+            last, keep = len(buffer) - 3, places.append
+            while here <= last:
+                here += 3 + (buffer[here] | buffer[here + 1] << 8)
+                keep(here)
+            if places[-1] > len(buffer):
+                places.pop()
+            rest = buffer[places[-1] :]
+            if len(places) > 1:
+                yield buffer, places
+
+
 def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
     """Return the fields of each message format, and where the data begin; check their size."""
     with path.open("rb") as stream:
@@ -215,17 +233,22 @@ def _count(path: Path, start: int) -> tuple[dict[int, tuple[str, int]], dict[int
     names: dict[int, str] = {}
     kinds: dict[int, str] = {}
     counts: Counter[int] = Counter()
-    data, added = ord("D"), ord("A")
     reached = start
-    for kind, buffer, at, end in _records(path, start):
-        if kind == data and end - at >= 2:
-            number = buffer[at] | buffer[at + 1] << 8
-            counts[number] += 1
-        elif kind == added and end - at >= 4:
-            instance, number = struct.unpack_from("<BH", buffer, at)
-            kinds[number] = buffer[at + 3 : end].decode(errors="replace")
+    for buffer, places in _blocks(path, start):
+        content = np.frombuffer(buffer, dtype=np.uint8)
+        at = np.array(places[:-1], dtype=np.int64)
+        kind, size = content[at + 2], np.diff(places) - 3
+        data = at[(kind == ord("D")) & (size >= 2)]
+        numbers = content[data + 3] | content[data + 4].astype(np.int64) << 8
+        counts.update(
+            dict(zip(*(x.tolist() for x in np.unique(numbers, return_counts=True)), strict=True))
+        )
+        for first in at[(kind == ord("A")) & (size >= 4)].tolist():
+            length = buffer[first] | buffer[first + 1] << 8
+            instance, number = struct.unpack_from("<BH", buffer, first + 3)
+            kinds[number] = buffer[first + 6 : first + 3 + length].decode(errors="replace")
             names[number] = kinds[number] if instance == 0 else f"{kinds[number]}[{instance}]"
-        reached += 3 + end - at
+        reached += places[-1]
     counted = {number: (name, counts[number]) for number, name in names.items()}
     return counted, kinds, path.stat().st_size - reached
 
