@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -84,11 +84,43 @@ class Recorder:
 
 
 _RECORDER: ContextVar[Recorder | None] = ContextVar("_RECORDER", default=None)
+_WATCHER: ContextVar[Callable[[str], None] | None] = ContextVar("_WATCHER", default=None)
+_STAGE: ContextVar[str] = ContextVar("_STAGE", default="")
 
 
 @contextmanager
 def span(name: str) -> Iterator[None]:
-    """Count the time of a block as the stage ``name``'s, where a run is recorded."""
+    """Count the time of a block as the stage ``name``'s, where a run is recorded.
+
+    Whoever watches the run is told the stage, and at its end the one that it was in.
+    """
+    watcher = _WATCHER.get()
+    if watcher is None:
+        with _counted(name):
+            yield
+        return
+    outer = _STAGE.set(name)
+    watcher(name)
+    try:
+        with _counted(name):
+            yield
+    finally:
+        _STAGE.reset(outer)
+        watcher(_STAGE.get())
+
+
+@contextmanager
+def watching(on_stage: Callable[[str], None]) -> Iterator[None]:
+    """Have each stage of a block named as it begins; an empty name is none."""
+    token = _WATCHER.set(on_stage)
+    try:
+        yield
+    finally:
+        _WATCHER.reset(token)
+
+
+@contextmanager
+def _counted(name: str) -> Iterator[None]:
     recorder = _RECORDER.get()
     if recorder is None:
         yield

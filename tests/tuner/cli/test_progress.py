@@ -1,10 +1,16 @@
 """What a run shows while it works, where standard output is no terminal."""
 
+import io
+import re
+from pathlib import Path
 from types import SimpleNamespace
 
-from tuner.cli.progress import listening
+from rich.console import Console
+
+from tuner.cli.progress import DOING, _MovingLine, listening
 from tuner.search.iteration import Iteration
 from tuner.search.point_estimate import PointEstimate
+from tuner.spans import span, watching
 
 MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
 
@@ -64,3 +70,39 @@ def test_quiet_shows_nothing(capsys):
         listener.on_iteration(iterations("2 s", 1)[0], 1.0)
         listener.on_message("Examining.")
     assert capsys.readouterr().out == ""
+
+
+def test_a_terminal_names_the_stage_that_runs_and_promises_nothing():
+    shown = Console(file=io.StringIO(), force_terminal=True, width=120)
+    line = _MovingLine(shown)
+
+    def now():
+        return line.__rich__().plain
+
+    try:
+        assert now().startswith("Starting, 0 s")
+        with watching(line.stage), span("search"):
+            assert now().startswith("Searching")
+            line.show(iterations("polish", 1)[0], 4.0)
+            assert now().startswith("polish: iteration 1")
+            assert "left" not in now()
+            with span("examination"):
+                assert now().startswith("Examining how well")
+            with span("a new stage"):
+                assert now().startswith("A new stage")
+            assert now().startswith("Searching")
+        with span("reading"):  # nobody watches any more
+            assert now().startswith("Starting")
+    finally:
+        line.close()
+
+
+def test_every_stage_of_a_run_has_its_words():
+    named = {
+        name
+        for folder in ("job", "recordings")
+        for path in Path("tuner", folder).glob("*.py")
+        for name in re.findall(r'(?:span|explanation\.part)\(\s*"([^"]+)"', path.read_text())
+    }
+    assert len(named) > 10
+    assert named <= set(DOING)

@@ -42,7 +42,7 @@ def _figure(contents: Contents) -> list[Chart]:
             name,
             [row.group for row in scored],
             [
-                100 * max(row.gain_holdout or 0.0, SMALLEST) if row.kept == kept else None
+                100 * (row.gain_holdout or 0.0) if row.kept == kept else None
                 for row in scored
             ],
             colour,
