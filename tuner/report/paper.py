@@ -26,6 +26,8 @@ WIDTH = 6.3
 LEGEND_COLUMNS = 5
 PIXELS = 96.0
 """An inch of the page on a screen."""
+ALIKE = 1.001
+"""Numbers that differ by less than so many times are one, for a logarithmic axis."""
 DASHES = {"solid": "-", "dot": ":", "dash": "--"}
 PATH = re.compile(r'(?<=\bd=")[^"]*')
 """The data of an SVG path."""
@@ -132,6 +134,9 @@ def _draw(panel: Panel, place: Axes) -> None:
             place.set_yscale("log")
             _label_decades(place.yaxis)
         if panel.x_scale == "log" and place.dataLim.x1 > 0:
+            least, largest = place.dataLim.minposx, place.dataLim.x1
+            if largest < ALIKE * least:  # but for rounding errors, which leave no axis
+                place.set_xlim(0.5 * least, 2.0 * largest)
             place.set_xscale("log")
             _label_decades(place.xaxis)
     if panel.equal:

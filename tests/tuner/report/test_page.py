@@ -11,6 +11,8 @@ import pytest
 from tests.tuner.report import making
 from tuner.errors import InputError
 from tuner.report import render
+from tuner.report.contents import read_contents
+from tuner.report.sections.selection import selection
 from tuner.uncertainty.directions import Direction
 
 WITH_MASS = (
@@ -124,3 +126,21 @@ def test_a_damaged_file_is_named(report: Path, tmp_path: Path) -> None:
     (tmp_path / "sensitivity.json").write_text('{"schema_version": 2}')
     with pytest.raises(InputError, match=r"sensitivity\.json"):
         render(tmp_path)
+
+
+def test_a_term_that_makes_left_out_flights_worse_is_drawn_left_of_zero(report: Path) -> None:
+    contents = read_contents(report)
+    assert contents.run is not None
+    section = selection(contents)
+    assert section is not None
+    (panel,) = section.charts[0].panels
+    gains = {row.group: row.gain_holdout for row in contents.run.result.selection}
+    assert min(gains.values()) < 0.0
+    drawn = {
+        label: value
+        for bars in panel.marks
+        for label, value in zip(bars.labels, bars.values, strict=True)
+        if value is not None
+    }
+    assert drawn == {name: pytest.approx(100.0 * gain) for name, gain in gains.items()}
+    assert panel.x_scale == "linear"

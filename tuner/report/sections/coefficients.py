@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from tuner.coefficients import COEFFICIENTS
 from tuner.examination.sensitivity_json import CoefficientKnowledge
+from tuner.numerics import Z95
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
@@ -30,6 +31,8 @@ VERDICTS = {
     Verdict.TIED: ("kept", "=", GREY),
     Verdict.FIXED: ("kept", "–", GREY),
 }
+WIDEST = 1000.0
+"""% at which a bar of the figure ends."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +107,7 @@ def _row(
 def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
     """Return half the 95 % interval of every coefficient, relative to its value."""
     wide = {
-        name: min(196.0 * coefficient.std_error / coefficient.step, 1000.0)
+        name: 100.0 * Z95 * coefficient.std_error / coefficient.step
         for name, coefficient in known.items()
         if coefficient.std_error and coefficient.step
     }
@@ -113,7 +116,9 @@ def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
     order = sorted(wide, key=wide.__getitem__)
     bars = []
     for verdict, (_, sign, colour) in VERDICTS.items():
-        widths = [wide[name] if known[name].verdict == verdict else None for name in order]
+        widths = [
+            min(wide[name], WIDEST) if known[name].verdict == verdict else None for name in order
+        ]
         if any(value is not None for value in widths):
             texts = [
                 f"{name}: ±{wide[name]:.2g} %, {verdict_in_words(known[name].verdict)}"
@@ -125,8 +130,9 @@ def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
         Chart(
             key="intervals",
             title="How closely each coefficient is known",
-            caption="Half the 95 % interval, relative to the value. For a fixed coefficient it is "
-            "the interval that it would have, were it fitted with the others.",
+            caption="Half the 95 % interval, relative to the value, drawn to "
+            f"{WIDEST:.0f} % at most. For a fixed coefficient it is the one that it would have, "
+            "were it fitted with the others.",
             panels=(Panel(bars, x_scale="log"),),
             x_title="± % of the value (of its usual uncertainty where the value is smaller)",
             height=120 + 24 * len(order),

@@ -7,9 +7,6 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
 
-SMALLEST = 1e-4
-"""Share of the loss below which the figure shows a gain as this."""
-
 
 def selection(contents: Contents) -> Section | None:
     """Return the table of the selection and its figure."""
@@ -41,10 +38,7 @@ def _figure(contents: Contents) -> list[Chart]:
         Bars(
             name,
             [row.group for row in scored],
-            [
-                100 * (row.gain_holdout or 0.0) if row.kept == kept else None
-                for row in scored
-            ],
+            [100 * (row.gain_holdout or 0.0) if row.kept == kept else None for row in scored],
             colour,
             [f"{row.group}: {reason_in_words(row)}" for row in scored],
         )
@@ -55,8 +49,8 @@ def _figure(contents: Contents) -> list[Chart]:
             key="selection",
             title="What each group of terms is worth",
             caption="Share of the loss of flights left out of the fit that each group takes away "
-            "beside the others in the model, on a logarithmic scale.",
-            panels=(Panel(bars, x_scale="log"),),
+            "beside the others in the model. Left of zero it makes them worse.",
+            panels=(Panel(bars),),
             x_title="gain held out [%]",
             height=140 + 26 * len(scored),
         )
