@@ -91,7 +91,7 @@ def examine(
 def _without_pose(signals: Signals) -> Inspection:
     """Return what a recording of gyro, accelerometer and motor commands alone holds."""
     flown = flying(signals)
-    error = obstacle(signals.recording.path, signals.series, flown)
+    error = obstacle(signals, flown)
     seconds = {"seconds": float(sum(end - begin for begin, end in flown))}
     fitted = () if error else (Note(NoteCode.WITHOUT_POSE, "info", numbers=seconds),)
     return replace(

@@ -17,10 +17,12 @@ from tuner.disk import readable
 from tuner.errors import RecordingError
 from tuner.flights.content import Settings, Signals, given_map, read_signals
 from tuner.flights.flight import Series
+from tuner.flights.formats import is_tabular
 from tuner.flights.load import load_flights
 from tuner.flights.locate import require_pose
 from tuner.flights.mission import IDLE, stretches
-from tuner.flights.notes import Note
+from tuner.flights.notes import Note, NoteCode
+from tuner.flights.ranges import FASTEST_TURN
 from tuner.flights.sidecar import read_sidecar
 
 #: What a recording must hold.
@@ -29,6 +31,8 @@ NEEDS = ("body_rate", "acceleration", "command")
 SLOWEST = 120.0
 #: s below which a stretch in the air shows nothing.
 SHORTEST = 2.0
+#: rad/s, or less, at which a vehicle turns through nine tenths of a gentle flight.
+GENTLE = 3.0
 
 
 @dataclass(frozen=True)
@@ -68,18 +72,17 @@ def flying(signals: Signals) -> tuple[tuple[float, float], ...]:
     return tuple((begin, end) for begin, end in runs if end - begin >= SHORTEST)
 
 
-def obstacle(
-    path: str | Path, series: Mapping[str, Series], flown: tuple[tuple[float, float], ...]
-) -> RecordingError | None:
+def obstacle(signals: Signals, flown: tuple[tuple[float, float], ...]) -> RecordingError | None:
     """Return why nothing can be fitted to a recording without a pose; None if it can.
 
     Parameters
     ----------
-    path
-        The recording.
-    series, flown
-        As of `InertialFlight`.
+    signals
+        Of the recording.
+    flown
+        The stretches in which its motors turn.
     """
+    path, series = signals.recording.path, signals.series
     slow = {name: series[name].rate for name in NEEDS if series[name].rate < SLOWEST}
     if slow:
         rates = ", ".join(f"{name} at {rate:.0f} Hz" for name, rate in slow.items())
@@ -91,6 +94,16 @@ def obstacle(
     if not flown:
         return RecordingError(
             path, "nothing flies in it: the motors only idle", "check what was recorded of them"
+        )
+    often = float(np.quantile(np.linalg.norm(series["body_rate"].values, axis=1), 0.9))
+    stated = signals.places["body_rate"].source.unit is not None or any(
+        note.code is NoteCode.UNIT_READ and note.names[0] == "body_rate" for note in signals.notes
+    )
+    if is_tabular(signals.recording.format) and not stated and GENTLE < often <= FASTEST_TURN:
+        return RecordingError(
+            path,
+            f"holds no pose, and a body rate of up to {often:.1f} that may be in rad/s or deg/s",
+            "give body_rate its unit (si or deg/s) in the topic map",
         )
     return None
 
@@ -119,7 +132,7 @@ def read_inertial(
         require_pose(signals.recording, signals.topic_map, signals.places, given=given is not None)
         return None
     runs = flying(signals)
-    if (error := obstacle(path, signals.series, runs)) is not None:
+    if (error := obstacle(signals, runs)) is not None:
         raise error
     kept = {
         name: signals.series[name] for name in (*NEEDS, "battery_voltage") if name in signals.series

@@ -20,6 +20,7 @@ from tuner.numerics import GRAVITY
 NAMES = {
     "si": "in SI units",
     "deg": "in degrees",
+    "deg/s": "in degrees per second",
     "g": "in g",
     "mg": "in thousandths of g",
     "mV": "in millivolts",
@@ -32,6 +33,8 @@ NAMES = {
 FORCE = (0.75, 1.4)
 #: rad that are more than a tilt, and less than a vehicle in the air has of them in degrees.
 MOST_TILT, LEAST_TILT = 0.55 * math.pi, 0.06
+#: rad/s that no vehicle turns at for a tenth of its flight: gyros end at 35.
+FASTEST_TURN = 40.0
 FEWEST = 20
 
 
@@ -69,6 +72,12 @@ def _command(values: Array) -> str | None:
     return None
 
 
+def _rates(values: Array) -> str | None:
+    """Return degrees per second where no gyro measures so many radians."""
+    often = float(np.quantile(np.linalg.norm(values, axis=1), 0.9))
+    return "deg/s" if often > FASTEST_TURN else None
+
+
 def _voltage(values: Array) -> str | None:
     return "mV" if 2000 < float(np.median(values)) < 100_000 else None
 
@@ -87,6 +96,7 @@ _RULES: Mapping[str, Callable[[Array], str | None]] = {
     "command": _command,
     "battery_voltage": _voltage,
     "acceleration": _force,
+    "body_rate": _rates,
 }
 
 

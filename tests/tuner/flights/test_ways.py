@@ -17,6 +17,7 @@ from tuner.config import Options, read_vehicle, settle, with_values
 from tuner.errors import ConfigError, RecordingError
 from tuner.flights import Flight, load_flight
 from tuner.flights.flight import Series
+from tuner.flights.inertial import read_inertial
 from tuner.flights.matlab import MAGIC
 from tuner.flights.notes import NoteCode
 from tuner.flights.suggest import suggested_map
@@ -371,3 +372,22 @@ def test_a_pose_alone_is_said_to_be_that(tmp_path: Path) -> None:
     assert note.kind == "warning"
     with pytest.raises(RecordingError, match="holds a pose alone, and neither a reference"):
         as_fitted(tmp_path / "flight.csv")
+
+
+@pytest.mark.parametrize(("factor", "outcome"), [(1.0, "si"), (20.0, "ask"), (500.0, "deg/s")])
+def test_the_unit_of_a_gyro_without_a_pose(factor: float, outcome: str, tmp_path: Path) -> None:
+    time = np.arange(0.0, 10.0, 1 / 200)
+    turning = {f"w{a}": factor * 0.3 * np.sin(3 * time + i) for i, a in enumerate(ways.XYZ)}
+    force = {f"a{a}": 9.81 * (a == "z") + 0.0 * time for a in ways.XYZ}
+    table = {"time": time, **turning, **force, **dict.fromkeys(ways.COMMANDS, 0.5 + 0.0 * time)}
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.text(table))
+    if outcome == "ask":
+        with pytest.raises(RecordingError, match=r"may be in rad/s or deg/s.*si or deg/s"):
+            read_inertial(path)
+        return
+    flight = read_inertial(path)
+    assert flight is not None
+    scale = 1.0 if outcome == "si" else np.radians(1.0)
+    expected = scale * factor * 0.3
+    assert np.abs(flight.series["body_rate"].values).max() == pytest.approx(expected, rel=0.01)
