@@ -129,7 +129,7 @@ def test_a_damaged_file_is_named(report: Path, tmp_path: Path) -> None:
 
 
 def test_a_term_that_makes_left_out_flights_worse_is_drawn_left_of_zero(report: Path) -> None:
-    contents = read_contents(report)
+    contents = read_contents(report.parent)
     assert contents.run is not None
     section = selection(contents)
     assert section is not None
