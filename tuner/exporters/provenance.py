@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import date
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from pydantic import JsonValue
 
 from tuner.coefficients import COEFFICIENTS, REGISTRY, Written
 from tuner.config import VehicleFile, values_of
+from tuner.errors import InputError
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.exporters.target import Target, quantity
 from tuner.result import EffectiveResult, Run
@@ -105,7 +107,8 @@ def in_simulator(
                 return run, None
             found = flying, effective
     if found is None and refit is not None:
-        found = refit(run, simulator)
+        with suppress(InputError):  # recordings that are gone: the gate that flies them says so
+            found = refit(run, simulator)
     if found is None:
         return run, None
     flying, effective = found

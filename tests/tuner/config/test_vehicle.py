@@ -175,6 +175,7 @@ def test_every_number_of_a_vehicle_file_is_a_coefficient_or_known_not_to_be():
     assert places - registered == {
         ("motor", "max_rotor_velocity"),
         ("aerodynamics", "reaction_torque"),
+        ("aerodynamics", "thrust_law"),
     }
 
 
