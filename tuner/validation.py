@@ -54,13 +54,23 @@ def complaint(detail: ErrorDetails) -> tuple[str, str]:
         case "model_type" | "model_attributes_type" | "dict_type":
             return f"{key} is {_short(detail['input'])}", "it should be a mapping of keys to values"
         case _:
+            return f"{key} is {_short(detail['input'])}", _expected(detail)
+
+
+def _expected(detail: ErrorDetails) -> str:
+    """Return what a value should have been."""
+    context = detail.get("ctx", {})
+    match detail["type"]:
+        case "too_short" | "string_too_short":
+            return f"give at least {context['min_length']}"
+        case "too_long" | "string_too_long":
+            return f"give at most {context['max_length']}"
+        case "string_pattern_mismatch":
+            return f"it should look like {context['pattern']}"
+        case _:
             message = detail["msg"].removeprefix("Value error, ")
-            return (
-                f"{key} is {_short(detail['input'])}",
-                message.replace("Input should be", "it should be").replace(
-                    "Input should", "it should"
-                ),
-            )
+            message = message.replace("Input should be", "it should be")
+            return message.replace("Input should", "it should")
 
 
 def dotted(place: Place) -> str:

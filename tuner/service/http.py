@@ -198,7 +198,7 @@ def get_jobs(
 def get_job(service: Served, job: str) -> FullJobAnswer:
     """Return a job, with what it said."""
     row = jobs.job(service.database, job)
-    return full_job(row, jobs.events(service.database, row))
+    return full_job(row, jobs.events(service.database, row, kind="message"))
 
 
 @api.get(

@@ -220,8 +220,15 @@ def job(database: Database, name: str) -> JobRow:
         return row
 
 
-def events(database: Database, row: JobRow, *, after: int = 0, most: int = 5_000) -> list[EventRow]:
-    """Return what happened to a job after an event of it."""
+def events(
+    database: Database,
+    row: JobRow,
+    *,
+    after: int = 0,
+    most: int = 5_000,
+    kind: str | None = None,
+) -> list[EventRow]:
+    """Return what happened to a job after an event of it, of one kind or of all."""
     with database.reading() as session:
         statement = (
             select(EventRow)
@@ -229,6 +236,8 @@ def events(database: Database, row: JobRow, *, after: int = 0, most: int = 5_000
             .order_by(EventRow.number)
             .limit(most)
         )
+        if kind is not None:
+            statement = statement.where(EventRow.kind == kind)
         return list(session.scalars(statement))
 
 

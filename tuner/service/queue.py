@@ -20,7 +20,7 @@ from tuner.service.database import Database
 from tuner.service.tables import EventRow, FileRow, JobRow, PointRow, State
 
 MOST_EVENTS = 20_000
-"""Of one job; what would come after is not kept."""
+"""Of one job; of what comes after, only messages and states are kept, as many again."""
 
 
 @dataclass(frozen=True)
@@ -222,6 +222,6 @@ def add_event(session: Session, job: int, kind: str, content: Mapping[str, Any])
         .execution_options(synchronize_session=False)
     )
     assert number is not None
-    if number <= MOST_EVENTS:
+    if number <= MOST_EVENTS * (2 if kind in ("message", "state") else 1):
         row = {"job": job, "number": number, "kind": kind, "content": dict(content)}
         session.execute(insert(EventRow), [row])

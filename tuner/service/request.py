@@ -248,7 +248,7 @@ def _named(
     shipped = _shipped(_KINDS[key])
     if not isinstance(given, str) or given not in shipped:
         known = [*shipped, *(earlier or ())]
-        remedy = did_you_mean(str(given), known) + " Or give the content of its file."
+        remedy = f"{did_you_mean(str(given), known)} or give the content of its file"
         raise ConfigError(key, f"'{given}' is not known here", remedy)
     return given
 

@@ -8,6 +8,8 @@ import pytest
 
 from tests.tuner.service.conftest import ended, submit, upload
 from tuner.result import RunResult
+from tuner.service import jobs, queue
+from tuner.service.tables import JobRow
 
 KEYS = {
     "id",
@@ -208,6 +210,20 @@ def test_what_goes_with_the_mass_is_compared_at_one_mass(client, recording):
     page = client.get("/compare", params={"a": jobs[0], "b": jobs[1]}).text
     assert all(words in page for words in ("2 kg", "2.5 kg", "motor_constant*", "+0.00 %", ">0.0<"))
     assert "motor_constant*" not in client.get("/compare", params={"a": jobs[0], "b": jobs[0]}).text
+
+
+def test_what_is_found_after_a_long_search_reaches_the_log(idle, monkeypatch):
+    monkeypatch.setattr(queue, "MOST_EVENTS", 10)
+    with idle.database.writing() as session:
+        row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)
+        session.add(row)
+        session.flush()
+        for kind in ["iteration"] * 15 + ["message"]:
+            queue.add_event(session, row.number, kind, {"text": "a flight got worse"})
+    found = jobs.events(idle.database, row)
+    assert [event.kind for event in found] == ["iteration"] * 10 + ["message"]
+    (late,) = jobs.events(idle.database, row, most=1, kind="message")
+    assert late.content["text"] == "a flight got worse"
 
 
 def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):

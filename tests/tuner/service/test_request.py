@@ -53,8 +53,11 @@ def recording(client, table):
         ({"method": "magic"}, "the request: method is 'magic'"),
         ({"name": "a\x07b"}, "the request: a name holds characters that cannot be printed"),
         ({"nam": "x"}, "the request: unknown key 'nam'; did you mean 'name'?"),
-        ({"recordings": []}, "the request: recordings is []"),
-        ({"recordings": ["x"]}, "the request: recordings[0] is 'x'"),
+        ({"recordings": []}, "the request: recordings is []; give at least 1"),
+        (
+            {"recordings": ["x"]},
+            "the request: recordings[0] is 'x'; it should look like ^[0-9a-f]{64}$",
+        ),
         ({"recordings": ["f" * 64]}, "recordings: ffffffffffff… was not uploaded here; upload"),
     ],
     ids=str,

@@ -21,6 +21,7 @@ from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
 from tuner.service.history import history, vehicles
 from tuner.service.http import Served, service_of, upload
+from tuner.service.queue import MOST_EVENTS
 from tuner.service.request import JobRequest
 from tuner.service.safety import COOKIE
 from tuner.service.service import Service
@@ -243,7 +244,7 @@ def show_live(service: Served, job: str) -> Response:
 
 
 def _live(service: Service, row: JobRow) -> dict[str, object]:
-    events = jobs.events(service.database, row, most=20_000)
+    events = jobs.events(service.database, row, most=2 * MOST_EVENTS)
     iterations = [
         float(event.content["position_rmse"])
         for event in events
