@@ -41,6 +41,8 @@ class Claim:
         Name of each recording in the job -> its digest.
     checkpoint
         Name -> digest of what a search elsewhere has put into the store.
+    said
+        Messages of earlier attempts: one begins as the one before it did.
     """
 
     number: int
@@ -50,6 +52,7 @@ class Claim:
     request: Mapping[str, Any]
     flights: Mapping[str, str]
     checkpoint: Mapping[str, str]
+    said: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -112,8 +115,13 @@ class Queue:
             row.started = row.started or now
             flights = {flight.name: flight.sha256 for flight in row.flights}
             add_event(session, row.number, "state", {"state": State.RUNNING})
+            messages = select(EventRow.content).where(
+                EventRow.job == row.number, EventRow.kind == "message"
+            )
+            said = frozenset(str(content["text"]) for content in session.scalars(messages))
+            checkpoint = row.checkpoint or {}
             return Claim(
-                row.number, row.id, word, row.deaths, row.request, flights, row.checkpoint or {}
+                row.number, row.id, word, row.deaths, row.request, flights, checkpoint, said
             )
 
     def report(
@@ -128,6 +136,8 @@ class Queue:
             if not _change(session, claim, {**standing, "lease": lease}):
                 return False
             for kind, content in events:
+                if kind == "message" and content["text"] in claim.said:
+                    continue
                 add_event(session, claim.number, kind, content)
             return True
 

@@ -226,6 +226,14 @@ def test_what_is_found_after_a_long_search_reaches_the_log(idle, monkeypatch):
     assert late.content["text"] == "a flight got worse"
 
 
+def test_an_attempt_repeats_nothing_that_one_before_it_said(client, recording):
+    job = submit(client, recording, namespace="refuse")
+    ended(client, job)
+    client.post(f"/api/v1/jobs/{job}/retry")
+    log = ended(client, job)["log"]
+    assert log == ["begins at 0"]
+
+
 def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):
     own = updated.model_dump(mode="json", exclude_none=True) | {"name": "quad 7"}
     submit(client, recording, vehicle=own)
