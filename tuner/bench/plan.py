@@ -105,7 +105,7 @@ class HoverPoint(Section):
     @model_validator(mode="after")
     def _has_one_source(self) -> Self:
         if (self.rotor_speed is None) == (self.recording is None):
-            raise ValueError("Input should have either rotor_speed or recording")
+            raise ValueError("it should have either rotor_speed or recording")
         return self
 
 
@@ -141,11 +141,11 @@ class SpinPoint(Section):
     def _has_one_source(self) -> Self:
         numbers = (self.yaw_rate, self.rotor_speed_slow)
         if self.recording is None and None in numbers:
-            raise ValueError("Input should have yaw_rate and rotor_speed_slow, or recording")
+            raise ValueError("it should have yaw_rate and rotor_speed_slow, or recording")
         if self.recording is not None and (*numbers, self.rotor_speed_fast) != (None,) * 3:
-            raise ValueError("Input should have numbers or recording, not both")
+            raise ValueError("it should have numbers or recording, not both")
         if self.yaw_rate is not None and not SLOWEST_SPIN <= abs(self.yaw_rate) <= FASTEST_SPIN:
-            raise ValueError("Input should have a yaw_rate of 0.2 to 50 rad/s")
+            raise ValueError("it should have a yaw_rate of 0.2 to 50 rad/s")
         return self
 
 
@@ -175,7 +175,7 @@ class Propeller(Section):
         pair = (self.thrust_coefficient, self.power_coefficient)
         if (self.table is None) == (None in pair):
             raise ValueError(
-                "Input should have either table, or thrust_coefficient and power_coefficient"
+                "it should have either table, or thrust_coefficient and power_coefficient"
             )
         return self
 

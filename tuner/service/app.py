@@ -23,7 +23,7 @@ from tuner.service.service import Service
 from tuner.service.shapes import API, Problem
 from tuner.service.web.pages import web
 from tuner.service.web.rendering import render
-from tuner.validation import complaint
+from tuner.validation import first_complaint
 from tuner.versions import installed
 
 logger = logging.getLogger(__name__)
@@ -82,11 +82,12 @@ async def _refused(request: Request, error: Exception) -> Response:
 async def _invalid(request: Request, error: Exception) -> Response:
     """Return the first complaint about a request's form, as a sentence."""
     assert isinstance(error, RequestValidationError)
-    first = dict(error.errors()[0])
-    first["loc"] = tuple(part for part in first["loc"] if part != "body")
-    if first["type"] == "json_invalid":
+    details = [
+        {**detail, "loc": detail["loc"][1:]} for detail in error.errors()
+    ]  # from body, query
+    if details[0]["type"] == "json_invalid":
         return _problem(request, 422, "the request", "is not JSON", "correct it")
-    what, remedy = complaint(first)  # type: ignore[arg-type]
+    what, remedy = first_complaint(details)  # type: ignore[arg-type]
     return _problem(request, 422, "the request", what, remedy)
 
 

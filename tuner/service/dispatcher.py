@@ -8,6 +8,7 @@ import queue
 import shutil
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -146,7 +147,7 @@ class Dispatcher:
     def _worked_on(self, claim: Claim, slot: int, folder: Path) -> Outcome:
         """Return what an attempt comes to, here or elsewhere."""
         limits, lease = self._settings.limits, self._settings.lease_seconds
-        report = _Reporting(self._jobs, claim, lease)
+        report = Reporting(self._jobs, claim, lease)
         is_unwanted = self._stopping.is_set
         if self._engine is not None:
             errand = Errand(claim, self._settings.store_url, limits)
@@ -200,10 +201,11 @@ class Dispatcher:
         return sorted(os.sched_getaffinity(0))[slot :: self._settings.workers]
 
 
-class _Reporting:
+class Reporting:
     """Passes on what a worker says, and renews the lease now and then when it says nothing.
 
-    What cannot be entered because the database does not answer is kept for the next time.
+    What cannot be entered because the database does not answer is kept for the next time. What
+    earlier attempts said before their search began is not said again before this one's.
     """
 
     def __init__(self, jobs: Queue, claim: Claim, lease: float) -> None:
@@ -213,9 +215,11 @@ class _Reporting:
         self._last = 0.0
         self._events: list[tuple[str, Mapping[str, Any]]] = []
         self._standing: dict[str, Any] = {}
+        self._repeated = Counter(claim.preamble)
 
     def __call__(self, events: Events, standing: Mapping[str, Any]) -> bool:
-        self._events.extend(events)
+        """Enter events and standing, and return whether the attempt still holds its job."""
+        self._events.extend(event for event in events if self._is_new(*event))
         self._standing.update(standing)
         now = time.monotonic()
         if not self._events and now - self._last < self._pause:
@@ -227,3 +231,12 @@ class _Reporting:
             return True
         self._last, self._events, self._standing = now, [], {}
         return held
+
+    def _is_new(self, kind: str, content: Mapping[str, Any]) -> bool:
+        """Return whether an event is none that repeats the preamble of an earlier attempt."""
+        if kind == "iteration":
+            self._repeated.clear()
+        if kind != "message" or not self._repeated[content["text"]]:
+            return True
+        self._repeated[content["text"]] -= 1
+        return False

@@ -41,8 +41,8 @@ class Claim:
         Name of each recording in the job -> its digest.
     checkpoint
         Name -> digest of what a search elsewhere has put into the store.
-    said
-        Messages of earlier attempts: one begins as the one before it did.
+    preamble
+        What earlier attempts said before their search began, which this one may say again.
     """
 
     number: int
@@ -52,7 +52,7 @@ class Claim:
     request: Mapping[str, Any]
     flights: Mapping[str, str]
     checkpoint: Mapping[str, str]
-    said: frozenset[str] = frozenset()
+    preamble: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -115,13 +115,9 @@ class Queue:
             row.started = row.started or now
             flights = {flight.name: flight.sha256 for flight in row.flights}
             add_event(session, row.number, "state", {"state": State.RUNNING})
-            messages = select(EventRow.content).where(
-                EventRow.job == row.number, EventRow.kind == "message"
-            )
-            said = frozenset(str(content["text"]) for content in session.scalars(messages))
-            checkpoint = row.checkpoint or {}
+            checkpoint, preamble = row.checkpoint or {}, _preamble(session, row.number)
             return Claim(
-                row.number, row.id, word, row.deaths, row.request, flights, checkpoint, said
+                row.number, row.id, word, row.deaths, row.request, flights, checkpoint, preamble
             )
 
     def report(
@@ -136,8 +132,6 @@ class Queue:
             if not _change(session, claim, {**standing, "lease": lease}):
                 return False
             for kind, content in events:
-                if kind == "message" and content["text"] in claim.said:
-                    continue
                 add_event(session, claim.number, kind, content)
             return True
 
@@ -199,6 +193,20 @@ class Queue:
                 add_event(session, row.number, "message", {"text": text})
                 add_event(session, row.number, "state", {"state": State.QUEUED})
             return len(rows)
+
+
+def _preamble(session: Session, job: int) -> tuple[str, ...]:
+    """Return what the attempts at a job said before their first iterations."""
+    begins = {"state": True, "iteration": False}
+    events = select(EventRow.kind, EventRow.content).where(
+        EventRow.job == job, EventRow.kind.in_((*begins, "message"))
+    )
+    texts, is_before = [], True
+    for kind, content in session.execute(events.order_by(EventRow.number)):
+        if kind == "message" and is_before:
+            texts.append(str(content["text"]))
+        is_before = begins.get(kind, is_before)
+    return tuple(texts)
 
 
 _UNCLAIMED = {"claim": None, "owner": None, "lease": None}

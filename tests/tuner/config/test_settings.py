@@ -112,7 +112,7 @@ def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypa
         ({"flights": []}, "names no recording"),
         ({"holdout": ["d"]}, "no flight 'd'"),
         ({"holdout": ["a", "b", "c"]}, "holds out all flights"),
-        ({"mass": -1.0}, "mass is -1.0; it should be greater than 0"),
+        ({"mass": -1.0}, "mass is -1.0; it should be more than 0"),
         ({"mass": float("nan")}, "mass is nan"),
         ({"seed": -1}, "seed is -1"),
         ({"fit": ["mass"], "fix": ["mass"]}, "cannot stand beside --fix"),

@@ -9,7 +9,8 @@ import pytest
 from tests.tuner.service.conftest import ended, submit, upload
 from tuner.result import RunResult
 from tuner.service import jobs, queue
-from tuner.service.tables import JobRow
+from tuner.service.dispatcher import Reporting
+from tuner.service.tables import JobRow, State
 
 KEYS = {
     "id",
@@ -232,6 +233,23 @@ def test_an_attempt_repeats_nothing_that_one_before_it_said(client, recording):
     client.post(f"/api/v1/jobs/{job}/retry")
     log = ended(client, job)["log"]
     assert log == ["begins at 0"]
+
+
+def test_what_happens_again_after_the_preamble_is_said_again(idle):
+    said, iteration = ("message", {"text": "the flights"}), ("iteration", {"number": 1})
+    worse = ("message", {"text": "a flight got worse"})
+    with idle.database.writing() as session:
+        row = JobRow(id="0" * 16, name="x", vehicle="x", request={}, submitted=0.0)
+        row.state, row.deaths, row.events = State.QUEUED, 0, 0
+        session.add(row)
+    jobs_queue = queue.Queue(idle.database, "here", 60.0)
+    for _ in range(3):
+        claim = jobs_queue.claim()
+        Reporting(jobs_queue, claim, 60.0)([said, said, iteration, worse, said], {})
+        jobs_queue.give_back(claim, message="gone")
+    texts = [e.content["text"] for e in jobs.events(idle.database, row, kind="message")]
+    again = ["a flight got worse", "the flights", "gone"]
+    assert texts == ["the flights", "the flights", *again, *again, *again]
 
 
 def test_an_earlier_job_s_vehicle_is_known_by_its_name(client, recording, updated):
