@@ -13,10 +13,12 @@ import httpx
 import pytest
 
 from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
+from tuner.config import Options
 from tuner.errors import RecordingError
 from tuner.service import incoming, inspecting, recordings
 from tuner.service.service import Service
 from tuner.service.settings import MIB
+from tuner.service.web.words import FIELDS, on_the_web
 
 BAG = FLIGHTS / "yaw_spin_3rps.bag"
 
@@ -236,3 +238,33 @@ def test_what_a_killed_server_was_receiving_is_gone_when_it_starts_again(setting
     service = Service.open(settings)
     assert left(service) == []
     service.close()
+
+
+@pytest.mark.usefixtures("real_inspection")
+def test_a_card_has_the_page_s_fields_in_place_of_options(client):
+    recording = upload(
+        client, b"time,a,b\n" + b"".join(b"%d,1,2\n" % i for i in range(99)), "x.csv"
+    )
+    page = client.get("/", params={"r": recording}).text
+    assert "a topic map (the setting &#39;topics&#39;)" in page
+    assert not re.search("--[a-z]", page)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name it in a topic map (--topics FILE)", "name it in a topic map (the setting 'topics')"),
+        ("--holdout: holds out all", "what checks the fit: holds out all"),
+        (
+            "--fit: cannot stand beside --fix",
+            "the setting 'free': cannot stand beside the setting 'fixed'",
+        ),
+        ("--fitness and --mass-error are none", "--fitness and --mass-error are none"),
+    ],
+)
+def test_options_become_fields_of_the_page(text, words):
+    assert on_the_web(text) == words
+
+
+def test_every_option_that_becomes_a_field_is_one():
+    assert set(FIELDS) <= set(Options.__dataclass_fields__)

@@ -13,7 +13,7 @@ import anyio.to_thread
 from fastapi import APIRouter, Query, Request
 from pydantic import ValidationError
 from starlette.datastructures import FormData
-from starlette.responses import HTMLResponse, RedirectResponse, Response
+from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from tuner.errors import ConfigError, InputError
 from tuner.result import RMSE_UNITS
@@ -31,6 +31,7 @@ from tuner.service.tables import JobRow, RecordingRow, State
 from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render
+from tuner.service.web.words import on_the_web
 from tuner.validation import config_error
 from tuner.yaml_files.document import read_yaml
 from tuner.yaml_files.shipped import configs_folder
@@ -162,6 +163,18 @@ def _submit(service: Service, form: FormData) -> Response:
         return _start(service, chosen, given=text, problem=str(error), status=status)
     service.dispatcher.call()
     return RedirectResponse(f"/jobs/{row.id}", status_code=303)
+
+
+@web.post("/settings")
+async def read_settings(request: Request) -> Response:
+    """Return what typed or dropped settings hold out, for the script, or what is wrong in them."""
+    async with request.form(max_files=0, max_fields=10, max_part_size=2**20) as form:
+        text = str(form.get("settings", ""))
+    try:
+        held = _held(await anyio.to_thread.run_sync(typed_settings, text))
+    except InputError as error:
+        return JSONResponse({"holdout": [], "problem": on_the_web(str(error))})
+    return JSONResponse({"holdout": held, "problem": ""})
 
 
 def _held(settings: Mapping[str, Any]) -> list[str]:

@@ -11,9 +11,11 @@ from starlette.responses import HTMLResponse
 
 from tuner.flights.damage import Cause, Damage
 from tuner.flights.notes import Note
+from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
 from tuner.service.tables import State
+from tuner.service.web.words import on_the_web
 from tuner.wording.notes import damage_sentence, note_in_words
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
@@ -45,6 +47,8 @@ def environment() -> Environment:
         "ago": _ago,
         "moment": lambda value: "" if value is None else iso(value),
         "lasting": _lasting,
+        "flight": flight_name,
+        "web": on_the_web,
         "note": lambda raw: note_in_words(Note.read(raw)),
         "damage": lambda raw: damage_sentence(Damage(**raw | {"cause": Cause(raw["cause"])})),
     }

@@ -1,0 +1,28 @@
+"""Messages as the pages word them: what the command line has as options, pages have as fields."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+FIELDS: Mapping[str, str] = {
+    "config": "the settings",
+    "controller": "the setting 'controller'",
+    "fit": "the setting 'free'",
+    "fix": "the setting 'fixed'",
+    "holdout": "what checks the fit",
+    "mass": "the weighed mass",
+    "method": "the setting 'search.method'",
+    "namespace": "the setting 'namespace'",
+    "seed": "the setting 'search.seed'",
+    "topics": "the setting 'topics'",
+    "vehicle": "the vehicle",
+}
+"""Option of `tune` that a job has, too -> the same on the page where a job begins."""
+_OPTION = re.compile(rf"--({'|'.join(FIELDS)})\b(?!-)( [A-Z]+\b)?")
+_COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
+
+
+def on_the_web(text: str) -> str:
+    """Return a message with fields of the page in place of options of the command line."""
+    return _OPTION.sub(lambda found: FIELDS[found[1]], _COMMAND.sub("", text))
