@@ -23,6 +23,10 @@ MADE = {
     Code.FLIGHT_WORSE: Finding(
         Code.FLIGHT_WORSE, "warning", "a", {"before": 29.0, "after": 40.0}, ("attitude", "degrees")
     ),
+    Code.FLIGHT_CRASHES: Finding(Code.FLIGHT_CRASHES, "warning", "a", {"seconds": 4.2}),
+    Code.PART_FAILED: Finding(
+        Code.PART_FAILED, "warning", "examination", names=("LinAlgError", "singular")
+    ),
     Code.MISSING_SIGNALS: Finding(
         Code.MISSING_SIGNALS, "warning", "a", names=("rotor_speed", "command")
     ),

@@ -36,7 +36,7 @@ def test_a_crash_and_a_metre_are_said_as_such():
 
 
 def test_what_a_target_holds_is_not_lost_there():
-    assert what_is_lost(EFFECTIVE, lambda _: Written("a tag")) == ()
+    assert what_is_lost(EFFECTIVE, lambda _: Written("a tag"), ()) == ()
 
 
 def row(code, *, kept=False):
