@@ -20,6 +20,8 @@ from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 
+EXPORTS = "export"
+"""Folder of a result folder, for its exports."""
 BEST_FIT_FILE = "best_fit.yaml"
 EFFECTIVE_FILE = "effective.yaml"
 REMEDY = "give the result folder of a finished run, made by this version of tune (or run it again)"

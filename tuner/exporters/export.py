@@ -28,11 +28,10 @@ from tuner.exporters.target import (
     not_carried,
     target_of,
 )
-from tuner.result import Run, read_run
+from tuner.result import EXPORTS, Run, read_run
 from tuner.wording.result import what_is_exported, what_is_lost
 
-FOLDER = "export"
-"""Of a result folder, for its exports."""
+FOLDER = EXPORTS
 
 
 @dataclass(frozen=True)

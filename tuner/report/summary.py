@@ -20,12 +20,8 @@ def summary(contents: Contents) -> list[str]:
     """Return the outcome in sentences."""
     sentences = []
     if contents.run is not None:
-        results = contents.run.result.coefficients
-        verdicts = [result.verdict for result in results.values() if result.fitted]
-        bench = contents.bench
-        sentences.append(of_run(contents.run.result) if bench is None else bench_in_words(bench))
-        if verdicts:
-            sentences.append(f"Of the coefficients, {_counted(verdicts)}.")
+        result, bench = contents.run.result, contents.bench
+        sentences += [_of_fit(result) if bench is None else bench_in_words(bench), *_judged(result)]
     elif contents.knowledge is not None:
         known = contents.knowledge.coefficients.values()
         verdicts = [coefficient.verdict for coefficient in known if coefficient.fitted]
@@ -37,6 +33,16 @@ def summary(contents: Contents) -> list[str]:
     if contents.proposals is not None:
         sentences += proposals_in_words(contents.proposals)[:2]
     return sentences
+
+
+def outcome(result: RunResult) -> list[str]:
+    """Return what a fit came to in sentences: how it fits, and what is known by it."""
+    return [_of_fit(result), *_judged(result)]
+
+
+def _judged(result: RunResult) -> list[str]:
+    verdicts = [found.verdict for found in result.coefficients.values() if found.fitted]
+    return [f"Of the coefficients, {_counted(verdicts)}."] if verdicts else []
 
 
 def _counted(verdicts: Sequence[Verdict]) -> str:
@@ -54,14 +60,14 @@ def _of_many(words: str) -> str:
     return words.replace("at its initial value", "at their initial values")
 
 
-def of_run(result: RunResult) -> str:
+def _of_fit(result: RunResult) -> str:
     """Return a fit in one sentence."""
     fitted = [flight for flight in result.flights if flight.split == "fit"]
     held_out = [flight for flight in result.flights if flight.split == "holdout"]
     free = [coefficient for coefficient in result.coefficients.values() if coefficient.fitted]
     unknown = sum(coefficient.identifiable is False for coefficient in free)
     text = (
-        f"{len(free)} coefficients were fitted to {len(fitted)} "
+        f"{len(free)} coefficient{'s were' if len(free) != 1 else ' was'} fitted to {len(fitted)} "
         f"flight{'s' if len(fitted) != 1 else ''}"
     )
     text += f", of which the flights do not identify {unknown}" if unknown else ""

@@ -14,6 +14,7 @@ from starlette.requests import ClientDisconnect
 from tuner.disk import file_name
 from tuner.errors import InputError
 from tuner.service import jobs, recordings
+from tuner.service.archive import zipped
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.events import follow
 from tuner.service.history import history
@@ -281,6 +282,27 @@ def file_response(service: Service, row: FileRow) -> StreamingResponse:
                 yield block
 
     return StreamingResponse(blocks(), media_type=kind, headers=headers)
+
+
+@api.get(
+    "/jobs/{job}/files.zip",
+    response_class=StreamingResponse,
+    responses={
+        200: {"content": {"application/zip": {"schema": {"type": "string"}}}},
+        **NOT_FOUND,
+    },
+)
+def get_files(service: Served, job: str) -> StreamingResponse:
+    """Return all files of a job's result as one archive."""
+    row = jobs.job(service.database, job)
+    if not row.files:
+        raise NotKnownError(f"job {row.id}", "has no files", "wait until the job is done")
+    for file in row.files:
+        if not service.store.has(file.sha256):
+            raise NotKnownError(file.name, "is gone from the store", "submit the job again")
+    headers = {"content-disposition": f'attachment; filename="{row.id}.zip"'}
+    blocks = zipped(service.store, row.files, row.id)
+    return StreamingResponse(blocks, media_type="application/zip", headers=headers)
 
 
 @api.get("/vehicles/{name}/history", responses=NOT_FOUND)

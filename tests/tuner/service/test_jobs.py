@@ -1,16 +1,22 @@
 """Jobs through the HTTP interface: shapes, states, deaths, cancelling, trying again."""
 
+import io
 import json
+import random
+import re
 import time
+import zipfile
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from tests.tuner.service.conftest import ended, submit, upload
+from tuner.report.summary import outcome
 from tuner.result import RunResult
-from tuner.service import jobs, queue
+from tuner.service import archive, jobs, queue
+from tuner.service.attempt import put
 from tuner.service.dispatcher import Reporting
-from tuner.service.tables import JobRow, State
+from tuner.service.tables import FileRow, JobRow, State
 
 KEYS = {
     "id",
@@ -266,3 +272,42 @@ def test_health_and_counters(client, recording):
     assert 'tune_jobs{state="done"} 1.0' in text
     assert 'route="/api/v1/jobs/{job}"' in text
     assert "tune_uploaded_bytes_total" in text
+
+
+def test_all_files_come_as_one_archive_under_plain_names(client, recording):
+    job = ended(client, submit(client, recording))
+    answer = client.get(f"/api/v1/jobs/{job['id']}/files.zip")
+    assert answer.headers["content-type"] == "application/zip"
+    assert "content-length" not in answer.headers  # it is made while it is sent
+    with zipfile.ZipFile(io.BytesIO(answer.content)) as opened:
+        assert opened.testzip() is None
+        names = {name.removeprefix(f"{job['id']}/"): name for name in opened.namelist()}
+        assert set(names) == set(job["links"]["files"])
+        for name, link in job["links"]["files"].items():
+            assert opened.read(names[name]) == client.get(link).content
+    waiting = submit(client, recording, namespace="slow")
+    early = client.get(f"/api/v1/jobs/{waiting}/files.zip")
+    assert (early.status_code, early.json()["what"]) == (404, "has no files")
+
+
+def test_an_archive_unpacks_nowhere_else_and_is_made_block_by_block(idle, tmp_path, monkeypatch):
+    monkeypatch.setattr(archive, "BLOCK", 1000)
+    content = random.Random(1).randbytes(50_000)
+    (tmp_path / "x").write_bytes(content)
+    digest = put(tmp_path / "x", idle.store)
+    names = ("../../x", "/etc/x", "a/../x", "C:\\x", "plots/\0.svg")
+    rows = [FileRow(name=name, sha256=digest, size=50_000) for name in names]
+    blocks = list(archive.zipped(idle.store, rows, "job"))
+    assert max(map(len, blocks)) < 40_000  # compression's window; a file at once has more
+    with zipfile.ZipFile(io.BytesIO(b"".join(blocks))) as opened:
+        made = opened.namelist()
+        assert [opened.read(name) for name in made] == [content] * len(names)
+    assert all(re.fullmatch(r"job(/\w[\w.-]*)+", name, re.ASCII) for name in made)
+
+
+def test_a_job_s_page_begins_with_the_report_s_outcome_and_its_files(client, recording):
+    job = ended(client, submit(client, recording))
+    page = client.get(f"/jobs/{job['id']}").text
+    result = RunResult.model_validate(client.get(job["links"]["files"]["result.json"]).json())
+    assert f'<p class="outcome">{" ".join(outcome(result))}</p>' in page
+    assert page.index("/files.zip") < page.index("<iframe")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +17,8 @@ from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
 from tuner.errors import ConfigError, InputError
-from tuner.result import RMSE_UNITS
+from tuner.report import summary
+from tuner.result import EXPORTS, RMSE_UNITS
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
 from tuner.service.history import history, vehicles
@@ -247,7 +249,13 @@ def show_job(service: Served, job: str) -> Response:
     row = jobs.job(service.database, job)
     done, _ = jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
     others = [other for other in done if other.id != row.id]
-    return render("job.html.jinja", others=others, **_live(service, row))
+    outcome: list[str] = []
+    with suppress(InputError):  # the report, if it is there, says what it can
+        if row.state == State.DONE:
+            outcome = summary.outcome(comparing.result_of(service.database, service.store, row.id))
+    exports = [file for file in row.files if file.name.startswith(f"{EXPORTS}/")]
+    more = {"others": others, "outcome": outcome, "exports": exports}
+    return render("job.html.jinja", **more, **_live(service, row))
 
 
 @web.get("/jobs/{job}/live")
