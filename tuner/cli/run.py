@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     status = DONE
     try:
         _know_the_command(given)
-        answer = app(given)
+        answer = app(given or ["--help"])
         sys.stdout.flush()
         status = answer if isinstance(answer, int) else DONE  # of a command that answers by it
     except ServerFaultError as error:

@@ -12,8 +12,9 @@ from tuner.cli.app import COMMANDS
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_the_help_names_every_command(capsys):
-    assert main(["--help"]) == 0
+@pytest.mark.parametrize("arguments", [["--help"], []])
+def test_the_help_names_every_command(arguments, capsys):
+    assert main(arguments) == 0
     text = capsys.readouterr().out
     for name in (*COMMANDS, "--flights", "--holdout", "--resume", "Example: tune --flights"):
         assert name in text
