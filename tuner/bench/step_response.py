@@ -26,6 +26,10 @@ NOT_FIRST_ORDER = 0.1
 """Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
 GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """Time constants, s, from the best of which the fit begins."""
+EARLIEST = 0.05
+"""s by which a speed may react before its command's stamp, where two loggers wrote them."""
+TOLD = 2.0
+"""Standard errors by which it must do so for a remark."""
 MOST_STEPS = 200
 MOST = 12_000
 """Samples beyond which those long after a step are thinned."""
@@ -36,8 +40,11 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
 
     Between two steps of the command the speed approaches its level as exp(-(t - delay)/τ), with
     τ = time_constant_up while it rises and time_constant_down while it falls (Eq. 5.3); every level
-    is fitted. A second lag is tried beside it: where it explains much, the shape is not first order
-    (thesis 5.4.1), and a remark says so.
+    is fitted. Where two loggers wrote speed and command, their clocks may differ, and the speed may
+    react before its command's stamp: the delay is estimated in both directions. One below zero is
+    no latency; how far the clocks are off, in either direction, is then in its interval, and a
+    remark says so. A second lag is tried beside it: where it explains much, the shape is not first
+    order (thesis 5.4.1), and a remark says so.
 
     Parameters
     ----------
@@ -54,7 +61,7 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
     known = np.isfinite(speed) & np.isfinite(command)
     time, command, speed = time[known], command[known], speed[known]
-    near = _near_steps(command)
+    near = _near_steps(time, command)
     time, command, speed = time[near], command[near], speed[near]
     edges = _edges(command)
     if len(edges) > MOST_STEPS:
@@ -83,9 +90,15 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     # at every step where the log and the commands keep time
     interval = float(np.median(np.diff(time)))
     covariance[2, 2] += interval**2 / 12
+    latency = delay + 0.5 * interval
+    early = max(-latency, 0.0)
+    told = early > TOLD * math.sqrt(covariance[2, 2])
+    covariance[2, 2] += early**2  # clocks that differ may do so in either direction
     outliers = int((~kept).sum())
     numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
     remarks = [Remark("steps", numbers)]
+    if told:
+        remarks.append(Remark("command_late", {"seconds": early}))
     richer = _fit(steps, speed, kept, lags, second=True)
     plain = steps.simulated(lags, speed, kept)
     misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
@@ -97,7 +110,7 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     return Measurement(
         name,
         ({"time_constant_up": 1.0}, {"time_constant_down": 1.0}, {"actuator_latency": 1.0}),
-        np.array([lags[0], lags[1], delay + 0.5 * interval]),
+        np.array([lags[0], lags[1], max(latency, 0.0)]),
         covariance,
         tuple(remarks),
         (Curve("Step response", "time, s", "rotor speed, rad/s", time, speed, kept, time, plain),),
@@ -110,14 +123,15 @@ def _edges(command: Array) -> NDArray[np.intp]:
     return np.asarray(edges[np.diff(edges, prepend=-10) > 1])
 
 
-def _near_steps(command: Array) -> NDArray[np.bool_]:
+def _near_steps(time: Array, command: Array) -> NDArray[np.bool_]:
     """Return (n,) which samples to use: all, or of a long recording those after steps and some."""
     count = len(command)
     near = np.arange(count) % max(1, 2 * count // MOST) == 0
     edges = _edges(command)
     reach = MOST // (2 * max(len(edges), 1))
+    before = min(max(2, round(EARLIEST / float(np.median(np.diff(time))))), reach)
     for edge in edges[:MOST_STEPS]:
-        near[max(edge - 2, 0) : edge + reach] = True
+        near[max(edge - before, 0) : edge + reach] = True
     return np.asarray(near)
 
 
@@ -192,7 +206,8 @@ def _fit(
     """
     shortest = float(np.diff(steps.time[steps.bounds[1:-1]]).min(initial=1.0))
     more = int(second)
-    low = np.array([math.log(1e-4), math.log(1e-4), 0.0, *[math.log(1e-5)] * more])
+    earliest = -min(EARLIEST, 0.5 * shortest)
+    low = np.array([math.log(1e-4), math.log(1e-4), earliest, *[math.log(1e-5)] * more])
     high = np.array([math.log(10.0), math.log(10.0), 0.5 * shortest, *[0.0] * more])
     begin = np.array([*start, *[start[:2].min() + math.log(0.3)] * more])
     solution = least_squares(

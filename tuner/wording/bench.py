@@ -30,6 +30,10 @@ REMARKS: Mapping[str, str] = {
         "The voltage varied by a factor of {ratio:.3f} only, so that its exponent was not fitted."
     ),
     "steps": "{up:.0f} steps up and {down:.0f} down; {outliers:.0f} samples were dropped.",
+    "command_late": (
+        "The speed reacts {early:.1f} ms before its command's stamp: two clocks wrote them. The "
+        "time constants do not depend on that, the latency does, and is open by as much."
+    ),
     "not_first_order": (
         "The response is not first order: a second lag of {milliseconds:.1f} ms explains "
         "{explained:.0%} of what remains."
@@ -53,6 +57,7 @@ def remarks_in_words(experiment: ExperimentRecord) -> list[str]:
     for remark in experiment.remarks:
         numbers = dict(remark.numbers)
         numbers["degrees"] = math.degrees(numbers.get("amplitude", 0.0))
+        numbers["early"] = 1e3 * numbers.get("seconds", 0.0)
         numbers["milliseconds"] = 1e3 * numbers.get("lag", 0.0)
         sentences.append(REMARKS[remark.code].format(**numbers))
     return sentences

@@ -107,6 +107,26 @@ def test_a_second_lag_is_named():
     assert "not_first_order" in codes
 
 
+@pytest.mark.parametrize("samples_early", [0, 3, 10])
+def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants(samples_early):
+    off = []
+    for seed in range(6):
+        run = rigs.motor_steps(np.random.default_rng(seed), rate=400.0)
+        count = len(run["time"]) - samples_early
+        early = {name: run[name][:count] for name in ("time", "command")}
+        found = step_response(
+            "steps", "s.csv", early | {"rotor_speed": run["rotor_speed"][samples_early:]}
+        )
+        off.append(deviations(found))
+        told = {remark.code: remark.numbers for remark in found.remarks}
+        assert ("command_late" in told) is (samples_early > 2)
+        if samples_early > 2:
+            seconds = samples_early / 400.0 - TRUTH["actuator_latency"]
+            assert told["command_late"]["seconds"] == pytest.approx(seconds, abs=0.0025)
+    assert (np.abs(np.mean(off, axis=0)) < 1.5).all()
+    assert (np.abs(off) < 3.0).all()
+
+
 def test_a_wrong_lever_ratio_conflicts_with_the_hovers():
     random = np.random.default_rng(3)
     samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
