@@ -6,13 +6,18 @@ filters and no latencies. Every vehicle of a batch has coefficients of its own.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
+from jax import Array, lax
 
+from lanes import Argument, Program, Run
 from sim_jax.control.gains import (
     AttitudeGains,
     Controller,
@@ -24,9 +29,9 @@ from sim_jax.control.gains import (
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import Arrangement, rollout
+from sim_jax.rollout import begun, rollout
 from sim_jax.schedule import Schedule
-from sim_jax.state import hover
+from sim_jax.state import State, hover
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 
@@ -116,35 +121,79 @@ def factors(vehicles: int) -> Array:
     return spread
 
 
-def fly(
-    factor: Array,
-    *,
-    samples: int,
-    precision: Any = "float64",
-    arranged: Arrangement | None = None,
-) -> Motion:
-    """Fly a circle with factors (12, \\*batch) on the coefficients; return the logged motion."""
+def _arguments(factor: Array, points: ReferencePoint) -> tuple[Any, ...]:
+    """Return what a rollout takes; the factors are (12, \\*batch)."""
     vehicle = _vehicle()
-    numbers = [value * factor[i] for i, value in enumerate(_coefficients(vehicle))]
+    numbers = [
+        value.astype(factor.dtype) * factor[i] for i, value in enumerate(_coefficients(vehicle))
+    ]
     vehicle = eqx.tree_at(_coefficients, vehicle, numbers)
-    shape = factor.shape[1:]
+    zero = jnp.zeros(factor.shape[1:])
+    start = hover(vehicle, Vec3(zero, zero, zero + 1.0))
+    return vehicle, _controller(), SCHEDULE, ReferenceInlet(points), start
+
+
+def fly(factor: Array, *, samples: int) -> Motion:
+    """Fly a circle with factors (12, \\*batch) on the coefficients; return the logged motion."""
     points = _circle(samples)
-    if shape:
-        points = ReferencePoint(
-            *(
-                Vec3(part.x[:, None], part.y[:, None], part.z[:, None])
-                for part in (points.position, points.velocity, points.acceleration)
-            )
+    if factor.shape[1:]:
+        points = jax.tree.map(lambda column: column[:, None], points)
+    return rollout(*_arguments(factor, points), samples=samples).log.motion
+
+
+class _Given(NamedTuple):
+    factor: Any
+    shared: Any
+    points: Any
+
+
+class Kernel:
+    """The flight as a kernel: every vehicle has factors of its own, and 12 more are shared.
+
+    Parameters
+    ----------
+    precision
+        ``float32`` or ``float64``.
+    moves
+        Whether it is differentiated by the shared factors.
+    """
+
+    def __init__(self, precision: str = "float64", *, moves: bool = False) -> None:
+        real = np.dtype(precision)
+        self.program, self.moves = (
+            Program(
+                _flown,
+                _Given(
+                    Argument((COEFFICIENTS,), real, lanes=True),
+                    Argument((COEFFICIENTS,), real, lanes=False, moves=moves),
+                    jax.tree.map(lambda _: Argument(("samples",), real, lanes=False), _circle(1)),
+                ),
+                name="flight of the yardstick",
+            ),
+            moves,
         )
-    zero = jnp.zeros(shape)
-    flown = rollout(
-        vehicle,
-        _controller(),
-        SCHEDULE,
-        ReferenceInlet(points),
-        hover(vehicle, Vec3(zero, zero, zero + 1.0)),
-        samples=samples,
-        precision=precision,
-        arranged=arranged,
-    )
-    return flown.log.motion
+
+    def __call__(self, factor: Any, *, samples: int) -> Run:
+        """Fly factors (12, B); the log's leaves are (B, samples), on the host."""
+        return self.program(
+            _Given(factor, np.ones(COEFFICIENTS), _points(samples)),
+            [np.eye(COEFFICIENTS)] if self.moves else None,
+            lanes=np.shape(factor)[-1],
+            turns=samples,
+        )
+
+
+@cache
+def _points(samples: int) -> Any:
+    return jax.tree.map(np.asarray, _circle(samples))
+
+
+def _flown(given: _Given, lengths: Mapping[str, int]) -> Motion:
+    factor = given.factor * given.shared
+    plant, first = begun(*_arguments(factor, given.points), precision=factor.dtype.name)
+
+    def sample(state: State, number: Array) -> tuple[State, Motion]:
+        after, row = plant.sample(state, number)
+        return after, row.motion
+
+    return lax.scan(sample, first, jnp.arange(lengths["turns"]))[1]

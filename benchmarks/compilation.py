@@ -1,4 +1,4 @@
-"""Seconds to compile, with nothing kept from earlier."""
+"""Seconds to build programs, with nothing kept from earlier."""
 
 from __future__ import annotations
 
@@ -30,13 +30,14 @@ def measure() -> Section:
         traced, compiled[what] = (Spread.of([pair[i] for pair in pairs]) for i in (0, 1))
         rows.append([what, seconds(traced), seconds(compiled[what])])
     return Section(
-        "Compilation",
-        "Seconds in a fresh process with no cache: what jax traces in Python, then what XLA "
-        "compiles. The cache in the user's folder spares the second from the second run on.",
-        ["", "trace", "compile"],
+        "Building programs",
+        "Seconds in a fresh process with nothing kept: what jax traces in Python, then what is "
+        "written as LLVM IR and compiled. The gradient, in reverse mode, is compiled by XLA. The "
+        "cache in the user's folder spares the compiling from the second run on.",
+        ["", "trace", "build"],
         rows,
         [
-            Bar("cold compile, forward", compiled["forward"].median, 1, "at most", " s"),
-            Bar("cold compile, Jacobian", compiled["jacobian"].median, 3, "at most", " s"),
+            Bar("build, forward", compiled["forward"].median, 1, "at most", " s"),
+            Bar("build, Jacobian", compiled["jacobian"].median, 3, "at most", " s"),
         ],
     )

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import statistics
 import time
-from functools import partial
+
+import numpy as np
 
 from benchmarks.table import Section, figure
 from tuner import runtime
@@ -15,44 +16,26 @@ REPEATS = 3
 def measure() -> Section:
     """Time Jacobians of growing jobs, and populations flown forward."""
     runtime.configure()
-    import jax  # noqa: PLC0415 (after the set-up)
+    from benchmarks.case import Kernel, factors  # noqa: PLC0415 (after the set-up)
 
-    from benchmarks.case import COEFFICIENTS, factors, fly  # noqa: PLC0415
-    from benchmarks.contestants.derivatives import jacobian_of  # noqa: PLC0415
-    from tuner.parallel import in_pieces, piece_that_fits, shared_among  # noqa: PLC0415
+    forward, jacobian = Kernel(), Kernel(moves=True)
 
-    devices = len(jax.devices())
-
-    def timed(function: object, vehicles: int, piece: int) -> float:
-        factor = factors(vehicles)
-        run = jax.jit(shared_among(in_pieces(function, piece), devices)).lower(factor).compile()
-        jax.block_until_ready(run(factor))
+    def row(what: str, kernel: Kernel, vehicles: int, length: int) -> list[str]:
+        factor, samples = np.asarray(factors(vehicles)), 100 * length
+        kernel(factor, samples=samples)
         times = []
         for _ in range(REPEATS):
             began = time.perf_counter()
-            jax.block_until_ready(run(factor))
+            kernel(factor, samples=samples)
             times.append(time.perf_counter() - began)
-        return statistics.median(times)
+        took = statistics.median(times)
+        return [what, figure(took), figure(took / vehicles / length * 1e3)]
 
-    in_turns = partial(in_pieces, piece=piece_that_fits(8, COEFFICIENTS))
-    rows = []
-    for flights in (16, 64, 256):
-        flown = partial(fly, samples=500, arranged=in_turns)
-        took = timed(partial(jacobian_of, flown), flights, flights)
-        rows.append(
-            [f"Jacobian, {flights} flights of 5 s", figure(took), figure(took / flights / 5 * 1e3)]
-        )
-    for length in (5, 20, 80):
-        flown = partial(fly, samples=100 * length, arranged=in_turns)
-        took = timed(partial(jacobian_of, flown), 16, 16)
-        rows.append(
-            [f"Jacobian, 16 flights of {length} s", figure(took), figure(took / 16 / length * 1e3)]
-        )
-    for population in (64, 512, 4096):
-        took = timed(partial(fly, samples=500), population, piece_that_fits(8))
-        rows.append(
-            [f"population of {population}, 5 s", figure(took), figure(took / population / 5 * 1e3)]
-        )
+    rows = [
+        *(row(f"Jacobian, {n} flights of 5 s", jacobian, n, 5) for n in (16, 64, 256)),
+        *(row(f"Jacobian, 16 flights of {s} s", jacobian, 16, s) for s in (5, 20, 80)),
+        *(row(f"population of {n}, 5 s", forward, n, 5) for n in (64, 512, 4096)),
+    ]
     return Section(
         "Scaling",
         "Median seconds of the yardstick's loop rates in float64, and milliseconds for each second "

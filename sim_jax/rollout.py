@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeAlias
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -24,10 +21,8 @@ from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroFilter
 from sim_jax.state import Start, State, first_state, hover_speed
-from sim_jax.trees import following, forgetful, replaced
+from sim_jax.trees import forgetful
 from sim_jax.vehicle import Vehicle
-
-Arrangement: TypeAlias = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class Rollout(eqx.Module):
@@ -77,11 +72,6 @@ def _check_rotors(vehicle: Vehicle, inlet: Inlet, start: Start) -> None:
                 f"the vehicle has {count} rotors, the {name} has values for "
                 + ", ".join(map(str, sorted(counts)))
             )
-
-
-def _advanced(batch: tuple[State, Plant], shared: Plant, number: Int[Array, ""]) -> Any:
-    state, per_vehicle = batch
-    return eqx.combine(per_vehicle, shared).sample(state, number)
 
 
 def begun(
@@ -135,7 +125,6 @@ def rollout(
     limits: Limits | None = None,
     gravity: float = GRAVITY,
     precision: Precision | None = None,
-    arranged: Arrangement | None = None,
 ) -> Rollout:
     """Fly: one vehicle, or a batch along trailing axes of any leaf.
 
@@ -165,10 +154,6 @@ def rollout(
     precision
         What to compute in; by default what holds all arguments. Single precision is twice as fast
         for a batch, and stays within a fiftieth of a millimetre of double over 40 s.
-    arranged
-        How the vehicles of a batch are taken from one sample to the next, such as some at a time:
-        gets a function of a pytree with the vehicles along its last axis and of others that all of
-        them share, and returns one that gives the same. All together by default.
 
     Returns
     -------
@@ -193,19 +178,12 @@ def rollout(
         precision=precision,
         reversible=horizon is None,
     )
-    shape = jnp.shape(first.crash_time)
-    causes = plant.vehicle, plant.controller, plant.environment.at_first
-    state = replaced(following(first, causes), crash_time=first.crash_time)
 
     def sample(state: State, number: Int[Array, ""]) -> tuple[State, Sample]:
-        if arranged is None:
-            return plant.sample(state, number)
-        per_vehicle, shared = eqx.partition(plant, lambda leaf: jnp.shape(leaf)[-1:] == shape)
-        together: tuple[State, Sample] = arranged(_advanced)((state, per_vehicle), shared, number)
-        return together
+        return plant.sample(state, number)
 
     if horizon is None:
-        state, log = lax.scan(forgetful(sample), state, jnp.arange(samples))
+        state, log = lax.scan(forgetful(sample), first, jnp.arange(samples))
         return Rollout(log, state.crash_time)
 
     def logged(number: Int[Array, ""], carried: tuple[State, Sample]) -> tuple[State, Sample]:
@@ -216,8 +194,7 @@ def rollout(
         )
         return state, log
 
-    row = jax.eval_shape(sample, state, jnp.asarray(0))[1]
+    row = jax.eval_shape(sample, first, jnp.asarray(0))[1]
     empty = jax.tree.map(lambda leaf: jnp.zeros((samples, *leaf.shape), leaf.dtype), row)
-    begin = state, following(empty, causes)
-    state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, begin)
+    state, log = lax.fori_loop(0, jnp.minimum(horizon, samples), logged, (first, empty))
     return Rollout(log, state.crash_time)

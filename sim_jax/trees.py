@@ -37,21 +37,6 @@ def forgetful(function: Callable[P, T]) -> Callable[P, T]:
     return again
 
 
-def following(tree: T, causes: PyTree[Array]) -> T:
-    """Return a pytree, its values untouched, that derivative rules take to depend on some causes.
-
-    To find what in a loop's carry has a derivative, jax traces the loop's body until no more of it
-    joins in. With all of it there from the start it traces once, which halves the time to trace a
-    Jacobian. What is added is zero whatever the causes hold, and gone once compiled.
-    """
-    never = jnp.zeros((), bool)
-    nothing = sum(
-        (jnp.where(never, leaf, 0.0) for leaf in jax.tree.leaves(causes)), start=jnp.zeros(())
-    )
-    following_: T = jax.tree.map(lambda leaf: (leaf + nothing).astype(leaf.dtype), tree)
-    return following_
-
-
 def row_of(tree: PyTree[Array], index: Int[Array, ""]) -> PyTree[Array]:
     """Return one row of every leaf, by a traced index along the first axis."""
     return jax.tree.map(lambda leaf: lax.dynamic_index_in_dim(leaf, index, 0, keepdims=False), tree)

@@ -35,7 +35,7 @@ from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
 from tuner.disk import cache_folder
-from tuner.runtime import collect_rarely, return_memory_after_compiling, set_environment
+from tuner.runtime import collect_rarely, set_environment
 
 __all__ = ["demo"]
 
@@ -56,7 +56,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Processes that take file by file then end together, and what one has compiled the other finds
     later, rather than compiling it at the same time.
     """
-    return_memory_after_compiling()  # here, for a process that only hands out tests needs no jax
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     folders: dict[tuple[bool, Path], list[Path]] = defaultdict(list)
     for path in dict.fromkeys(item.path for item in items):

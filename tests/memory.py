@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
-
-from tuner.runtime import return_memory
 
 MOST_MEMORY = 900 * 2**20
 """bytes of a process at the end of a module beyond which its compiled programs are dropped."""
@@ -48,4 +48,5 @@ def give_back(most: int) -> None:
 
 def _collect() -> None:
     gc.collect()
-    return_memory()
+    with suppress(OSError, AttributeError, TypeError):  # where the C library is not glibc
+        ctypes.CDLL(None).malloc_trim(0)

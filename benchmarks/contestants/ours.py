@@ -1,9 +1,8 @@
-"""This project's rollout: ``python -m benchmarks.contestants.ours float32 4096``."""
+"""This project's kernel: ``python -m benchmarks.contestants.ours float32 4096``."""
 
 from __future__ import annotations
 
 import sys
-from functools import partial
 
 import numpy as np
 
@@ -12,10 +11,7 @@ from tuner import runtime
 
 runtime.configure()
 
-import jax  # noqa: E402 (after the set-up)
-
-from benchmarks.case import STEPS, factors, fly  # noqa: E402
-from tuner.parallel import in_pieces, piece_that_fits, shared_among  # noqa: E402
+from benchmarks.case import STEPS, Kernel, factors  # noqa: E402 (after the set-up)
 
 WORK = 8_000_000
 """vehicle-steps a run, at least a tenth of a second."""
@@ -23,16 +19,11 @@ WORK = 8_000_000
 
 def main(precision: str, vehicles: int) -> None:
     samples = max(100, min(20_000, WORK // (vehicles * STEPS)))
-    flight = partial(fly, samples=samples, precision=precision)
-    if vehicles == 1:
-        alone, factor = jax.jit(flight), factors(1)[:, 0]
-        answer(lambda: jax.block_until_ready(alone(factor)), samples * STEPS, runtime.describe())
-        return
-    piece = piece_that_fits(np.dtype(precision).itemsize)
-    batch = jax.jit(shared_among(in_pieces(flight, piece), len(jax.devices())))
-    factor = np.asarray(factors(vehicles))
+    kernel, factor = Kernel(precision), np.asarray(factors(vehicles))
     answer(
-        lambda: jax.block_until_ready(batch(factor)), vehicles * samples * STEPS, runtime.describe()
+        lambda: kernel(factor, samples=samples),
+        vehicles * samples * STEPS,
+        f"{precision}, a thread a core, log on the host",
     )
 
 

@@ -15,10 +15,9 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["
 #: Import packages whose distribution is named otherwise.
 DISTRIBUTIONS = {"yaml": "pyyaml", "backports": "backports-zstd"}
 #: Distributions that work without being imported: plugins, and what `make lint` and `docs` run.
-#: psycopg is found by SQLAlchemy, from the URL of a database; jax.export writes with flatbuffers.
+#: psycopg is found by SQLAlchemy, from the URL of a database.
 NOT_IMPORTED = {
     "psycopg",
-    "flatbuffers",
     *("pytest-xdist", "ruff", "mypy", "import-linter", "types-pyyaml", "lxml-stubs"),
     *("mkdocs", "mkdocs-material", "mkdocstrings"),
 }

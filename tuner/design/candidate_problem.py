@@ -1,8 +1,4 @@
-"""The objective of candidate flights: simulated and measured as the recorded ones were.
-
-Candidates are laid out in arrays of the recorded flights' sizes, so that the program that was
-compiled for the examination of these flies them, too.
-"""
+"""The objective of candidate flights: simulated and measured as the recorded ones were."""
 
 from __future__ import annotations
 
@@ -23,7 +19,6 @@ from tuner.design.candidates import Candidate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
-from tuner.parallel import padded_size
 from tuner.simulation.trajectory import Published, published
 
 Array = NDArray[np.float64]
@@ -62,8 +57,6 @@ def candidate_problem(
         for flight in flights
     ]
     starts: Vec3 = jax.tree.map(lambda *places: jnp.stack(places), *(r.start for r in references))
-    samples = round(seconds * schedule.log_rate)
-    longer = samples > padded_size(objective.samples)
     spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
     count = len(flights)
     segments = Segments(
@@ -75,7 +68,6 @@ def candidate_problem(
                 silent=spins & (name not in spin_channels),
                 seconds=seconds,
                 recorded=_seconds(objective),
-                as_many_rows=not longer,
             )
             for name, measured in recorded.measured.items()
         },
@@ -87,17 +79,16 @@ def candidate_problem(
     return replace(
         objective,
         segments=segments,
-        samples=samples if longer else objective.samples,
+        samples=round(seconds * schedule.log_rate),
         multiplicity=None,
     )
 
 
 def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
-    """Return the references side by side, as long as the recorded ones, the last points held."""
+    """Return the references side by side, the last points held."""
     assert isinstance(recorded.inlet, ReferenceInlet)
     inlets = [reference.inlet for reference in references]
-    recorded_ticks = np.shape(recorded.inlet.points.position.x)[0]
-    length = max(recorded_ticks, *(len(r.lap) - 1 for r in references))  # none acts at the end
+    length = max(len(reference.lap) - 1 for reference in references)  # none acts at the end
 
     def beside(*rows: jax.Array) -> jax.Array:
         edges = [
@@ -141,7 +132,6 @@ def _sampled(
     silent: NDArray[np.bool_],
     seconds: float,
     recorded: Array,
-    as_many_rows: bool,
 ) -> Measured:
     """Return one channel of every candidate, as often and as precisely recorded as in the best.
 
@@ -153,26 +143,20 @@ def _sampled(
         (C,) for which candidates it is not compared.
     seconds, recorded
         How long a candidate lasts, and (F,) how long each segment was recorded, in s.
-    as_many_rows
-        Whether candidates have as many rows as the recorded ones, rather than what they need.
     """
     weight = np.asarray(measured.weight)
-    rows = len(weight) if as_many_rows else int(seconds * SAMPLE_RATE)
-    rate = min(SAMPLE_RATE, (rows + 1) / seconds)
-    taken = min(int(seconds * rate) - 1, rows)
+    rows = int(seconds * SAMPLE_RATE) - 1
     recorded_rate = (weight > 0).sum(axis=0) / recorded
     equivalent = np.where(
-        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / rate), 0.0
+        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / SAMPLE_RATE), 0.0
     )
     segments = len(silent)
-    time = np.zeros((rows, segments))
-    time[:taken] = np.arange(1, taken + 1)[:, None] / rate
+    time = np.repeat(np.arange(1, rows + 1)[:, None] / SAMPLE_RATE, segments, axis=1)
     values = np.zeros((rows, np.asarray(measured.values).shape[1], segments))
     if values.shape[1] > weight.shape[1]:
         values[:, 0] = 1.0  # an attitude
     constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
-    weights = np.zeros((rows, *constant.shape))
-    weights[:taken] = constant
+    weights = np.broadcast_to(constant, (rows, *constant.shape))
     return Measured(time=jnp.asarray(time), values=jnp.asarray(values), weight=jnp.asarray(weights))
 
 

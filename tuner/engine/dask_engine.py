@@ -47,14 +47,12 @@ class OnDask(Engine):
         Workers that there are or will be.
     store
         Through which shared values travel.
-    devices
-        Of each worker.
     """
 
-    def __init__(self, client: Client, at_once: int, store: Store, devices: int) -> None:
+    def __init__(self, client: Client, at_once: int, store: Store) -> None:
         self.at_once = self.ahead = at_once
         self.executor: Executor = client.get_executor(pure=False)
-        self._client, self._store, self._devices = client, store, devices
+        self._client, self._store = client, store
         self._topic = f"tune-{uuid.uuid4().hex}"
         self._listeners: dict[str, Report] = {}
         client.subscribe_topic(self._topic, self._heard)
@@ -69,7 +67,7 @@ class OnDask(Engine):
         with self._translated():
             # bytes, lest the scheduler, which looks at arguments, import and hold all of it
             content = cloudpickle.dumps((function, task))
-            inner = self.executor.submit(run_task, content, identity, self._topic, self._devices)
+            inner = self.executor.submit(run_task, content, identity, self._topic)
 
         def ended(inner: Future[R]) -> None:
             self._listeners.pop(identity, None)
@@ -144,9 +142,6 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
         No scheduler answers, or what the file names is not there.
     """
     configure()
-    import jax  # noqa: PLC0415 (slow, and configured first)
-
-    devices = len(jax.devices("cpu"))
     base = file.store or str(cache_folder() / "shared")
     store = Store(f"{base.rstrip('/')}/{uuid.uuid4().hex}")  # what this engine shares, and no other
     with contextlib.ExitStack() as stack:
@@ -157,10 +152,10 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
             cluster = stack.enter_context(cluster_of(file))
             client = stack.enter_context(connected(cluster, file))
             client.register_plugin(
-                SetUp(devices, tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
+                SetUp(tuple(pool) if local else (), cores=file.cores, gpus=file.gpus)
             )
         at_once = file.workers if file.address is None else max(1, len(client.nthreads()))
-        yield OnDask(client, at_once, store, devices)
+        yield OnDask(client, at_once, store)
 
 
 @contextlib.contextmanager

@@ -115,7 +115,7 @@ class Engine(ABC):
 
 
 class Here(Engine):
-    """Computes each task when it is submitted, in this process, on all its devices."""
+    """Computes each task when it is submitted, in this process."""
 
     at_once = 1
     ahead = 0

@@ -1,4 +1,4 @@
-"""In a worker: its cores and devices are set up, tasks report, shared values arrive."""
+"""In a worker: its cores are set up, tasks report, shared values arrive."""
 
 from __future__ import annotations
 
@@ -33,9 +33,6 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
 
     Attributes
     ----------
-    devices
-        How many of XLA's devices share a batch: as many as where the job was started, for the last
-        bits of a result depend on it.
     pool, cores
         Numbers of the processor cores that workers on this machine share out, and how many each
         takes; an empty pool leaves workers where their starter put them.
@@ -43,7 +40,6 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
         Of this machine.
     """
 
-    devices: int
     pool: tuple[int, ...] = ()
     cores: int = 1
     gpus: int = 0
@@ -58,14 +54,7 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
             os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
         for name in THREADS:
             os.environ.setdefault(name, "1")
-        flag = f"--xla_force_host_platform_device_count={self.devices}"
-        os.environ["XLA_FLAGS"] = " ".join([*_other_flags(), flag])
         configure()
-
-
-def _other_flags() -> list[str]:
-    given = os.environ.get("XLA_FLAGS", "").split()
-    return [flag for flag in given if "host_platform_device_count" not in flag]
 
 
 def pin(cores: Collection[int]) -> None:
@@ -77,7 +66,7 @@ def pin(cores: Collection[int]) -> None:
             os.sched_setaffinity(int(thread.name), cores)
 
 
-def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
+def run_task(content: bytes, identity: str, topic: str) -> Any:
     """Compute a task in a worker, its reports and log lines sent where it was asked for.
 
     Parameters
@@ -86,8 +75,6 @@ def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
         Function and argument, pickled.
     identity, topic
         Of the task and its reports.
-    devices
-        See `SetUp`.
 
     Raises
     ------
@@ -97,7 +84,6 @@ def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
         This worker cannot compute it.
     """
     worker, stop = get_worker(), Event(stop_name(identity))
-    _check_devices(devices)
     try:
         function, task = pickle.loads(content)
     except (ImportError, AttributeError) as error:
@@ -123,19 +109,6 @@ def run_task(content: bytes, identity: str, topic: str, devices: int) -> Any:
 def stop_name(identity: str) -> str:
     """Return the name of the event that ends a task."""
     return f"stop-{identity}"
-
-
-def _check_devices(wanted: int) -> None:
-    import jax  # noqa: PLC0415 (slow, and configured first)
-
-    there = len(jax.devices("cpu"))
-    if there != wanted:
-        raise EngineError(
-            "--cluster",
-            f"its workers divide batches among {there} devices, this process among {wanted}, so "
-            "that the last digits would differ",
-            "restart its workers, or start from a machine like that which started them first",
-        )
 
 
 class _Lines(logging.Handler):

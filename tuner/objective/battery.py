@@ -16,7 +16,6 @@ from tuner.errors import RecordingError
 from tuner.flights.flight import Flight
 from tuner.objective.voltage import VOLTAGE, voltages_of
 from tuner.objective.windows import Window
-from tuner.parallel import padded_size
 
 
 def with_reference_voltage(vehicle: VehicleFile, flights: Sequence[Flight]) -> VehicleFile:
@@ -79,7 +78,7 @@ def log_voltage_of(
         return None
     rate = schedule.position_control_rate
     longest = max(window.flight.duration for window in windows)
-    clock = (np.arange(padded_size(int(np.ceil(longest * rate)) + 2)) + 0.5) / rate
+    clock = (np.arange(int(np.ceil(longest * rate)) + 2) + 0.5) / rate
     columns = []
     for flight, window in zip(flights, windows, strict=True):
         if id(flight) not in curves:

@@ -38,7 +38,6 @@ from tuner.objective.recorded_inputs import (
     with_body_rate,
     zeroed,
 )
-from tuner.parallel import padded_size
 
 OF_MOTORS = (
     "actuator_latency",
@@ -98,7 +97,7 @@ class RecordedReference(RecordedInlet):
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> ReferenceInlet:
         """Lay the reference out tick by tick, its last point repeated."""
         del schedule
-        length = padded_size(max(len(flight.time) for flight in flights))
+        length = max(len(flight.time) for flight in flights)
         columns = [reference_points(flight, length) for flight in flights]
         position, velocity, acceleration = (
             Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)

@@ -16,7 +16,6 @@ from tuner.config.job import InletName
 from tuner.flights.flight import Flight
 from tuner.flights.resample import without_gaps
 from tuner.objective.recorded_inputs import linear_interpolation, sparse, zero_order_hold
-from tuner.parallel import padded_size
 
 
 class RecordedInlet(ABC):
@@ -101,7 +100,7 @@ class RecordedInlet(ABC):
     ) -> list[jax.Array]:
         """Return a signal's columns, each (steps, F), at the physics rate."""
         longest = max(flight.duration for flight in flights)
-        steps = padded_size(int(np.ceil(longest * schedule.physics_rate)) + 2)
+        steps = int(np.ceil(longest * schedule.physics_rate)) + 2
         clock, rate = np.arange(steps) / schedule.physics_rate, self.update_rate(schedule)
         moves = rate is None or sparse(flights, signal, rate)
         read = linear_interpolation if moves else zero_order_hold

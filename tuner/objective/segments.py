@@ -28,7 +28,6 @@ from tuner.objective.noise import repeats
 from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
-from tuner.parallel import padded_size
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = tuple(name for name, row in recording_offsets().items() if row.unit == "s")
@@ -292,7 +291,7 @@ def _measured(
         time = np.zeros(0) if series is None else series.time[inside]
         values = np.zeros((0, width)) if series is None else series.values[inside]
         recorded.append((time, values))
-    length = padded_size(max(len(time) for time, _ in recorded))
+    length = max(len(time) for time, _ in recorded)
     times, tables, scales = [], [], []
     for flight, (time, values) in zip(flights, recorded, strict=True):
         padding = length - len(time)

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from lanes import Argument, Program
 from sim_jax.control import attitude
 from sim_jax.control.gains import Controller
 from sim_jax.control.position import (
@@ -30,12 +32,9 @@ from tuner.findings import Code, Finding
 from tuner.flights.flight import Array, Flight, Series
 from tuner.model import controller_of
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
-from tuner.parallel import in_pieces
 
 POINTS = 1024
-"""Set-points that are looked at, spread over a flight: one compiled program serves all."""
-PIECE = 128
-"""Of them, computed at a time."""
+"""Set-points that are looked at, spread over a flight."""
 LATENCIES = np.arange(0.0, 0.0801, 0.004)
 """s by which the state that a controller sees may be old."""
 ALIKE = 0.5
@@ -189,22 +188,27 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
         series = flight.series.get(name)
         held = np.zeros((len(now), 3)) if series is None else zero_order_hold(series, now)
         state[name] = held
-    rates = _rates({k: jnp.asarray(v.T) for k, v in state.items()}, controller_of(controller))
-    return np.asarray(rates).T.reshape(len(LATENCIES), len(time), 3)
+    given = {name: values.T for name, values in state.items()}, controller_of(controller)
+    arguments = (
+        {name: Argument(rows.shape[:-1], float, lanes=True) for name, rows in given[0].items()},
+        jax.tree.map(
+            lambda leaf: Argument(np.shape(leaf), np.result_type(leaf), lanes=False), given[1]
+        ),
+    )
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    rates: Array = _program(tuple(leaves), structure)(given, lanes=len(now)).values
+    return rates.reshape(len(LATENCIES), len(time), 3)
 
 
-@jax.jit
-def _rates(state: Mapping[str, jax.Array], controller: Controller) -> jax.Array:
-    """Return the set-points (3, n): a loop, for outside of one each number is computed anew.
-
-    That XLA would compute what several results share once for each, and so on inwards, made it two
-    thousand times slower.
-    """
-    rates: jax.Array = in_pieces(_rates_of_piece, PIECE)(state, controller)
-    return rates
+@lru_cache(maxsize=8)
+def _program(leaves: tuple[Argument, ...], structure: Any) -> Program:
+    arguments = jax.tree.unflatten(structure, leaves)
+    return Program(_rates, arguments, name="rate set-points of a controller file")
 
 
-def _rates_of_piece(state: Mapping[str, jax.Array], controller: Controller) -> jax.Array:
+def _rates(given: tuple[Mapping[str, jax.Array], Controller], _: Mapping[str, int]) -> jax.Array:
+    """Return the rate set-point (3,) of one state."""
+    state, controller = given
     position, velocity = Vec3.of(state["position"]), Vec3.of(state["velocity"])
     estimate = Quaternion.of(state["attitude"]).normalized()
     point = ReferencePoint(

@@ -4,7 +4,7 @@ The solver is put together as optimistix documents it: an `AbstractGaussNewton` 
 (`DampedNewtonDescent`, which solves (JᵀJ + λ I) Δy = -Jᵀr by QR) and a search
 (`ClassicalTrustRegion`, which accepts or rejects the point and sets λ = 1/step size). Its `init`,
 `step` and `terminate` are called here rather than by `optimistix.least_squares`, because the
-residuals of a step come from a simulation that runs on all devices, outside the compiled step, and
+residuals of a step come from a kernel, outside the compiled step, and
 because a user sees each iteration. What `fn` is and why it is linear: `tuner.search
 .normal_equations`.
 """
@@ -196,7 +196,7 @@ def begin(points: Point, damping: NDArray[np.float64] | None = None) -> Step:
 def advance(objective: Objective, before: Step, criterion: Criterion, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
 
-    The points are flown on all devices, or wherever the engine in force computes; the step itself,
+    The points are flown here, or wherever the engine in force computes; the step itself,
     a small affair, is taken on one.
 
     Parameters
@@ -227,8 +227,5 @@ def proposed(step: Step) -> Point:
 
 
 def on_host(tree: Any) -> Any:
-    """Return a pytree with numpy arrays: the same compiled step then serves every iteration.
-
-    What comes back from several devices would otherwise count as another kind of argument.
-    """
+    """Return a pytree with numpy arrays: the same compiled step then serves every iteration."""
     return jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, tree)

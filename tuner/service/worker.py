@@ -88,9 +88,8 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
     """Run the job and return how it ended."""
     limits, asked = assignment.limits, assignment.asked
     limit_process(memory_bytes=limits.memory_bytes, file_bytes=limits.file_bytes)
-    from tuner.runtime import configure, set_environment  # noqa: PLC0415 (jax after the limits)
+    from tuner.runtime import configure  # noqa: PLC0415 (jax after the limits)
 
-    set_environment()  # as many devices as without pinning, on which the last digits depend
     if assignment.cores and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, assignment.cores)
     try:

@@ -59,7 +59,7 @@ def test_workers_keep_to_cores_of_their_own(two_workers):
     if len(own) == 2 and len(os.sched_getaffinity(0)) > 1:
         first, second = own.values()
         assert first != second
-    # XLA's two devices take some threads each; a pool a core would be many more
+    # XLA takes some threads; a pool a core would be many more
     assert all(len(one["cores"]) < 40 for one in processes)
 
 
