@@ -137,7 +137,8 @@ def test_where_no_spin_is_held_level_nothing_changes() -> None:
     start = at_first_point(craft, points)
     flown = fly(craft, ReferenceInlet(points), start, Schedule(), 100)
     none = ReferenceInlet(points, level_held=jnp.asarray(False))
-    assert apart(flown.log.motion, fly(craft, none, start, Schedule(), 100).log.motion) == 0.0
+    held = fly(craft, none, start, Schedule(), 100)
+    assert apart(flown.log.motion, held.log.motion) < 1e-14  # two programs: each may round its way
 
 
 def member_of(flown: Rollout, member: int) -> Sample:
