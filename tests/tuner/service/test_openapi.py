@@ -11,6 +11,7 @@ import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis.errors import Unsatisfiable
+from markupsafe import escape
 from schemathesis.checks import CHECKS, load_all_checks
 
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
@@ -75,3 +76,21 @@ def test_no_answer_is_a_fault_or_undocumented(served, examples):
     assert sum(statuses.values()) > 300
     assert max(statuses) < 500
     assert {200, 404, 422} <= set(statuses)
+
+
+def test_the_description_is_a_page_that_needs_nothing_else(served):
+    client, _ = served
+    described = client.get("/api/v1/openapi.json").json()
+    page = client.get("/api").text
+    for path, calls in described["paths"].items():
+        for method, call in calls.items():
+            assert f"{method.upper()} {escape(path)}</code>" in page
+            assert all(
+                f"<code>{given['name']}</code>" in page for given in call.get("parameters", ())
+            )
+    assert all(
+        f"<code>{key}</code>" in page
+        for key in described["components"]["schemas"]["JobRequest"]["properties"]
+    )
+    assert "http://" not in page
+    assert "https://" not in page

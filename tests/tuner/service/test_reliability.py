@@ -96,7 +96,8 @@ def check_all_done_once(found: list[dict]) -> None:
 def results_in(data: Path) -> dict[str, int]:
     """Return how often each result stands in a table, and that its sum is the whole one."""
     with sqlite3.connect(data / "tune.sqlite") as table:
-        rows = table.execute("SELECT job, best FROM points").fetchall()
+        fitted = "SELECT job, best FROM points WHERE coefficient = 'motor_constant'"
+        rows = table.execute(fitted).fetchall()
         ends = table.execute(
             "SELECT job, COUNT(*) FROM events WHERE kind = 'state' AND content LIKE '%done%' "
             "GROUP BY job"

@@ -327,6 +327,22 @@ def compare(service: Served, a: str = "", b: str = "") -> Response:
     )
 
 
+@web.get("/api")
+def show_interface(request: Request) -> Response:
+    """Show the calls of the HTTP interface, as the application describes them."""
+    described = request.app.openapi()
+    shapes = described["components"]["schemas"]
+    calls = [call for path in described["paths"].values() for call in path.values()]
+    meanings = {s: of["description"] for call in calls for s, of in call["responses"].items()}
+    return render(
+        "api.html.jinja",
+        paths=described["paths"],
+        shapes=shapes,
+        source=request.app.openapi_url,
+        refusals={status: meanings[status] for status in sorted(meanings) if status >= "4"},
+    )
+
+
 @web.get("/login")
 def login_page() -> Response:
     """Ask for a token."""
