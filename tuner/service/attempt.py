@@ -126,7 +126,8 @@ def attempt(
         raise DiedError("it did not end") from None
     finally:
         _kill(process)
-        process.stdin.close()
+        with suppress(BrokenPipeError):  # of one that died before it read
+            process.stdin.close()
         reader.join(timeout=5)
         process.stdout.close()
     if last is None:

@@ -4,6 +4,8 @@ import io
 import json
 import random
 import re
+import subprocess
+import sys
 import time
 import zipfile
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +15,7 @@ import pytest
 from tests.tuner.service.conftest import ended, submit, upload
 from tuner.report.summary import outcome
 from tuner.result import RunResult
-from tuner.service import archive, jobs, queue
+from tuner.service import archive, attempt, jobs, queue
 from tuner.service.attempt import put
 from tuner.service.dispatcher import Reporting
 from tuner.service.tables import FileRow, JobRow, State
@@ -100,6 +102,18 @@ def test_a_worker_that_dies_once_goes_on_from_its_checkpoint(client, recording):
     assert "SIGKILL" in job["log"][1]
     assert "goes on from its checkpoint" in job["log"][1]
     assert job["log"][2] == "begins at 1"
+
+
+def test_a_worker_that_dies_before_it_reads_is_a_death(client, recording, monkeypatch):
+    class Gone(subprocess.Popen):
+        def __init__(self, *args, **more):
+            super().__init__(*args, **more)
+            self.wait()
+
+    monkeypatch.setattr(attempt, "WORKER", [sys.executable, "-c", ""])
+    monkeypatch.setattr(attempt.subprocess, "Popen", Gone)
+    job = ended(client, submit(client, recording))
+    assert job["error"].startswith("its worker died 3 times; the last time it ended with status 0")
 
 
 def test_three_deaths_are_the_end_with_the_reason(client, recording):
