@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ _STAND_INS = (
     1_000_133, 1_000_151, 1_000_159, 1_000_171, 1_000_183, 1_000_187, 1_000_193, 1_000_199,
 )  # fmt: skip
 """Lengths under which a function is traced; no number of a program is likely to be one of them."""
+BUILT = "/lanes/build_duration"
+"""What `jax.monitoring` calls the end of building a kernel, once it is traced."""
 TASKS_A_CORE = 4
 """Pieces of work a core: their sizes differ."""
 WASTE = 0.15
@@ -257,7 +260,10 @@ class _Compiled:
         layout = Layout(
             program.arguments, program.moving, program.columns, lengths, self.outputs, self.moved
         )
+        began = time.perf_counter()
         self.code = Code(layout.written(closed, self.width), "run")
+        spent = time.perf_counter() - began
+        jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 5)(self.code.address)
 

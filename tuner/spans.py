@@ -18,11 +18,13 @@ TRACING = "tracing"
 LOWERING = "lowering"
 COMPILING = "compiling"
 LOADING = "loading compiled code"
+BUILDING = "building kernels"
 OF_JAX = {
     "/jax/core/compile/jaxpr_trace_duration": TRACING,
     "/jax/core/compile/jaxpr_to_mlir_module_duration": LOWERING,
     COMPILED: COMPILING,
     "/jax/compilation_cache/cache_retrieval_time_sec": LOADING,
+    "/lanes/build_duration": BUILDING,
 }
 """Event of `jax.monitoring` -> what it is called here."""
 START = "start of Python"

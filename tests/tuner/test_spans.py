@@ -6,10 +6,13 @@ from threading import Thread
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from lanes import Argument, Program
 from tuner.cli.profile import profiling, trace_of
 from tuner.spans import (
+    BUILDING,
     COMPILING,
     ELSEWHERE,
     LOADING,
@@ -115,3 +118,12 @@ def test_nothing_is_left_unless_it_is_asked_for(tmp_path):
     with profiling(False, quiet=False) as into:
         into(tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_building_a_kernel_counts_in_the_stage_that_asks_for_it_and_has_a_name():
+    double = Program(lambda x, _: 2.0 * x, Argument((), float, lanes=True), name="doubled")
+    with recording() as recorder, span("twice"):
+        assert double(np.arange(3.0), lanes=3).values.tolist() == [0.0, 2.0, 4.0]
+    (row,) = (row for row in table_of(recorder.spans, recorder.now(), 1.0) if row.stage == "twice")
+    assert row.jax[BUILDING] > 0.0
+    assert [each.detail for each in recorder.spans if each.name == BUILDING] == ["doubled"]
