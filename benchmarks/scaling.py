@@ -39,8 +39,8 @@ def measure() -> Section:
     return Section(
         "Scaling",
         "Median seconds of the yardstick's loop rates in float64, and milliseconds for each second "
-        f"that one vehicle flies, which would stay the same if time grew in proportion; "
-        f"{runtime.describe()}.",
+        "that one vehicle flies, which would stay the same if time grew in proportion; kernels, a "
+        "thread a core.",
         ["", "s", "ms a flown second"],
         rows,
     )
