@@ -96,7 +96,9 @@ class Lowering:
         return [self._read(values, var) for var in jaxpr.outvars]
 
     def _read(self, values: Mapping[Any, Value], var: Any) -> Value:
-        return self.literal(var.val) if isinstance(var, Literal) else values[var]
+        if isinstance(var, Literal):
+            return self.literal(np.asarray(var.val, dtype_of(var)))
+        return values[var]
 
     def literal(self, number: Any) -> Value:
         """Return a constant; the stand-in of a length is that length."""

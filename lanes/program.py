@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
 from typing import Any, TypeAlias
@@ -101,7 +101,10 @@ class Program:
             arguments, is_leaf=lambda leaf: isinstance(leaf, Argument)
         )
         self.structure: Any = structure
-        self.arguments: tuple[Argument, ...] = tuple(leaves)
+        # in the precision that jax computes in
+        self.arguments: tuple[Argument, ...] = tuple(
+            replace(a, dtype=jax.dtypes.canonicalize_dtype(a.dtype)) for a in leaves
+        )
         self.moving = tuple(number for number, a in enumerate(leaves) if a.moves)
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))

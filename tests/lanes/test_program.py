@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -250,3 +253,17 @@ def test_a_folder_that_cannot_be_written_is_no_reason_to_fail(tmp_path):
         assert object_code(TEXT)
     finally:
         keep_code_in(None)
+
+
+def test_where_jax_computes_in_single_precision_a_kernel_does_too():
+    script = (
+        "import jax, numpy as np\n"
+        "from jax import numpy as jnp\n"
+        "from lanes import Argument, Program\n"
+        "program = Program(lambda x, _: jnp.sin(x) * 2.5 + 1.0, Argument((), float, lanes=True))\n"
+        "got = program(np.arange(5.0), lanes=5).values\n"
+        "assert program.is_kernel and got.dtype == np.float32, got.dtype\n"
+        "np.testing.assert_allclose(got, 2.5 * np.sin(np.arange(5.0)) + 1.0, rtol=1e-6)\n"
+    )
+    environment = {**os.environ, "JAX_ENABLE_X64": "false"}
+    subprocess.run([sys.executable, "-c", script], env=environment, check=True)
