@@ -22,12 +22,13 @@ NOT_IMPORTED = {
     *("mkdocs", "mkdocs-material", "mkdocstrings"),
 }
 #: What a test uses where somebody has installed it; why it is in no extra stands there.
-WHERE_INSTALLED = {"test": {"s3fs", "moto"}}
+WHERE_INSTALLED = {"test": {"s3fs", "moto", "h5py", "mujoco"}}
 TOOLS = {"dev", "docs"}
 """Extras of nothing but those."""
 OURS = {"lanes", "sim_jax", "tuner", "tests", "benchmarks", "examples", "docs"}
 
-#: Folders -> the extra that they need beside what is always installed.
+TARGETS = "tuner/exporters/targets"
+#: Extra -> the folders and files that need it beside what is always installed.
 USES = {
     None: ("lanes", "sim_jax", "tuner", "examples", "docs"),
     "test": ("tests",),
@@ -35,9 +36,13 @@ USES = {
     "cluster": ("tuner/engine",),
     "service": ("tuner/service", "tuner/client"),
     "postgresql": (),
+    "matlab": ("tuner/flights/matlab.py",),
+    "simulators": tuple(f"{TARGETS}/{name}.py" for name in ("mujoco", "drone_models", "rotorpy")),
 }
-#: Folders inside others of which only an extra is asked.
-APART = {ROOT / folder for name in ("cluster", "service") for folder in USES[name]}
+#: What lies inside other folders and is asked of an extra alone.
+APART = {
+    ROOT / place for name in ("cluster", "service", "matlab", "simulators") for place in USES[name]
+}
 
 
 def normalised(name: str) -> str:
@@ -81,8 +86,8 @@ def imported(*folders: str) -> set[str]:
     packages = {
         module.split(".")[0]
         for folder in folders
-        for path in (ROOT / folder).rglob("*.py")
-        if ROOT / folder in APART or not APART & set(path.parents)
+        for path in ([ROOT / folder] if folder.endswith(".py") else (ROOT / folder).rglob("*.py"))
+        if ROOT / folder in APART or not APART & {path, *path.parents}
         for module in modules(
             ast.parse(path.read_text(encoding="utf-8")), by_name=folder != "tests"
         )
