@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.numerics import huber_weights
+
 Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 1024
@@ -21,12 +23,6 @@ def robust(error: Array, limit: float) -> Array:
     return np.where(beyond, 2.0 * limit * size - limit * limit, error * error)
 
 
-def weights_of(error: Array, limit: float) -> Array:
-    """Return the weights by which least squares has the slope of Huber's loss."""
-    size = np.abs(error)
-    return np.where(size > limit, limit / np.where(size > 0.0, size, 1.0), 1.0)
-
-
 def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> tuple[Array, Array]:
     """Return gradient (F, Q) and Gauss-Newton Hessian (F, Q, Q) of one channel's robust loss.
 
@@ -40,7 +36,7 @@ def gauss_newton(columns: Array, scaled: Array, scale: Array, huber: float) -> t
         As for `robust`.
     """
     segments, size = columns.shape[0], columns.shape[-1]
-    root = np.sqrt(weights_of(scaled, huber))
+    root = np.sqrt(huber_weights(scaled, huber))
     rows = columns.reshape(segments, -1, size) * (
         root.reshape(segments, -1, 1) / scale[:, None, None]
     )
