@@ -20,7 +20,7 @@ from pathlib import Path
 from benchmarks.history import remembered
 from benchmarks.table import Section, sections_of, table, updated, with_bars
 from benchmarks.timing import ROOT, machine
-from tuner import runtime
+from tuner.core import runtime
 
 PARTS = (
     "throughput",

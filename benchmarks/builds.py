@@ -16,17 +16,17 @@ from pathlib import Path
 from benchmarks.contest import STRIDE, Contest, simple
 from tuner.config import Options, settle
 from tuner.config.job import JobFile
-from tuner.errors import InputError
-from tuner.flights.flight import Flight, Series
-from tuner.flights.initial import initial_state
-from tuner.job.best_fit import controller_flown, vehicle_fitted
-from tuner.job.first_terms import with_first_terms
-from tuner.job.holding import with_undetermined_held
-from tuner.job.prepare import job_of
-from tuner.job.terms import search_with_terms
+from tuner.core.errors import InputError
+from tuner.evaluate.best_fit import controller_flown, vehicle_fitted
+from tuner.evaluate.predict import Predictions, predict
 from tuner.objective.inlets import INLETS
-from tuner.prediction.predict import Predictions, predict
-from tuner.recordings import read_usable
+from tuner.objective.job_flights import read_usable
+from tuner.recordings.flight import Flight, Series
+from tuner.recordings.initial import initial_state
+from tuner.search.problem import job_of
+from tuner.terms.first_terms import with_first_terms
+from tuner.terms.search_with_terms import search_with_terms
+from tuner.uncertainty.holding import with_undetermined_held
 
 INLET = "actuator"
 """What the commanded thrust and torque ask of the motors."""

@@ -31,22 +31,22 @@ from benchmarks.simulated_recordings import recorded
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
-from tuner.coefficients.space import Space
 from tuner.config import Options, settle
 from tuner.engine import Report, engine_for
-from tuner.job.prepare import Job, job_of
-from tuner.job.search import free_offsets
-from tuner.model import with_terms_computed
+from tuner.objective.job_flights import read_recordings
 from tuner.objective.normal import Objective
-from tuner.recordings import read_recordings
 from tuner.search.continuation import grow
+from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
+from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import plan
-from tuner.selection.candidates import with_terms
+from tuner.terms.candidates import with_terms
 from tuner.uncertainty.calibration import FILE, LEVELS, Calibration, Held
 from tuner.uncertainty.estimates import uncertainty_of
+from tuner.vehicle.model import with_terms_computed
+from tuner.vehicle.space import Space
 from tuner.wording.phrases import listed
 
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from benchmarks.regression import Regression
-from tuner.flights.flight import Flight
-from tuner.prediction.predict import Predictions, hold
+from tuner.evaluate.predict import Predictions, hold
+from tuner.recordings.flight import Flight
 
 STEPS = (10, 50)
 """Samples of 10 ms after which predictions are compared."""

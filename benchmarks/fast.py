@@ -15,14 +15,15 @@ import numpy as np
 
 from benchmarks import fast_flights
 from benchmarks.table import Section, figure
-from tuner.config import Options, VehicleFile, settle
+from tuner.config import Options, settle
 from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.regression import adding, convolved
 from tuner.equation_error.turning import regressors
-from tuner.flights.flight import Flight
 from tuner.job.run import run
-from tuner.recordings import read_usable
+from tuner.objective.job_flights import read_usable
+from tuner.recordings.flight import Flight
 from tuner.result import RunResult
+from tuner.vehicle import VehicleFile
 
 LABS = ((10, 400.0), (11, 100.0))
 """Seeds, and Hz at which rotor speeds are recorded."""

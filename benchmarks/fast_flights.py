@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.air import wandering
 from sim_jax.numeric import GRAVITY
-from tuner.disk import write_text
+from tuner.core.disk import write_text
 from tuner.job.new_vehicle import new_vehicle
-from tuner.scaling_laws import INCH, Airframe
+from tuner.vehicle.scaling_laws import INCH, Airframe
 
 Numbers = NDArray[np.float64]
 

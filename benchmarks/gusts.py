@@ -20,10 +20,10 @@ from benchmarks.calibration import fitted, problem, reference_job
 from benchmarks.simulated_recordings import Flown, recorded
 from benchmarks.table import Bar, Section, figure
 from benchmarks.timing import ROOT
+from tuner.disturbances.estimation import with_disturbances
 from tuner.engine import Report, engine_for
-from tuner.job.disturbances import with_disturbances
-from tuner.job.prepare import Job
-from tuner.job.selected import Selected
+from tuner.search.problem import Job
+from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate
 
 DRAWS = int(os.environ.get("TUNE_GUSTS_DRAWS", "20"))

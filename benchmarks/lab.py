@@ -21,23 +21,23 @@ from benchmarks.lab_flights import METER, VOLTS, Lab, drawn, write
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure
 from sim_jax.schedule import Schedule
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import Options, settle, values_of
+from tuner.config import Options, settle
+from tuner.disturbances.estimation import examined
 from tuner.engine import Report, engine_for
-from tuner.flights.flight import Array, Flight
-from tuner.job.disturbances import examined
 from tuner.job.explanation import Explanation
-from tuner.job.first_terms import with_first_terms
-from tuner.job.listener import SILENT
-from tuner.job.prepare import Job, job_of
-from tuner.job.selected import Selected
-from tuner.job.terms import search_with_terms
 from tuner.objective.battery import log_voltage_of
+from tuner.objective.job_flights import read_usable
 from tuner.objective.voltage import VOLTAGE
 from tuner.objective.windows import Window
-from tuner.recordings import read_usable
+from tuner.recordings.flight import Array, Flight
 from tuner.search.fitted import Fitted
+from tuner.search.listener import SILENT
+from tuner.search.problem import Job, job_of
+from tuner.terms.first_terms import with_first_terms
+from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate, Uncertainty
+from tuner.vehicle import COEFFICIENTS, values_of
 from tuner.wording.findings import one_line
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))

@@ -28,14 +28,14 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.trim import in_trim
-from tuner.coefficients import term_groups
-from tuner.config import ControllerFile, TrajectorySettings, VehicleFile, read_vehicle, with_values
-from tuner.disk import write_text
-from tuner.model import Model, model_of, schedule_of, with_terms_computed
-from tuner.simulation.bag import write_bag
-from tuner.simulation.simulate import Simulation
-from tuner.simulation.trajectory import Published, published
-from tuner.yaml_files.shipped import find_config
+from tuner.config import TrajectorySettings
+from tuner.core.disk import write_text
+from tuner.core.shipped import find_config
+from tuner.evaluate.bag import write_bag
+from tuner.evaluate.simulate import Simulation
+from tuner.objective.trajectory import Published, published
+from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle, term_groups, with_values
+from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed
 
 Numbers = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.simulated_recordings import recorded
-from tuner.numerics import Inverse
+from tuner.core.numerics import Inverse
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.information import information_at
 

@@ -18,13 +18,14 @@ from benchmarks import builds, without_pose
 from benchmarks.contest import STEPS, STRIDE, Contest, simple
 from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
-from tuner.config import ControllerFile, Options, read_vehicle, settle
-from tuner.errors import InputError
+from tuner.config import Options, settle
+from tuner.core.errors import InputError
+from tuner.evaluate.predict import UNITS, Predictions, predict, summary
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
-from tuner.prediction.predict import UNITS, Predictions, predict, summary
-from tuner.recordings import read_usable
+from tuner.objective.job_flights import read_usable
 from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.vehicle import ControllerFile, read_vehicle
 
 FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))
 JOBS: Mapping[str, str] = {"nanobench": "crazyflie"}

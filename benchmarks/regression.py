@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tuner.flights.flight import Array, Flight
-from tuner.flights.states import States, filtered, states_at
-from tuner.prediction.predict import Predictions, errors_of
+from tuner.evaluate.predict import Predictions, errors_of
+from tuner.recordings.flight import Array, Flight
+from tuner.recordings.states import States, filtered, states_at
 
 MEMORY = 4
 """Samples of the inputs that are regressors."""

@@ -8,7 +8,7 @@ import time
 import numpy as np
 
 from benchmarks.table import Section, figure
-from tuner import runtime
+from tuner.core import runtime
 
 REPEATS = 3
 

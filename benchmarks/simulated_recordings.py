@@ -15,13 +15,13 @@ from benchmarks.air import air
 from sim_jax.disturbance import Disturbance
 from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
-from tuner.filter_error.recorded import SETPOINTS
-from tuner.flights.flight import Flight, Series
-from tuner.model import Model
+from tuner.disturbances.recorded import SETPOINTS
 from tuner.objective.flight import Trace, beginning_of, trace_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
+from tuner.recordings.flight import Flight, Series
+from tuner.vehicle.model import Model
 
 Array = NDArray[np.float64]
 

@@ -11,14 +11,14 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tuner.core.runtime import configure
 from tuner.exporters.draft import write
+from tuner.exporters.effective import pose_rmse
+from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.refly import refly
 from tuner.exporters.target import Choices, target_of
 from tuner.exporters.targets import NAMES
-from tuner.job.effective import pose_rmse
-from tuner.job.effective_of_run import kept_effective
 from tuner.result import PoseRmse, read_run
-from tuner.runtime import configure
 from tuner.wording.result import rmse_in_words
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.table import Bar, Section, millions
 from benchmarks.timing import Contestant, Measured, compete
-from tuner import runtime
+from tuner.core import runtime
 
 BATCHES = (1, 256, 4096)
 ROUNDS = 11

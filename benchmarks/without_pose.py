@@ -16,14 +16,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.contest import STRIDE, Contest, simple
-from tuner.config import ControllerFile, Options, read_vehicle, settle
-from tuner.errors import InputError
-from tuner.flights.flight import Flight, Series
-from tuner.flights.inertial import InertialFlight
-from tuner.flights.initial import initial_state
-from tuner.job.inertial import fit_without_pose, without_pose
-from tuner.prediction.predict import Predictions, predict
+from tuner.config import Options, settle
+from tuner.core.errors import InputError
+from tuner.evaluate.predict import Predictions, predict
+from tuner.inertial.job import fit_without_pose, without_pose
+from tuner.recordings.flight import Flight, Series
+from tuner.recordings.inertial import InertialFlight
+from tuner.recordings.initial import initial_state
 from tuner.result import BEST_FIT_FILE
+from tuner.vehicle import ControllerFile, read_vehicle
 
 RATE = 100.0
 """Hz of the clock on which flights are compared."""

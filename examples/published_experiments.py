@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import tuner
-from tuner.config import ControllerFile, VehicleFile, find_config, read_controller, read_vehicle
-from tuner.trajectory_settings import TrajectoryName
+from tuner.config.trajectory_settings import TrajectoryName
+from tuner.core.shipped import find_config
+from tuner.vehicle import ControllerFile, VehicleFile, read_controller, read_vehicle
 
 LAWS: tuple[Literal["quaternion", "rotation_matrix"], ...] = ("quaternion", "rotation_matrix")
 

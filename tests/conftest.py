@@ -34,8 +34,8 @@ from lanes.machine import keep_code_in
 from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
-from tuner.disk import cache_folder
-from tuner.runtime import collect_rarely, set_environment
+from tuner.core.disk import cache_folder
+from tuner.core.runtime import collect_rarely, set_environment
 
 __all__ = ["demo"]
 

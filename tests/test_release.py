@@ -63,7 +63,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SHIPPED = """
 from tuner.config import configs_folder, find_config, read_job, read_vehicle
-from tuner.flights.topics import load_topic_map
+from tuner.recordings.topics import load_topic_map
 
 print(read_vehicle(find_config("vehicles", "hovergames", configs_folder())).name)
 print(read_job(configs_folder() / "tune.yaml").mass)

@@ -6,17 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from tuner.config import ControllerFile, Options, VehicleFile
+from tuner.config import Options
 from tuner.config.job import Method
+from tuner.core.runtime import configure
 from tuner.engine import engine_for
-from tuner.flights.load import load_flight
+from tuner.recordings.load import load_flight
 from tuner.result import Run, read_run
-from tuner.runtime import configure
+from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle_api import Named, export, simulate, text_of
 
 if TYPE_CHECKING:
     from tuner.client.client import Client
-    from tuner.comparison.table import Table
+    from tuner.evaluate.comparison_table import Table
     from tuner.job.sensitivity import SensitivityResult
 
 __all__ = [
@@ -169,7 +170,7 @@ def compare(
         The input cannot be used.
     """
     configure()
-    from tuner.comparison.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
+    from tuner.evaluate.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
     options = Options.of(
         flights, controller=controller, config=config, topics=topics, namespace=namespace

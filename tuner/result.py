@@ -8,17 +8,16 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import VehicleFile, read_vehicle
+from tuner.core.disk import exists
+from tuner.core.errors import InputError
+from tuner.core.files import FiniteOrNone, Part, ResultFile
+from tuner.core.findings import Finding
 from tuner.design.log_proposal import LogProposal
-from tuner.disk import exists
-from tuner.errors import InputError
-from tuner.files import FiniteOrNone, Part, ResultFile
-from tuner.findings import Finding
-from tuner.selection.table import SelectionRow
+from tuner.terms.selection_table import SelectionRow
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
+from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
 
 EXPORTS = "export"
 """Folder of a result folder, for its exports."""
@@ -113,7 +112,8 @@ class PredictedErrors(Part):
 
     Means over all predictions of a flight of the Euclidean distance in position (m), velocity (m/s)
     and body rate (rad/s), and of the angle between the attitudes (rad). Each begins at the recorded
-    state, filtered within hundredths of a second (`tuner.flights.states`); nothing is fitted to it.
+    state, filtered within hundredths of a second (`tuner.recordings.states`); nothing is
+    fitted to it.
     """
 
     seconds: float

@@ -7,19 +7,19 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from tuner.config import ControllerFile, VehicleFile
-from tuner.disk import exists
+from tuner.config.trajectory_settings import TrajectoryName
+from tuner.core.disk import exists
+from tuner.core.errors import ExportError
+from tuner.core.runtime import configure
 from tuner.engine import engine_for
-from tuner.errors import ExportError
-from tuner.flights.flight import Array
+from tuner.recordings.flight import Array
 from tuner.result import Run, read_run
-from tuner.runtime import configure
-from tuner.trajectory_settings import TrajectoryName
+from tuner.vehicle import ControllerFile, VehicleFile
 
 if TYPE_CHECKING:
     from sim_jax.precision import Precision
+    from tuner.evaluate.simulate import Simulation
     from tuner.exporters.export import Exported
-    from tuner.simulation.simulate import Simulation
 
 Named = str | Path
 T = TypeVar("T")
@@ -64,7 +64,7 @@ def simulate(
     rate
         Hz of the result.
     grid
-        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.simulation.plan.grid_of`
+        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.evaluate.plan.grid_of`
         makes every combination of several ranges.
     precision
         What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
@@ -76,7 +76,7 @@ def simulate(
     Returns
     -------
     tuple
-        One simulation, or B of them; `tuner.simulation.write.write_flights` writes them.
+        One simulation, or B of them; `tuner.evaluate.write.write_flights` writes them.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def simulate(
         Something cannot be flown.
     """
     configure()
-    from tuner.simulation.plan import fly  # noqa: PLC0415 (jax)
+    from tuner.evaluate.plan import fly  # noqa: PLC0415 (jax)
 
     shape = {
         "name": trajectory,
@@ -146,10 +146,10 @@ def export(
         The file cannot be written.
     """
     configure()
+    from tuner.exporters.effective_of_run import kept_effective  # noqa: PLC0415
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
     from tuner.exporters.refly import refly  # noqa: PLC0415
-    from tuner.job.effective_of_run import kept_effective  # noqa: PLC0415
 
     if draws is not None:
         if into is not None:

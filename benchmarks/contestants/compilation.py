@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
-from tuner import runtime
+from tuner.core import runtime
 
 runtime.configure(keep_compiled=False)
 

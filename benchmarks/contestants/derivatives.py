@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from benchmarks.timing import answer
-from tuner import runtime
+from tuner.core import runtime
 
 runtime.configure()
 

@@ -7,7 +7,7 @@ import sys
 import time
 from dataclasses import replace
 
-from tuner import runtime
+from tuner.core import runtime
 
 runtime.configure()
 

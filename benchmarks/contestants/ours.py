@@ -7,7 +7,7 @@ import sys
 import numpy as np
 
 from benchmarks.timing import answer
-from tuner import runtime
+from tuner.core import runtime
 
 runtime.configure()
 

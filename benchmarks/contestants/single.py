@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from benchmarks.timing import answer
-from tuner import runtime
+from tuner.core import runtime
 
 runtime.configure()
 
-from tuner.config import (  # noqa: E402 (after the set-up)
-    ControllerFile,
-    TrajectorySettings,
-    configs_folder,
-    read_vehicle,
-)
-from tuner.simulation.simulate import simulate  # noqa: E402
+from tuner.config import TrajectorySettings  # noqa: E402 (after the set-up)
+from tuner.core.shipped import configs_folder  # noqa: E402 (after the set-up)
+from tuner.evaluate.simulate import simulate  # noqa: E402
+from tuner.vehicle import ControllerFile, read_vehicle  # noqa: E402 (after the set-up)
 
 DURATION = 40.0
 

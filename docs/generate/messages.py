@@ -16,7 +16,7 @@ from pathlib import Path
 
 from docs.generate.text import GENERATED
 from tuner import __file__ as _package
-from tuner.findings import Code
+from tuner.core.findings import Code
 from tuner.wording.findings import TEXTS
 
 PACKAGE = Path(_package).parent
@@ -24,22 +24,22 @@ UNKNOWN = "…"
 
 #: Where a message comes from -> heading; the first that matches.
 TOPICS: Mapping[str, str] = {
-    "flights/": "Recordings",
     "recording": "Recordings",
-    "bench/": "Ground measurements",
+    "job_flights": "Recordings",
+    "ground/": "Ground measurements",
     "exporters/": "Export",
-    "coefficients/": "Vehicle, controller and job files",
+    "vehicle/": "Vehicle, controller and job files",
     "config/": "Vehicle, controller and job files",
-    "yaml_files/": "Vehicle, controller and job files",
-    "validation": "Vehicle, controller and job files",
-    "simulation/": "Simulated flights",
-    "trajectory": "Simulated flights",
+    "core/yaml": "Vehicle, controller and job files",
+    "core/shipped": "Vehicle, controller and job files",
+    "core/validation": "Vehicle, controller and job files",
+    "evaluate/": "Simulated flights",
+    "objective/trajectory": "Simulated flights",
     "service/": "The tuning service",
     "client/": "The tuning service",
     "engine/": "Workers and clusters",
     "cli/": "Options of the command line",
-    "disk": "Files and folders",
-    "files": "Files and folders",
+    "core/": "Files and folders",
     "": "Jobs and results",
 }
 

@@ -11,11 +11,13 @@ from docs.generate.http import http_page, openapi_file
 from docs.generate.messages import messages_page
 from docs.generate.models import sections_of
 from docs.generate.text import GENERATED
-from tuner.bench.plan import BenchFile
-from tuner.coefficients.table import markdown_table
-from tuner.config import ControllerFile, JobFile, VehicleFile, configs_folder
+from tuner.config import JobFile
+from tuner.core.shipped import configs_folder
 from tuner.engine.cluster_file import ClusterFile
+from tuner.ground.plan import BenchFile
 from tuner.result import RunResult
+from tuner.vehicle import ControllerFile, VehicleFile
+from tuner.vehicle.coefficient_table import markdown_table
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -90,7 +92,7 @@ def _topics() -> str:
 
 def _coefficients() -> str:
     return (
-        f"{GENERATED}# Coefficients\n\nOne row each in `tuner/coefficients/registry.py`, from "
+        f"{GENERATED}# Coefficients\n\nOne row each in `tuner/vehicle/registry.py`, from "
         "which the vehicle file's keys, the search, the verdicts and the exports follow. Those of "
         "the section `effects` are terms beyond Gazebo's motor model: left out, they do not act; "
         f"freed, they start at the value at which they vanish.\n\n{markdown_table()}"

@@ -6,8 +6,8 @@ import pytest
 
 from benchmarks import lab_flights
 from benchmarks.lab import Trial, job_at, searched
-from tuner.config import ControllerFile
 from tuner.objective.criterion import Point
+from tuner.vehicle import ControllerFile
 
 STEEP = (46, 54, 56)
 """Seeds of laboratories whose fits went astray: for rounded commands and a clock, for starts that

@@ -16,14 +16,15 @@ from docs.generate.messages import known_messages, sites
 from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
 from tests.docs.pages import PAGES, ROOT, anchors, blocks, commands, links, name_of
-from tuner.bench.plan import read_bench
 from tuner.cli.app import COMMANDS, app
-from tuner.config import read_controller, read_job, read_vehicle
+from tuner.config import read_job
+from tuner.core.findings import Code
 from tuner.engine.cluster_file import read_cluster
-from tuner.findings import Code
-from tuner.flights.sidecar import read_sidecar
-from tuner.flights.topics import load_topic_map
+from tuner.ground.plan import read_bench
+from tuner.recordings.sidecar import read_sidecar
+from tuner.recordings.topics import load_topic_map
 from tuner.result import RunResult
+from tuner.vehicle import read_controller, read_vehicle
 
 READERS = {
     "bench-file.md": (read_bench,),

@@ -14,7 +14,7 @@ import pytest
 import tuner
 from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands, figures
 from tuner.cli import main
-from tuner.simulation.write import write_flights
+from tuner.evaluate.write import write_flights
 
 pytestmark = pytest.mark.slow
 

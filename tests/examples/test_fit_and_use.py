@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tuner.config import read_vehicle
 from tuner.exporters.targets.px4 import read_parameters
 from tuner.result import read_run
+from tuner.vehicle import read_vehicle
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -15,7 +15,7 @@ from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
 from tests.sim_jax.derivatives import assert_derivatives
 from tests.tuner.uncertainty.making import controller_file, vehicle_file
-from tuner.model import model_of, schedule_of
+from tuner.vehicle.model import model_of, schedule_of
 
 TILT = {"marker_tilt_x": 0.01, "marker_tilt_y": -0.015}
 FRAME = {"marker_offset_x": 0.012, "marker_offset_z": 0.035, "marker_tilt_z": 0.03, **TILT}

@@ -15,7 +15,7 @@ from sim_jax.state import hover_speed
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
 from tests.sim_jax.support import quaternion, vec, vehicle
-from tuner.coefficients import REGISTRY
+from tuner.vehicle import REGISTRY
 
 CRAFT = vehicle()
 EFFECTS = [row for row in REGISTRY.values() if row.is_effect and row.scope == "vehicle"]

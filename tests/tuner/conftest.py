@@ -2,7 +2,9 @@
 
 import pytest
 
-from tuner.config import ControllerFile, TrajectorySettings, configs_folder, read_vehicle
+from tuner.config import TrajectorySettings
+from tuner.core.shipped import configs_folder
+from tuner.vehicle import ControllerFile, read_vehicle
 
 
 @pytest.fixture(scope="session")
@@ -14,8 +16,8 @@ def updated():
 @pytest.fixture(scope="session")
 def bag(updated, tmp_path_factory):
     """Twelve seconds of a small, quick circle of several laps, as a recording."""
-    from tuner.simulation.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.simulation.write import write_flights  # noqa: PLC0415
+    from tuner.evaluate.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.evaluate.write import write_flights  # noqa: PLC0415
 
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "small_circle.bag"
@@ -26,8 +28,8 @@ def bag(updated, tmp_path_factory):
 @pytest.fixture(scope="session")
 def full_bag(updated, tmp_path_factory):
     """Six seconds of the same, every command of the 400 Hz loop recorded."""
-    from tuner.simulation.simulate import simulate  # noqa: PLC0415 (jax)
-    from tuner.simulation.write import write_flights  # noqa: PLC0415
+    from tuner.evaluate.simulate import simulate  # noqa: PLC0415 (jax)
+    from tuner.evaluate.write import write_flights  # noqa: PLC0415
 
     shape = TrajectorySettings(name="circle", radius=0.3, omega=1.0, speed_scale=4.0)
     path = tmp_path_factory.mktemp("lab") / "full_circle.bag"
@@ -38,7 +40,7 @@ def full_bag(updated, tmp_path_factory):
 @pytest.fixture(scope="session")
 def full_flight(full_bag):
     """The same, read."""
-    from tuner.flights.load import load_flight  # noqa: PLC0415
+    from tuner.recordings.load import load_flight  # noqa: PLC0415
 
     return load_flight(full_bag)
 
@@ -46,6 +48,6 @@ def full_flight(full_bag):
 @pytest.fixture(scope="session")
 def flight(bag):
     """The same, read."""
-    from tuner.flights.load import load_flight  # noqa: PLC0415
+    from tuner.recordings.load import load_flight  # noqa: PLC0415
 
     return load_flight(bag)

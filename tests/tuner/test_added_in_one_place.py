@@ -24,21 +24,25 @@ from sim_jax.terms import total
 from sim_jax.vector import Vec3
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
-from tuner.coefficients import EFFECTS, REGISTRY, Coefficient, NotCarried, Written
-from tuner.config import (
+from tuner.config import JobFile
+from tuner.core.errors import ExportError
+from tuner.evaluate.write import write_flights
+from tuner.exporters import targets
+from tuner.exporters.draft import Draft, differences
+from tuner.exporters.target import Target, registered
+from tuner.recordings.inspection import inspect_recordings
+from tuner.vehicle import (
+    EFFECTS,
+    REGISTRY,
+    Coefficient,
     ControllerFile,
-    JobFile,
+    NotCarried,
+    Written,
     read_vehicle,
     values_of,
     with_values,
     write_vehicle,
 )
-from tuner.errors import ExportError
-from tuner.exporters import targets
-from tuner.exporters.draft import Draft, differences
-from tuner.exporters.target import Target, registered
-from tuner.flights.inspection import inspect_recordings
-from tuner.simulation.write import write_flights
 
 NAME = "sail_drag"
 TRUTH = 0.06

@@ -14,8 +14,8 @@ from tuner.cli.export import export as export_command
 from tuner.cli.sensitivity import sensitivity as sensitivity_command
 from tuner.cli.simulate import simulate as simulate_command
 from tuner.cli.tune import tune as tune_command
-from tuner.config import ControllerFile, with_values
-from tuner.errors import InputError
+from tuner.core.errors import InputError
+from tuner.vehicle import ControllerFile, with_values
 
 #: Function -> its command, and what each calls by another name or has alone.
 PEERS = {

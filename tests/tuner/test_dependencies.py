@@ -36,7 +36,7 @@ USES = {
     "cluster": ("tuner/engine",),
     "service": ("tuner/service", "tuner/client"),
     "postgresql": (),
-    "matlab": ("tuner/flights/matlab.py",),
+    "matlab": ("tuner/recordings/matlab.py",),
     "simulators": tuple(f"{TARGETS}/{name}.py" for name in ("mujoco", "drone_models", "rotorpy")),
 }
 #: What lies inside other folders and is asked of an extra alone.

@@ -14,17 +14,17 @@ import tuner
 from tests.tuner.exporters.conftest import as_the_run_says, make_run
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
-from tuner import disk
 from tuner.cli import main
-from tuner.config import write_vehicle
 from tuner.config.job import ExportSettings
-from tuner.disk import file_name, inside
-from tuner.errors import OutputError
+from tuner.core import disk
+from tuner.core.disk import file_name, inside
+from tuner.core.errors import OutputError
 from tuner.exporters.export import exports_of_job
 from tuner.report import render
 from tuner.report.chart import Chart, Panel
 from tuner.report.paper import write_plots
 from tuner.result import BEST_FIT_FILE
+from tuner.vehicle import write_vehicle
 
 __all__ = ["make_run"]
 

@@ -5,8 +5,10 @@ import math
 import pytest
 
 from tuner.cli import main
-from tuner.config import configs_folder, read_job, read_vehicle, values_of
-from tuner.scaling_laws import KNOWN, coefficients_of
+from tuner.config import read_job
+from tuner.core.shipped import configs_folder
+from tuner.vehicle import read_vehicle, values_of
+from tuner.vehicle.scaling_laws import KNOWN, coefficients_of
 
 QUAD = ["--mass", "2.243", "--wheelbase", "0.5", "--propeller", "11x4.7"]
 PALM = ["--mass", "0.03", "--wheelbase", "0.092", "--propeller", "1.85x1.0"]

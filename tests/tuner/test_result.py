@@ -3,8 +3,8 @@ import json
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
-from tuner.errors import InputError
-from tuner.findings import Code, Finding
+from tuner.core.errors import InputError
+from tuner.core.findings import Code, Finding
 from tuner.result import read_run
 
 

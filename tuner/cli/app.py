@@ -16,7 +16,7 @@ EXAMPLES = (
 
 def version() -> str:
     """Return the installed version."""
-    from tuner.versions import installed
+    from tuner.core.versions import installed
 
     return installed()
 

@@ -17,7 +17,7 @@ def bench(file: Path, /, *, out: Path | None = None, quiet: Quiet = False) -> No
     out
         Write into this result folder. Default: runs/ and the time.
     """
-    from tuner.job.bench import bench as run_bench
+    from tuner.ground.job import bench as run_bench
 
     result = run_bench(file, out=out, command=TYPED.get())
     if not quiet:

@@ -42,11 +42,11 @@ def compare(
     """
     from tuner.cli.progress import listening
     from tuner.cli.tables import print_comparison
-    from tuner.runtime import configure
+    from tuner.core.runtime import configure
 
     configure()
-    from tuner.comparison.compare import compare as compare_vehicles
     from tuner.config import Options
+    from tuner.evaluate.compare import compare as compare_vehicles
 
     options = Options(
         flights, controller=controller, config=config, topics=topics, namespace=namespace

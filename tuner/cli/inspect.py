@@ -30,17 +30,17 @@ def inspect(
     if suggest:
         from pathlib import Path
 
-        from tuner.flights.suggest import suggested_map
-        from tuner.recording_paths import find_flights
+        from tuner.core.recording_paths import find_flights
+        from tuner.recordings.suggest import suggested_map
 
         for path in find_flights(flights):
             sys.stdout.write(suggested_map(Path(path)))
         return
     from dataclasses import asdict
 
-    from tuner.flights.inspection import as_json, inspect_recordings
-    from tuner.recording_paths import find_flights
-    from tuner.verdict import in_words, verdict_of
+    from tuner.core.recording_paths import find_flights
+    from tuner.job.recording_verdict import in_words, verdict_of
+    from tuner.recordings.inspection import as_json, inspect_recordings
 
     inspections, errors = inspect_recordings(
         find_flights(flights), topics=topics, namespace=namespace or ""
@@ -53,7 +53,7 @@ def inspect(
         print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
     else:
         from tuner.cli.tables import console
-        from tuner.flights.inspection_table import render
+        from tuner.recordings.inspection_table import render
 
         words = {path: in_words(verdict) for path, verdict in verdicts.items()}
         console().print(render(inspections, words))

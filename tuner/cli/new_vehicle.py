@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from tuner.cli.options import Quiet
 
 if TYPE_CHECKING:
-    from tuner.scaling_laws import Airframe
+    from tuner.vehicle.scaling_laws import Airframe
 
 INCH = 0.0254
 #: Smallest and largest that a number may be.
@@ -76,9 +76,9 @@ def new_vehicle(
     like
         Scale from this known vehicle, and take from it what is not given.
     """
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
     from tuner.job.new_vehicle import new_vehicle as make
-    from tuner.scaling_laws import KNOWN
+    from tuner.vehicle.scaling_laws import KNOWN
 
     if layout != "x":
         remedy = "describe it with the body axes turned by 45 degrees, as an x"
@@ -107,8 +107,8 @@ def _airframe(
     given: Mapping[str, float | None], propeller: str | None, known: Airframe | None
 ) -> Airframe:
     """Return what is given, and the rest from a known vehicle, its motors with its propeller."""
-    from tuner.errors import InputError
-    from tuner.scaling_laws import Airframe
+    from tuner.core.errors import InputError
+    from tuner.vehicle.scaling_laws import Airframe
 
     numbers = {option: value for option, value in given.items() if value is not None}
     if known is not None:
@@ -138,7 +138,7 @@ def _airframe(
 
 
 def _answer(option: str, text: str) -> float | None:
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
 
     try:
         return float(text) if text.strip() else None
@@ -147,7 +147,7 @@ def _answer(option: str, text: str) -> float | None:
 
 
 def _check(option: str, value: float | None) -> None:
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
 
     low, high, unit = RANGES[option]
     if value is not None and not low <= value <= high:
@@ -157,7 +157,7 @@ def _check(option: str, value: float | None) -> None:
 
 def _size(word: str) -> tuple[float, float]:
     """Return diameter and pitch, m, of ``11x4.7``."""
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
 
     try:
         diameter, pitch = (float(part) for part in word.lower().split("x"))

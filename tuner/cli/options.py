@@ -130,7 +130,7 @@ def lengths(option: str, word: str) -> tuple[float, ...]:
     InputError
         The word holds anything but numbers above zero.
     """
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
 
     try:
         numbers = tuple(float(part) for part in word.split(","))

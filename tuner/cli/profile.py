@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tuner.disk import write_text
-from tuner.files import csv_text
-from tuner.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
+from tuner.core.disk import write_text
+from tuner.core.files import csv_text
+from tuner.core.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
 from tuner.wording.phrases import listed
 
 if TYPE_CHECKING:

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from tuner.cli.tables import console, print_settings
-from tuner.spans import watching
+from tuner.core.spans import watching
 from tuner.wording.phrases import as_sentence
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tuner.job.listener import Listener
     from tuner.search.iteration import Iteration
+    from tuner.search.listener import Listener
     from tuner.search.point_estimate import PointEstimate
 
 
@@ -49,14 +49,14 @@ DOING = {
     "exports": "Exporting",
     "page": "Drawing the page",
 }
-"""Stage of a run, as `tuner.spans` has it -> what is done in it."""
+"""Stage of a run, as `tuner.core.spans` has it -> what is done in it."""
 
 
 @contextmanager
 def listening(*, quiet: bool) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing."""
     from tuner.cli.results import estimates_table, folds_table
-    from tuner.job.listener import SILENT, Listener
+    from tuner.search.listener import SILENT, Listener
 
     if quiet:
         yield SILENT

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tuner.client.client import Client
-    from tuner.job.listener import Listener
+    from tuner.search.listener import Listener
 
 Server = Annotated[
     str | None,
@@ -70,7 +70,7 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
 
 
 def _folds(rows: list[dict[str, Any]]) -> Any:
-    from tuner.job.cross_validation import Fold  # (jax)
+    from tuner.evaluate.cross_validation import Fold  # (jax)
     from tuner.result import AxesRmse
 
     return [

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from tuner.job.bench import BenchResult
-    from tuner.job.cross_validation import Fold
+    from tuner.evaluate.cross_validation import Fold
+    from tuner.ground.job import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import AxesRmse, EffectiveResult, RunResult
     from tuner.search.point_estimate import PointEstimate
@@ -60,7 +60,7 @@ def print_run(folder: Path, result: RunResult) -> None:
 
 def print_bench(bench: BenchResult) -> None:
     """Print what each experiment and all together say, and where everything lies."""
-    from tuner.bench.bench_json import bench_record
+    from tuner.ground.bench_json import bench_record
     from tuner.wording.bench import agreement_in_words, numbers_in_words
     from tuner.wording.findings import one_line
 

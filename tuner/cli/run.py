@@ -14,7 +14,7 @@ from cyclopts import CycloptsError
 
 from tuner.cli.app import COMMANDS, app
 from tuner.cli.options import TYPED
-from tuner.errors import InputError, ServerFaultError, did_you_mean
+from tuner.core.errors import InputError, ServerFaultError, did_you_mean
 
 DONE = 0
 OUR_FAULT = 1

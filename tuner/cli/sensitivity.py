@@ -71,7 +71,7 @@ def sensitivity(
     from tuner.cli.options import lengths
     from tuner.cli.progress import listening
     from tuner.cli.results import print_sensitivity
-    from tuner.runtime import configure
+    from tuner.core.runtime import configure
 
     configure()
     from tuner.config import Options

@@ -87,7 +87,7 @@ def _serve(
     with _extra():
         from tuner.service.serve import LOOPBACK, is_loopback
         from tuner.service.serve import serve as run
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
     from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
 
     if not 0 <= port < 2**16:
@@ -163,7 +163,7 @@ def _database(data: Path | None, url: str | None) -> Iterator[Database]:
     """Open the database of a server, which may be running."""
     with _extra():
         from tuner.service.database import Database
-    from tuner.disk import make_folder
+    from tuner.core.disk import make_folder
     from tuner.service.settings import ServiceSettings, default_data
 
     settings = ServiceSettings(data=data or default_data(), database=url or "")
@@ -179,7 +179,7 @@ def _database(data: Path | None, url: str | None) -> Iterator[Database]:
 @contextmanager
 def _extra() -> Iterator[None]:
     """Turn a missing package of the extra, imported inside, into one line."""
-    from tuner.errors import InputError
+    from tuner.core.errors import InputError
 
     packages = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "fsspec", "python_multipart")
     try:

@@ -58,12 +58,12 @@ def simulate(
         Write force and moment of each term along the flights into this FILE.csv, too.
     """
     from tuner.cli.tables import print_flights
-    from tuner.runtime import configure
+    from tuner.core.runtime import configure
 
     configure()
     from tuner.engine import engine_for
-    from tuner.simulation.plan import fly, grid_of
-    from tuner.simulation.write import write_flights
+    from tuner.evaluate.plan import fly, grid_of
+    from tuner.evaluate.write import write_flights
 
     flights = fly(
         vehicle,

@@ -10,12 +10,12 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from tuner.comparison.table import Row
-    from tuner.comparison.table import Table as Comparison
     from tuner.config import Settings
+    from tuner.evaluate.comparison_table import Row
+    from tuner.evaluate.comparison_table import Table as Comparison
+    from tuner.evaluate.write import Summary
     from tuner.exporters.export import Exported
-    from tuner.scaling_laws import Estimate
-    from tuner.simulation.write import Summary
+    from tuner.vehicle.scaling_laws import Estimate
 
 
 #: Columns that a table may take, if need be beyond the terminal's, so that no number is cut.
@@ -81,7 +81,7 @@ def print_export(done: Exported) -> None:
 
 def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     """Print a vehicle's coefficients by scaling laws, how crude each is, and where they lie."""
-    from tuner.coefficients import COEFFICIENTS
+    from tuner.vehicle import COEFFICIENTS
 
     table = columns_of(left=("coefficient",), right=("value", "±"), then=("unit", "source"))
     for name, estimate in estimates.items():

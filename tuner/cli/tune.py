@@ -53,17 +53,17 @@ def tune(
         print(job_script_for(cluster))
         return
     from tuner.cli.profile import profiling
-    from tuner.spans import span
+    from tuner.core.spans import span
 
     with profiling(profile, quiet=quiet) as profile_into:
         with span("import"):
             from tuner.cli.progress import listening
             from tuner.cli.results import print_bench, print_run
-            from tuner.runtime import configure
+            from tuner.core.runtime import configure
 
             configure()
             from tuner.config import settle
-            from tuner.job.inertial import fit_without_pose, without_pose
+            from tuner.inertial.job import fit_without_pose, without_pose
             from tuner.job.run import run
 
         options = fitted.options(bench=bench)

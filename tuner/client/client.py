@@ -10,13 +10,14 @@ from urllib.parse import quote
 
 from tuner.client.connection import Connection
 from tuner.client.job_request import request_of
-from tuner.config import ControllerFile, Options, VehicleFile
+from tuner.config import Options
 from tuner.config.job import Method
-from tuner.disk import inside, make_folder, whole_file
-from tuner.errors import InputError, ServerFaultError
-from tuner.flights.cache import digest
+from tuner.core.disk import inside, make_folder, whole_file
+from tuner.core.errors import InputError, ServerFaultError
 from tuner.job.folder import folder_for
+from tuner.recordings.cache import digest
 from tuner.result import Run, read_run
+from tuner.vehicle import ControllerFile, VehicleFile
 
 Named = str | Path
 Event = tuple[str, dict[str, Any]]

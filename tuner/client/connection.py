@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
-from tuner.errors import InputError, ServerFaultError
+from tuner.core.errors import InputError, ServerFaultError
 
 API = "/api/v1"
 DEFAULT_SERVER = "http://127.0.0.1:8000"

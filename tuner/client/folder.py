@@ -12,9 +12,9 @@ from pydantic import Field
 
 from tuner.client.client import Client
 from tuner.config import Options
-from tuner.disk import exists
-from tuner.errors import InputError
-from tuner.files import ResultFile
+from tuner.core.disk import exists
+from tuner.core.errors import InputError
+from tuner.core.files import ResultFile
 
 logger = logging.getLogger(__name__)
 

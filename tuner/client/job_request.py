@@ -6,13 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tuner.config import Options, Settings, read_vehicle, settle
-from tuner.config.controller import read_controller
-from tuner.errors import InputError
-from tuner.flights.topics import load_topic_map
-from tuner.yaml_files.document import read_yaml
-from tuner.yaml_files.section import Section
-from tuner.yaml_files.shipped import Kind, configs_folder, find_config
+from tuner.config import Options, Settings, settle
+from tuner.core.errors import InputError
+from tuner.core.shipped import Kind, configs_folder, find_config
+from tuner.core.yaml_document import read_yaml
+from tuner.core.yaml_section import Section
+from tuner.recordings.topics import load_topic_map
+from tuner.vehicle import read_vehicle
+from tuner.vehicle.controller import read_controller
 
 
 def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:

@@ -8,11 +8,10 @@ from typing import Annotated, Literal, Self
 from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
-from tuner.coefficients import COEFFICIENTS, conditions, term_groups
-from tuner.errors import ConfigError, did_you_mean
-from tuner.exporters.targets import NAMES
-from tuner.trajectory_settings import TrajectorySettings
-from tuner.yaml_files.section import (
+from tuner.config.trajectory_settings import TrajectorySettings
+from tuner.core.errors import ConfigError, did_you_mean
+from tuner.core.shipped import Kind, find_config
+from tuner.core.yaml_section import (
     Flag,
     Number,
     Positive,
@@ -21,7 +20,8 @@ from tuner.yaml_files.section import (
     read_model,
     refuse,
 )
-from tuner.yaml_files.shipped import Kind, find_config
+from tuner.exporters.targets import NAMES
+from tuner.vehicle import COEFFICIENTS, conditions, term_groups
 
 #: Recorded signals whose residuals a fit can weigh, in this order everywhere.
 CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acceleration")

@@ -11,17 +11,17 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import ValidationError
 
-from tuner.bench.bench_json import joint_prior
-from tuner.coefficients.joint_prior import JointPrior
-from tuner.config.controller import ControllerFile, read_controller
 from tuner.config.job import JobFile, Method, read_job
-from tuner.config.values import check_names, with_values
-from tuner.config.vehicle import VehicleFile, read_vehicle
-from tuner.disk import exists
-from tuner.errors import ConfigError, InputError, did_you_mean
-from tuner.recording_paths import find_flights
-from tuner.validation import config_error
-from tuner.yaml_files.shipped import Kind, find_config
+from tuner.core.disk import exists
+from tuner.core.errors import ConfigError, InputError, did_you_mean
+from tuner.core.recording_paths import find_flights
+from tuner.core.shipped import Kind, find_config
+from tuner.core.validation import config_error
+from tuner.ground.bench_json import joint_prior
+from tuner.vehicle.controller import ControllerFile, read_controller
+from tuner.vehicle.joint_prior import JointPrior
+from tuner.vehicle.values import check_names, with_values
+from tuner.vehicle.vehicle import VehicleFile, read_vehicle
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"

@@ -19,7 +19,7 @@ from tuner.design.candidates import Candidate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
-from tuner.simulation.trajectory import Published, published
+from tuner.objective.trajectory import Published, published
 
 Array = NDArray[np.float64]
 

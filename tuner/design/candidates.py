@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from sim_jax.trajectory import Shape, shapes
 from tuner.config import TrajectorySettings
-from tuner.errors import InputError
-from tuner.simulation.trajectory import at_speed
+from tuner.core.errors import InputError
+from tuner.objective.trajectory import at_speed
 
 CLEARANCE = 0.5
 """Distance that a reference keeps from the walls, from which a vehicle may stray, m."""

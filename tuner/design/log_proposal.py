@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from tuner.files import Part
+from tuner.core.files import Part
 
 
 class LogProposal(Part):

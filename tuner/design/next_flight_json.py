@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.disk import write_text
-from tuner.files import Part, ResultFile, csv_text
+from tuner.core.disk import write_text
+from tuner.core.files import Part, ResultFile, csv_text
 
 NEXT_FLIGHT_TABLE = "next_flight.csv"
 

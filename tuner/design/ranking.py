@@ -15,17 +15,17 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
+from tuner.core.numerics import log_determinant, scaled_inverse, unit_diagonal
 from tuner.design.candidate_problem import candidate_point, candidate_problem
 from tuner.design.candidates import Arena, Candidate, candidates
 from tuner.design.next_flight_json import Proposal, Proposals
-from tuner.examination.examination import Examination
-from tuner.numerics import log_determinant, scaled_inverse, unit_diagonal
 from tuner.objective.criterion import Criterion
 from tuner.objective.normal import Objective
 from tuner.uncertainty.covariance import WIDE
+from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.information import information_from_jacobian
 from tuner.uncertainty.verdict import Verdict
+from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]
 

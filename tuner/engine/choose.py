@@ -6,11 +6,11 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from tuner.core.errors import ConfigError
+from tuner.core.yaml_section import build
 from tuner.engine.cluster_file import ClusterFile, read_cluster
 from tuner.engine.engine import HERE, Engine, using
 from tuner.engine.extra import extra
-from tuner.errors import ConfigError
-from tuner.yaml_files.section import build
 
 
 def cluster_for(workers: int | None, cluster: str | None) -> ClusterFile | None:

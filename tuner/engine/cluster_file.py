@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from annotated_types import Interval
 from pydantic import StringConstraints, model_validator
 
-from tuner.yaml_files.section import Section, Whole, build, read_model, refuse
+from tuner.core.yaml_section import Section, Whole, build, read_model, refuse
 
 Memory = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)? ?[KMGT]i?B$")]
 Address = Annotated[

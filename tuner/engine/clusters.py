@@ -14,9 +14,9 @@ import dask.config
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
+from tuner.core.errors import InputError
 from tuner.engine.cluster_file import ClusterFile, JobQueue, Kubernetes
 from tuner.engine.extra import extra
-from tuner.errors import InputError
 
 ANSWER = 10
 """s within which a scheduler answers."""

@@ -23,14 +23,14 @@ import cloudpickle
 from distributed import Client, Event, KilledWorker
 from distributed.comm import CommClosedError
 
-from tuner.disk import cache_folder
+from tuner.core.disk import cache_folder
+from tuner.core.errors import EngineError
+from tuner.core.runtime import configure
 from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import Engine, Report, Task
 from tuner.engine.store import Store
 from tuner.engine.worker import SetUp, Shared, run_task, stop_name
-from tuner.errors import EngineError
-from tuner.runtime import configure
 
 T = TypeVar("T")
 R = TypeVar("R")

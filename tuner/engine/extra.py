@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 
 PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
 

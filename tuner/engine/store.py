@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from fsspec.core import url_to_fs
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 
 
 class Store:

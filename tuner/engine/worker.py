@@ -14,10 +14,10 @@ from typing import Any
 
 from distributed import Event, Status, Worker, WorkerPlugin, get_worker
 
+from tuner.core.errors import EngineError
+from tuner.core.runtime import configure
 from tuner.engine.engine import HERE, using
 from tuner.engine.store import Store
-from tuner.errors import EngineError
-from tuner.runtime import configure
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Of linear algebra beside XLA: one, for every worker has its cores for itself."""

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.coefficients.space import Space
 from tuner.equation_error.measured import Mask, Measured
 from tuner.equation_error.model import Accelerations, values_at
 from tuner.equation_error.regression import (
@@ -19,10 +17,12 @@ from tuner.equation_error.regression import (
     predicting,
     regress,
 )
-from tuner.flights.flight import Array
-from tuner.model import Model, with_terms_computed
-from tuner.selection.candidates import Groups
-from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.recordings.flight import Array
+from tuner.terms.candidates import Groups
+from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.model import Model, with_terms_computed
+from tuner.vehicle.space import Space
 
 GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
 """What of a moment predicts turning: no part of the vehicle."""

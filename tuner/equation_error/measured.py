@@ -14,9 +14,9 @@ from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
-from tuner.flights.flight import Array, Flight, Series
-from tuner.flights.states import filtered, states_at
 from tuner.objective.noise import white_noise
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.states import filtered, states_at
 
 Mask = NDArray[np.bool_]
 

@@ -14,10 +14,10 @@ import numpy as np
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
-from tuner.coefficients.space import Parameter
 from tuner.equation_error.measured import Measured
-from tuner.flights.flight import Array
-from tuner.model import Model, with_coefficients
+from tuner.recordings.flight import Array
+from tuner.vehicle.model import Model, with_coefficients
+from tuner.vehicle.space import Parameter
 
 NUDGE = 1e-3
 """Change of a scaled coordinate over its usual size, and of a rotor's speed over itself, by which

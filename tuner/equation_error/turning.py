@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuner.config import VehicleFile
 from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.regression import convolved
-from tuner.flights.flight import Array, Flight
 from tuner.objective.explained import levers
+from tuner.recordings.flight import Array, Flight
+from tuner.vehicle import VehicleFile
 
 AHEAD = 0.1
 """s after which a predicted body rate is compared with the one that it began with."""

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.config import values_of
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
+from tuner.core.numerics import GRAVITY
 from tuner.exporters.draft import read_file
 from tuner.exporters.px4_parameters import outside_range, read_parameters
 from tuner.exporters.sdf.composite import Array, Inertial, together
@@ -22,8 +22,8 @@ from tuner.exporters.sdf.includes import assembled
 from tuner.exporters.sdf.model import Model, inertials, read_model
 from tuner.exporters.sdf.spans import Element, number
 from tuner.exporters.sdf.template import rendered
-from tuner.numerics import GRAVITY
 from tuner.result import Run
+from tuner.vehicle import values_of
 
 RPM = 2 * math.pi / 60
 """rad/s of one rpm."""

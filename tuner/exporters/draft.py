@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tuner.config import VehicleFile
-from tuner.disk import make_folder, whole_file
-from tuner.errors import ConfigError, ExportError
-from tuner.files import read_bytes
+from tuner.core.disk import make_folder, whole_file
+from tuner.core.errors import ConfigError, ExportError
+from tuner.core.files import read_bytes
+from tuner.vehicle import VehicleFile
 
 MAX_BYTES = 10_000_000
 #: Numbers are written with twelve digits; mass and inertia may go through sums of links.

@@ -15,16 +15,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import VehicleFile, values_of, with_values
-from tuner.disk import inside, make_folder, write_text
-from tuner.errors import ConfigError, ExportError, InputError
-from tuner.examination.sensitivity_json import Knowledge
+from tuner.core.disk import inside, make_folder, write_text
+from tuner.core.errors import ConfigError, ExportError, InputError
+from tuner.core.files import csv_text
+from tuner.core.numerics import symmetric_eigen
 from tuner.exporters.draft import Draft, write
 from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
-from tuner.files import csv_text
-from tuner.numerics import symmetric_eigen
 from tuner.result import Run
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of, with_values
 
 Array = NDArray[np.float64]
 

@@ -28,10 +28,10 @@ from sim_jax.sensing import packed, push, switched
 from sim_jax.state import State
 from sim_jax.trees import replaced
 from sim_jax.vector import Vec3
-from tuner.model import Model
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.flown import Flown
 from tuner.objective.segments import Segments
+from tuner.vehicle.model import Model
 
 Array = NDArray[np.float64]
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
 
-from tuner.config import read_vehicle
 from tuner.config.job import ExportSettings
-from tuner.disk import check_file, file_name, inside
-from tuner.errors import ExportError, InputError
+from tuner.core.disk import check_file, file_name, inside
+from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, Gate, write
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.gates import Refly, check, check_elsewhere, check_hover, not_flown
@@ -29,6 +28,7 @@ from tuner.exporters.target import (
     target_of,
 )
 from tuner.result import EXPORTS, Run, read_run
+from tuner.vehicle import read_vehicle
 from tuner.wording.result import what_is_exported, what_is_lost
 
 FOLDER = EXPORTS

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
-from tuner.config import VehicleFile
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.exporters.draft import Draft, Gate
 from tuner.exporters.hover import hover_command, thrust_to_weight
 from tuner.result import RMSE_UNITS, AxesRmse, Run
+from tuner.vehicle import VehicleFile
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.
 Refly = Callable[[Run, VehicleFile], Mapping[str, AxesRmse]]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from tuner.config import VehicleFile
-from tuner.numerics import GRAVITY
+from tuner.core.numerics import GRAVITY
+from tuner.vehicle import VehicleFile
 
 
 def rotor_speed(vehicle: VehicleFile, command: float) -> float:

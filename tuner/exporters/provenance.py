@@ -9,12 +9,11 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from tuner.coefficients import COEFFICIENTS, REGISTRY, Written
-from tuner.config import VehicleFile, values_of
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.exporters.target import Target, quantity
 from tuner.result import EffectiveResult, Run
+from tuner.vehicle import COEFFICIENTS, REGISTRY, VehicleFile, Written, values_of
 from tuner.wording.verdicts import judgement_in_words
 
 Refit = Callable[[Run, Simulator], tuple[VehicleFile, EffectiveResult] | None]

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
+from tuner.core.yaml_document import commented
 from tuner.exporters.draft import read_file
-from tuner.yaml_files.document import commented
 
 INT32, FLOAT = 6, 9
 """MAVLink's numbers of parameter types, as ground stations write them."""

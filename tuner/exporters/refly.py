@@ -8,11 +8,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from tuner.comparison.comparison import Comparison
-from tuner.config import ControllerFile, JobFile, Settings, VehicleFile
-from tuner.errors import InputError
-from tuner.recordings import Recording, read_usable, with_conditions, with_inputs_late, with_offsets
+from tuner.config import JobFile, Settings
+from tuner.core.errors import InputError
+from tuner.evaluate.comparison import Comparison
+from tuner.objective.job_flights import (
+    Recording,
+    read_usable,
+    with_conditions,
+    with_inputs_late,
+    with_offsets,
+)
 from tuner.result import AxesRmse, Run, RunResult
+from tuner.vehicle import ControllerFile, VehicleFile
 
 
 def refly(

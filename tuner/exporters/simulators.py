@@ -11,9 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
-from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried, Written
-from tuner.coefficients.registry import NO_LOSS
-from tuner.config import VehicleFile, values_of, with_values
+from tuner.core.numerics import GRAVITY
 from tuner.exporters.hover import (
     full_thrust,
     hover_command,
@@ -21,7 +19,16 @@ from tuner.exporters.hover import (
     rotor_speed,
     thrust_at,
 )
-from tuner.numerics import GRAVITY
+from tuner.vehicle import (
+    COEFFICIENTS,
+    Coefficient,
+    NotCarried,
+    VehicleFile,
+    Written,
+    values_of,
+    with_values,
+)
+from tuner.vehicle.registry import NO_LOSS
 
 Entry = Written | NotCarried
 Laws = Callable[[VehicleFile], VehicleFile]

@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
-from tuner.coefficients import COEFFICIENTS, Coefficient, NotCarried
-from tuner.config import VehicleFile, values_of
-from tuner.errors import ExportError, did_you_mean
+from tuner.core.errors import ExportError, did_you_mean
 from tuner.exporters import targets
 from tuner.exporters.draft import Draft
 from tuner.exporters.simulators import Entry, Simulator
+from tuner.vehicle import COEFFICIENTS, Coefficient, NotCarried, VehicleFile, values_of
 
 
 @dataclass(frozen=True)

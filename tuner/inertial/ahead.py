@@ -15,12 +15,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.config import ControllerFile, VehicleFile, values_of
-from tuner.flights.flight import Array
 from tuner.inertial.response import Lags, rotor_speeds
 from tuner.inertial.signals import Stretch, smoothed
-from tuner.model import model_of
 from tuner.objective.explained import levers
+from tuner.recordings.flight import Array
+from tuner.vehicle import ControllerFile, VehicleFile, values_of
+from tuner.vehicle.model import model_of
 
 AHEAD = 0.5
 """s."""

@@ -23,10 +23,10 @@ import numpy as np
 from scipy import optimize
 
 from sim_jax.vehicle import Motor
-from tuner.flights.flight import Array
+from tuner.core.numerics import Inverse
 from tuner.inertial.response import Lags, rotor_speeds
 from tuner.inertial.signals import Stretch, blocks_of, derivative, smoothed
-from tuner.numerics import Inverse
+from tuner.recordings.flight import Array
 
 OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 """What is explained: three angular accelerations in rad/s², the specific force along z in m/s²."""

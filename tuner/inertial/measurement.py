@@ -15,15 +15,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.bench.measurement import Curve, Measurement, Remark
-from tuner.config import ControllerFile, VehicleFile
-from tuner.errors import RecordingError
-from tuner.flights.inertial import InertialFlight
+from tuner.core.errors import RecordingError
+from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
-from tuner.model import model_of
 from tuner.objective.explained import levers
 from tuner.objective.motor_order import order_findings
+from tuner.recordings.inertial import InertialFlight
+from tuner.vehicle import ControllerFile, VehicleFile
+from tuner.vehicle.model import model_of
 from tuner.wording.findings import remedy, sentence
 from tuner.wording.phrases import clause
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from sim_jax.motor import Lag, reference_speed
 from sim_jax.vehicle import Motor
-from tuner.flights.flight import Array
 from tuner.inertial.signals import Stretch
+from tuner.recordings.flight import Array
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.coefficients.space import extended
-from tuner.config import VehicleFile, initial_values, with_values
+from tuner.core.errors import ConfigError
+from tuner.core.findings import Code, Finding
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import measured
-from tuner.errors import ConfigError
-from tuner.findings import Code, Finding
-from tuner.job.prepare import Job, job_of
-from tuner.selection.candidates import Groups, candidate_groups, start_of
+from tuner.search.problem import Job, job_of
+from tuner.terms.candidates import Groups, candidate_groups, start_of
+from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
+from tuner.vehicle.space import extended
 
 ENOUGH = 0.9
 """Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""

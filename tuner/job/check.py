@@ -11,18 +11,17 @@ from numpy.typing import NDArray
 
 from sim_jax.control.mixer import ROTORS
 from sim_jax.numeric import GRAVITY
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import VehicleFile
-from tuner.findings import Code, Finding
-from tuner.flights.flight import Array, Flight
-from tuner.job.prepare import Job
-from tuner.numerics import symmetric_eigen, unit_diagonal
+from tuner.core.findings import Code, Finding
+from tuner.core.numerics import symmetric_eigen, unit_diagonal
 from tuner.objective.explained import Source, squared_speed
 from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.motor_order import order_findings
 from tuner.objective.recorded_inputs import sparse
 from tuner.objective.setpoints import setpoint_findings
+from tuner.recordings.flight import Array, Flight
+from tuner.search.problem import Job
 from tuner.search.progress import plain_criterion
+from tuner.vehicle import COEFFICIENTS, VehicleFile
 
 HORIZON = 12.0
 """s from the start that are looked at: far enough to move, near enough to stay on the path."""

@@ -11,13 +11,13 @@ from sim_jax.inlet import ReferenceInlet
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.design.next_flight_json import Proposals
 from tuner.design.ranking import rank_next_flights
-from tuner.examination.examination import Examination
-from tuner.examination.knowledge import knowledge_of
-from tuner.examination.sensitivity_json import Knowledge
-from tuner.examination.tables import write_files
-from tuner.flights.flight import Flight
-from tuner.job.prepare import SPIN_CHANNELS, Job
+from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted
+from tuner.search.problem import SPIN_CHANNELS, Job
+from tuner.uncertainty.examination import Examination
+from tuner.uncertainty.knowledge import knowledge_of
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.tables import write_files
 
 MARGIN = 1.0
 """Length added to what the recorded flights took, to make an arena of it; m."""

@@ -6,10 +6,10 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from tuner.errors import EngineError, OutputError
-from tuner.findings import Code, Finding
-from tuner.job.listener import Listener
-from tuner.spans import span
+from tuner.core.errors import EngineError, OutputError
+from tuner.core.findings import Code, Finding
+from tuner.core.spans import span
+from tuner.search.listener import Listener
 from tuner.wording.findings import one_line
 
 logger = logging.getLogger(__name__)

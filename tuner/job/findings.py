@@ -7,19 +7,18 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.comparison.errors import FlightErrors, Pose
-from tuner.config import VehicleFile
-from tuner.findings import Code, Finding, Level
-from tuner.job.held_out import Validation
-from tuner.job.prepare import Job
+from tuner.core.findings import Code, Finding, Level
+from tuner.evaluate.held_out import Validation
+from tuner.evaluate.predict import UNITS
+from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.prediction.predict import UNITS
 from tuner.search.fitted import Fitted
 from tuner.search.loop import Loop, loop_of
+from tuner.search.problem import Job
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import CONFLICT, Sources
+from tuner.vehicle import COEFFICIENTS, VehicleFile
 
 UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import datetime
 from pathlib import Path
 
-from tuner.disk import check_folder, exists
-from tuner.errors import InputError
+from tuner.core.disk import check_folder, exists
+from tuner.core.errors import InputError
 
 
 def folder_for(out: Path | None, *, resume: bool = False) -> Path:

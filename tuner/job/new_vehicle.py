@@ -5,19 +5,19 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import (
+from tuner.core.disk import check_file, write_text
+from tuner.core.shipped import configs_folder
+from tuner.core.versions import PROGRAM, installed
+from tuner.core.yaml_document import commented, dump_yaml
+from tuner.vehicle import (
+    COEFFICIENTS,
     VehicleFile,
-    configs_folder,
     read_vehicle,
     values_of,
     with_values,
     write_vehicle,
 )
-from tuner.disk import check_file, write_text
-from tuner.scaling_laws import Airframe, Estimate, anchored, coefficients_of
-from tuner.versions import PROGRAM, installed
-from tuner.yaml_files.document import commented, dump_yaml
+from tuner.vehicle.scaling_laws import Airframe, Estimate, anchored, coefficients_of
 
 SPINS = ("ccw", "ccw", "cw", "cw")
 """Of the quad X in PX4's order: front right, rear left, front left, rear right."""
@@ -39,7 +39,7 @@ def new_vehicle(airframe: Airframe, out: Path, *, like: str | None = None) -> di
     out
         The vehicle file; the job file has the same name and ends in ``.job.yaml``.
     like
-        A shipped vehicle of `tuner.scaling_laws.KNOWN` that the laws are to meet.
+        A shipped vehicle of `tuner.vehicle.scaling_laws.KNOWN` that the laws are to meet.
 
     Raises
     ------

@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import VehicleFile, initial_values, write_vehicle
+from tuner.core.disk import write_text
+from tuner.core.files import csv_text
+from tuner.core.numerics import Z95
+from tuner.core.versions import PROGRAM, versions
+from tuner.core.yaml_document import commented, dump_yaml
 from tuner.design.log_proposal import LogProposal
-from tuner.disk import write_text
-from tuner.files import csv_text
-from tuner.job.best_fit import (
+from tuner.evaluate.best_fit import (
     best_values,
     conditions_of,
     controller_flown,
@@ -23,14 +24,12 @@ from tuner.job.best_fit import (
     initial_of,
     offsets_of,
 )
-from tuner.job.held_out import Validation
-from tuner.job.prepare import Job
-from tuner.numerics import Z95
+from tuner.evaluate.held_out import Validation
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS, whole
 from tuner.objective.inlets import INLETS, window_seconds
+from tuner.objective.job_flights import Recording
 from tuner.objective.segments import OFFSETS
-from tuner.recordings import Recording
 from tuner.result import (
     BEST_FIT_FILE,
     EFFECTIVE_FILE,
@@ -45,7 +44,8 @@ from tuner.result import (
 )
 from tuner.search.fitted import Fitted
 from tuner.search.normal_equations import normal_equations
-from tuner.selection.table import SelectionRow
+from tuner.search.problem import Job
+from tuner.terms.selection_table import SelectionRow
 from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import (
@@ -57,9 +57,8 @@ from tuner.uncertainty.verdict import (
     judge_impossible_inertia,
     judge_regressed,
 )
-from tuner.versions import PROGRAM, versions
+from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.wording.verdicts import judgement_in_words
-from tuner.yaml_files.document import commented, dump_yaml
 
 METRICS_FILE = "metrics.csv"
 CONTROLLER_FILE = "controller.yaml"

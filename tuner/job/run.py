@@ -1,6 +1,6 @@
 """The command `tune` as a function: settle, prepare, check, search, validate, write, report.
 
-Callers set jax up first, see `tuner.runtime.configure`.
+Callers set jax up first, see `tuner.core.runtime.configure`.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ from functools import partial
 from math import nan
 from pathlib import Path
 
-from tuner.comparison.compare import table_of
-from tuner.config import Options, Settings, VehicleFile, settle, with_values, write_vehicle
+from tuner.config import Options, Settings, settle
+from tuner.core.disk import make_folder
+from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
+from tuner.core.findings import Finding
+from tuner.core.spans import span
+from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
-from tuner.disk import make_folder
-from tuner.errors import ConfigError, EngineError, InputError, OutputError
-from tuner.examination.examination import Examination
+from tuner.disturbances.estimation import Examined, examined
+from tuner.evaluate.best_fit import vehicle_fitted
+from tuner.evaluate.compare import table_of
+from tuner.evaluate.cross_validation import cross_validate, jackknife_errors
+from tuner.evaluate.held_out import Validation, validate
+from tuner.evaluate.input_lag import with_inputs_on_time
+from tuner.exporters.effective import Effective, effective_fit
+from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.refly import refly
-from tuner.findings import Finding
 from tuner.job.accelerations import with_accelerations
-from tuner.job.balanced import with_inputs_balanced
-from tuner.job.best_fit import vehicle_fitted
-from tuner.job.bootstrap import bootstrap, check_bootstrap
 from tuner.job.check import check_information, check_recordings
-from tuner.job.cross_validation import cross_validate, jackknife_errors
-from tuner.job.disturbances import Examined, examined
-from tuner.job.effective import Effective, effective_fit
-from tuner.job.effective_of_run import kept_effective
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.job.explanation import Explanation
 from tuner.job.findings import (
@@ -42,27 +43,27 @@ from tuner.job.findings import (
     turning_unexplained,
     voltage_taken,
 )
-from tuner.job.first_terms import with_first_terms
 from tuner.job.folder import folder_for
-from tuner.job.held_out import Validation, validate
-from tuner.job.listener import SILENT, Listener
-from tuner.job.next_log import what_to_log
-from tuner.job.prepare import Job, job_of
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
-from tuner.job.search import OnProgress, parameters_of
-from tuner.job.selected import Selected
-from tuner.job.terms import search_with_terms
-from tuner.prediction.input_lag import with_inputs_on_time
-from tuner.recordings import as_logged, read_usable
+from tuner.objective.job_flights import as_logged, read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
 from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.search.estimation import OnProgress, parameters_of
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import Iteration
+from tuner.search.listener import SILENT, Listener
+from tuner.search.problem import Job, job_of
 from tuner.search.progress import Progress
-from tuner.spans import span
+from tuner.terms.balanced_inertia import with_inputs_balanced
+from tuner.terms.first_terms import with_first_terms
+from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.selection_state import Selected
+from tuner.uncertainty.bootstrap import bootstrap, check_bootstrap
+from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import sources_of
 from tuner.uncertainty.sources import Sources
+from tuner.vehicle import VehicleFile, with_values, write_vehicle
 from tuner.wording.findings import remedy, sentence
 from tuner.wording.phrases import clause
 from tuner.wording.result import export_sentence

@@ -6,29 +6,30 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tuner.config import Options, Settings, check_names, settle
+from tuner.config import Options, Settings, settle
+from tuner.core.disk import make_folder
+from tuner.core.errors import InputError, did_you_mean
+from tuner.core.findings import Finding
+from tuner.core.versions import versions
 from tuner.design.candidates import Arena
 from tuner.design.next_flight_json import Proposals
-from tuner.disk import make_folder
-from tuner.errors import InputError, did_you_mean
-from tuner.examination.examination import Examination, examine
-from tuner.examination.sensitivity_json import Knowledge
-from tuner.findings import Finding
-from tuner.job.best_fit import comparison_of
+from tuner.evaluate.best_fit import comparison_of
 from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.prepare import Job, job_of
-from tuner.job.unfitted import unfitted
 from tuner.objective.alternatives import alternatives_of
-from tuner.recordings import as_logged, read_usable
+from tuner.objective.job_flights import as_logged, read_usable
 from tuner.report import render
 from tuner.report.record import About, Recording, write_traces
 from tuner.search.fitted import Fitted
-from tuner.sensitivity_analysis.global_indices import global_sensitivity
-from tuner.sensitivity_analysis.global_sensitivity_json import Method
+from tuner.search.problem import Job, job_of
+from tuner.search.unfitted import unfitted
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.global_indices import global_sensitivity
+from tuner.uncertainty.global_sensitivity_json import Method
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.profiles_json import Profiles
-from tuner.versions import versions
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.vehicle import check_names
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.config import VehicleFile
-from tuner.flights.flight import Array, Flight, Series
-from tuner.flights.notes import Note, NoteCode
-from tuner.flights.resample import resample
 from tuner.objective.explained import levers
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.resample import resample
+from tuner.vehicle import VehicleFile
 
 WRENCH = ("commanded_thrust", "commanded_torque")
 

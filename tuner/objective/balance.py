@@ -37,12 +37,12 @@ from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
-from tuner.flights.flight import Flight
-from tuner.flights.states import states_at
 from tuner.objective.criterion import Point
 from tuner.objective.flown import fly
 from tuner.objective.normal import Objective
 from tuner.objective.tunable import Tunable
+from tuner.recordings.flight import Flight
+from tuner.recordings.states import states_at
 
 STRETCH = 0.2
 """s that the equations are weighed over: noise beyond some 5 Hz is averaged out."""

@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
-from tuner.config import VehicleFile
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight
+from tuner.core.errors import RecordingError
 from tuner.objective.voltage import VOLTAGE, voltages_of
 from tuner.objective.windows import Window
+from tuner.recordings.flight import Flight
+from tuner.vehicle import VehicleFile
 
 
 def with_reference_voltage(vehicle: VehicleFile, flights: Sequence[Flight]) -> VehicleFile:

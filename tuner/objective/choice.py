@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from tuner.config import ControllerFile, VehicleFile
 from tuner.config.job import InletName
+from tuner.core.errors import RecordingError
+from tuner.core.findings import Code, Finding
 from tuner.equation_error.turning import predicts_turning
-from tuner.errors import RecordingError
-from tuner.findings import Code, Finding
-from tuner.flights.flight import Flight
-from tuner.flights.notes import NoteCode
 from tuner.objective.explained import Explained, Source, explained
 from tuner.objective.inlets import INLETS
 from tuner.objective.motor_order import motor_order
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
+from tuner.recordings.flight import Flight
+from tuner.recordings.notes import NoteCode
+from tuner.vehicle import ControllerFile, VehicleFile
 
 EXPLAINS = 0.15
 """Correlation of torque and angular acceleration about roll and pitch from which a recording of the

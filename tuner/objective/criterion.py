@@ -12,8 +12,8 @@ from jax import Array
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
-from tuner.coefficients import REGISTRY, recording_offsets
 from tuner.objective.segments import OFFSETS, Segments
+from tuner.vehicle import REGISTRY, recording_offsets
 
 Either: TypeAlias = Any
 """An array of NumPy, or, in a compiled step of the search, of jax."""

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from tuner.config import VehicleFile
-from tuner.flights.flight import Array, Flight, Series
 from tuner.objective.recorded_inputs import linear_interpolation
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.vehicle import VehicleFile
 
 Source = Literal["command", "rotor_speed"]
 

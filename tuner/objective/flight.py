@@ -24,10 +24,10 @@ from sim_jax.terms.total import total_wrench
 from sim_jax.trim import in_trim
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import PerRotor, Vehicle
-from tuner.model import Model
 from tuner.objective.battery import relative_log_voltage
 from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, whole
 from tuner.objective.segments import Segments
+from tuner.vehicle.model import Model
 
 MOTION, TURNED, SETPOINTS = "motion", "turned", "setpoints"
 """What no recording holds: the centre of mass's position, velocity and body rate; the body's
@@ -125,7 +125,7 @@ def simulate_segments(
     states
         How far the starts lie from the recorded ones, in the segments' standard deviations.
     conditions
-        Name, of `tuner.coefficients.conditions` -> what surrounds each segment, in its unit.
+        Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
     """
     start, inlet, environment = beginning_of(
         model, segments, schedule, states=states, conditions=conditions

@@ -27,9 +27,9 @@ from sim_jax.inlet import Inlet
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
-from tuner.model import Model, with_coefficients
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.segments import Segments
+from tuner.vehicle.model import Model, with_coefficients
 
 Array = NDArray[np.float64]
 

@@ -24,8 +24,8 @@ from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
-from tuner.coefficients import of_scope
 from tuner.objective.inlets import recorded_inlet_of
+from tuner.vehicle import of_scope
 
 STATES: Mapping[str, tuple[int, float]] = {
     name: (row.count, row.prior_sd) for name, row in of_scope("window").items()

@@ -29,15 +29,15 @@ from sim_jax.inlet import (
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
-from tuner.coefficients import term_groups
 from tuner.config.job import InletName
-from tuner.flights.flight import Flight
 from tuner.objective.recorded_inlet import RecordedInlet
 from tuner.objective.recorded_inputs import (
     reference_points,
     with_body_rate,
     zeroed,
 )
+from tuner.recordings.flight import Flight
+from tuner.vehicle import term_groups
 
 OF_MOTORS = (
     "actuator_latency",

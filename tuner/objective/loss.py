@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import huber_weights
+from tuner.core.numerics import huber_weights
 
 Array = NDArray[np.float64]
 

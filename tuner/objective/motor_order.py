@@ -14,12 +14,7 @@ from itertools import permutations
 import numpy as np
 from scipy import signal
 
-from tuner.config import VehicleFile
-from tuner.findings import Code, Finding
-from tuner.flights.content import PER_MOTOR
-from tuner.flights.flight import Array, Flight, Series
-from tuner.flights.notes import Note, NoteCode
-from tuner.motor_orders import columns_of
+from tuner.core.findings import Code, Finding
 from tuner.objective.explained import (
     Source,
     common_clock,
@@ -28,6 +23,11 @@ from tuner.objective.explained import (
     squared_speed,
 )
 from tuner.objective.recorded_inputs import linear_interpolation
+from tuner.recordings.content import PER_MOTOR
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.notes import Note, NoteCode
+from tuner.vehicle import VehicleFile
+from tuner.vehicle.motor_orders import columns_of
 
 LAGS = (0.005, 0.015, 0.03, 0.06)
 """s of the rotors' lag that are tried."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.config import CHANNELS
-from tuner.flights.flight import Flight, Series
-from tuner.numerics import robust_sd
+from tuner.core.numerics import robust_sd
+from tuner.recordings.flight import Flight, Series
 
 #: Smallest believable standard deviation, in the channel's unit (attitude: rad).
 FLOOR = {

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from sim_jax.crash import Limits
 from sim_jax.schedule import Schedule
-from tuner.coefficients.space import Space
-from tuner.model import Model
 from tuner.objective.criterion import (
     Criterion,
     Jacobian,
@@ -28,6 +26,8 @@ from tuner.objective.criterion import (
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulator import MEMORY, Simulator
 from tuner.objective.tunable import Tunable, tunable_of
+from tuner.vehicle.model import Model
+from tuner.vehicle.space import Space
 
 
 class Objective(eqx.Module):
@@ -54,7 +54,7 @@ class Objective(eqx.Module):
     memory: int = eqx.field(static=True, default=MEMORY)
     """bytes that derivatives may take while they are computed: segments beyond take turns."""
     conditions: tuple[str, ...] = eqx.field(static=True, default=())
-    """What surrounds each flight and is estimated with it, of `tuner.coefficients.conditions`."""
+    """What surrounds each flight and is estimated with it, of `tuner.vehicle.conditions`."""
     multiplicity: Float[Array, " N"] | None = None
     """How often each flight counts in loss, gradient and Hessian; None is once."""
 
@@ -158,7 +158,7 @@ def with_conditions(
     objective, point
         The problem, and where it stands.
     names
-        Of `tuner.coefficients.conditions`.
+        Of `tuner.vehicle.conditions`.
     """
     added = tuple(name for name in names if name not in objective.conditions)
     wider = replace(objective, conditions=(*objective.conditions, *added))

@@ -13,9 +13,9 @@ import numpy as np
 from sim_jax.inlet import Inlet
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
-from tuner.flights.flight import Flight
-from tuner.flights.resample import without_gaps
 from tuner.objective.recorded_inputs import linear_interpolation, sparse, zero_order_hold
+from tuner.recordings.flight import Flight
+from tuner.recordings.resample import without_gaps
 
 
 class RecordedInlet(ABC):

@@ -16,11 +16,8 @@ from numpy.typing import NDArray
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
-from tuner.coefficients import recording_offsets
 from tuner.config.job import InletName
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, Series
-from tuner.flights.initial import position_error
+from tuner.core.errors import RecordingError
 from tuner.objective.battery import log_voltage_of
 from tuner.objective.initial_conditions import freedom_of, freedom_of_spin
 from tuner.objective.inlets import INLETS, inlet_of
@@ -28,6 +25,9 @@ from tuner.objective.noise import repeats
 from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
+from tuner.recordings.flight import Flight, Series
+from tuner.recordings.initial import position_error
+from tuner.vehicle import recording_offsets
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.
 CLOCKS = tuple(name for name, row in recording_offsets().items() if row.unit == "s")
@@ -200,7 +200,7 @@ def window_segments(
         s from the beginning of a window to that of the next; by default its length.
     free_starts
         Whether starts are free, about the widely smoothed state; else they are the recorded states
-        (`tuner.flights.states`).
+        (`tuner.recordings.states`).
     input_late
         Flight name -> s by which what is fed in is stamped later than what it is compared with.
     """

@@ -27,11 +27,11 @@ from sim_jax.control.position import (
 )
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
-from tuner.config import ControllerFile
-from tuner.findings import Code, Finding
-from tuner.flights.flight import Array, Flight, Series
-from tuner.model import controller_of
+from tuner.core.findings import Code, Finding
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.model import controller_of
 
 POINTS = 1024
 """Set-points that are looked at, spread over a flight."""

@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.config import VehicleFile
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, Series
-from tuner.flights.notes import Note, NoteCode
-from tuner.flights.units import UNITS
-from tuner.numerics import GRAVITY
+from tuner.core.errors import RecordingError
+from tuner.core.numerics import GRAVITY
 from tuner.objective.explained import squared_speed
+from tuner.recordings.flight import Flight, Series
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.units import UNITS
+from tuner.vehicle import VehicleFile
 
 SPEED_UNITS = {"si": "in rad/s", "rpm": "in revolutions a minute", "hz": "in revolutions a second"}
 """Units that rotor speeds come in, and how a sentence calls them."""

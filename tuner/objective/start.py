@@ -12,7 +12,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
 from sim_jax.vector import Vec3
-from tuner.flights.flight import Flight, InitialState, Series
+from tuner.recordings.flight import Flight, InitialState, Series
 
 #: A start slower (m/s, rad/s) and more level (rad) than this is a hover at rest.
 REST_SPEED, REST_RATE, REST_TILT = 0.1, 0.1, 0.1

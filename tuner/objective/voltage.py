@@ -19,9 +19,9 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import BSpline, make_smoothing_spline
 
-from tuner.flights.flight import Array as Numbers
-from tuner.flights.flight import Flight, Series
-from tuner.numerics import robust_sd
+from tuner.core.numerics import robust_sd
+from tuner.recordings.flight import Array as Numbers
+from tuner.recordings.flight import Flight, Series
 
 VOLTAGE = "battery_voltage"
 OFTEN = 20.0

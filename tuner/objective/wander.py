@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
 
 from sim_jax.numeric import GRAVITY
-from tuner.flights.flight import Flight, Series
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.noise import FLOOR, white_noise
 from tuner.objective.start import rests
+from tuner.recordings.flight import Flight, Series
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, InitialState, Series
-from tuner.flights.initial import initial_state
-from tuner.flights.states import states_at
+from tuner.core.errors import RecordingError
+from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.recordings.initial import initial_state
+from tuner.recordings.states import states_at
 
 BEFORE = 1.2
 """s of a recording before a window that may help to estimate its start."""
@@ -73,7 +73,7 @@ def windows_of(
         s from the beginning of a window to that of the next; by default its length.
     smoothed_widely
         Whether a window's initial state is smoothed over a tenth of a second on either side, for
-        a start that stays free; else it is the recorded state of `tuner.flights.states`. The
+        a start that stays free; else it is the recorded state of `tuner.recordings.states`. The
         windows are the same ones either way.
 
     Raises

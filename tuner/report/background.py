@@ -12,10 +12,10 @@ import sys
 import time
 from pathlib import Path
 
+from tuner.core.spans import add_beside
 from tuner.report.contents import read_contents
 from tuner.report.paper import write_plots
 from tuner.report.sections import sections_of
-from tuner.spans import add_beside
 
 
 class BackgroundDrawing:

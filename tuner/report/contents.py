@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.bench.bench_json import BenchRecord
-from tuner.comparison.table import Table
+from tuner.core.disk import exists, file_name
+from tuner.core.errors import InputError
 from tuner.design.next_flight_json import Proposals
-from tuner.disk import exists, file_name
-from tuner.errors import InputError
-from tuner.examination.sensitivity_json import Knowledge
-from tuner.flights.flight import Array
+from tuner.evaluate.comparison_table import Table
+from tuner.ground.bench_json import BenchRecord
+from tuner.recordings.flight import Array
 from tuner.report.record import About, Recording, SearchRecord, read_traces
 from tuner.result import Run, RunResult, read_run
-from tuner.sensitivity_analysis.global_sensitivity_json import GlobalSensitivity
+from tuner.uncertainty.global_sensitivity_json import GlobalSensitivity
 from tuner.uncertainty.profiles_json import Profiles
+from tuner.uncertainty.sensitivity_json import Knowledge
 
 
 @dataclass(frozen=True)

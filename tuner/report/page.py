@@ -12,14 +12,14 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from tuner.disk import write_text
+from tuner.core.disk import write_text
+from tuner.core.spans import span
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
 from tuner.report.paper import data_uri, plot_file, write_plots
 from tuner.report.section import Section
 from tuner.report.sections import sections_of
 from tuner.report.summary import summary
-from tuner.spans import span
 
 REPORT_FILE = "report.html"
 

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from tuner.disk import file_name, inside, make_folder, write_text
+from tuner.core.disk import file_name, inside, make_folder, write_text
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
 if TYPE_CHECKING:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import JsonValue
 
-from tuner.disk import file_name, whole_file
-from tuner.files import FiniteOrNone, Part, ResultFile, read_arrays
-from tuner.findings import Finding
+from tuner.core.disk import file_name, whole_file
+from tuner.core.files import FiniteOrNone, Part, ResultFile, read_arrays
+from tuner.core.findings import Finding
 from tuner.search.iteration import Iteration
 
 if TYPE_CHECKING:  # a page is drawn without jax
-    from tuner.comparison.errors import FlightErrors
+    from tuner.evaluate.rmse import FlightErrors
     from tuner.search.fitted import Fitted
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import scaled_inverse, scaled_solve
+from tuner.core.numerics import scaled_inverse, scaled_solve
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.findings import Finding
-from tuner.flights.flight import Flight
+from tuner.core.findings import Finding
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
+from tuner.recordings.flight import Flight
 from tuner.search.iteration import Iteration
 
 COLOURED = 1.2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuner.files import FiniteOrNone, Part
+from tuner.core.files import FiniteOrNone, Part
 
 
 class Iteration(Part):

@@ -24,7 +24,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from tuner.coefficients.space import Coordinates
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
@@ -34,6 +33,7 @@ from tuner.search.normal_equations import (
     normal_equations,
     residuals_at,
 )
+from tuner.vehicle.space import Coordinates
 
 
 class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuner.files import Part
+from tuner.core.files import Part
 
 
 class PointEstimate(Part):

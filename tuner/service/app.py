@@ -14,7 +14,9 @@ from starlette.exceptions import HTTPException
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
+from tuner.core.validation import first_complaint
+from tuner.core.versions import installed
 from tuner.service.errors import ServiceError
 from tuner.service.http import Doors, api, watching
 from tuner.service.metrics import Metrics
@@ -23,8 +25,6 @@ from tuner.service.service import Service
 from tuner.service.shapes import API, Problem
 from tuner.service.web.pages import web
 from tuner.service.web.rendering import render
-from tuner.validation import first_complaint
-from tuner.versions import installed
 
 logger = logging.getLogger(__name__)
 

@@ -7,7 +7,7 @@ import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import PurePosixPath
 
-from tuner.disk import file_name
+from tuner.core.disk import file_name
 from tuner.service.store import Store
 from tuner.service.tables import FileRow
 

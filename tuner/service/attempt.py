@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from tuner.disk import digest_of, inside
+from tuner.core.disk import digest_of, inside
 from tuner.result import RunResult
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, Asked

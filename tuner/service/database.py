@@ -14,7 +14,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import Session
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service.errors import UnavailableError
 
 LOCKED_FOR = 5.0

@@ -14,9 +14,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from tuner.core.errors import InputError
+from tuner.core.runtime import cores
 from tuner.engine.engine import Engine
-from tuner.errors import InputError
-from tuner.runtime import cores
 from tuner.service.attempt import DiedError, Events, UnwantedError, attempt, outcome_of, prepare
 from tuner.service.elsewhere import Errand, sent
 from tuner.service.errors import NoSpaceError, UnavailableError

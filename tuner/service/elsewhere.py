@@ -14,10 +14,10 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from tuner.disk import inside
+from tuner.core.disk import inside
+from tuner.core.errors import EngineError
 from tuner.engine.engine import Engine
 from tuner.engine.engine import Report as Channel
-from tuner.errors import EngineError
 from tuner.service.attempt import (
     BEAT,
     CHECKPOINTS,

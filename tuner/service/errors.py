@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 
 
 class ServiceError(InputError):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from sqlalchemy import func, select
 from sqlalchemy.orm import selectinload
 
-from tuner.coefficients.registry import at_mass
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, shown
 from tuner.service.naming import stems
 from tuner.service.shapes import CoefficientHistory, History, Point, iso
 from tuner.service.tables import JobRow, PointRow, State
+from tuner.vehicle.registry import at_mass
 
 MOST_JOBS = 500
 """Of a history, the latest."""

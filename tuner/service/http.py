@@ -11,8 +11,9 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.requests import ClientDisconnect
 
-from tuner.disk import file_name
-from tuner.errors import InputError
+from tuner.core.disk import file_name
+from tuner.core.errors import InputError
+from tuner.core.versions import installed
 from tuner.service import jobs, recordings
 from tuner.service.archive import zipped
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
@@ -38,7 +39,6 @@ from tuner.service.shapes import (
     recording_answer,
 )
 from tuner.service.tables import FileRow, RecordingRow, State
-from tuner.versions import installed
 
 BLOCK = 2**18
 #: What any call may answer beside what it is for.

@@ -13,7 +13,7 @@ import anyio.to_thread
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service.errors import TooLargeError
 from tuner.service.naming import last_part
 from tuner.service.settings import Limits, size_in_words

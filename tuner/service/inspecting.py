@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tuner.errors import RecordingError
+from tuner.core.errors import RecordingError
 from tuner.service.limiting import limit_process
 from tuner.service.settings import Limits, size_in_words
 
@@ -67,7 +67,7 @@ def main() -> None:
     """Inspect the file that the command line names."""
     file, memory, size, seconds = sys.argv[1], *map(int, sys.argv[2:])
     limit_process(memory_bytes=memory, file_bytes=size, cpu_seconds=seconds)
-    from tuner.flights.inspection import as_json, inspect_recordings  # noqa: PLC0415 (after limits)
+    from tuner.recordings.inspection import as_json, inspect_recordings  # noqa: PLC0415 (after limits)
 
     try:
         inspections, errors = inspect_recordings([Path(file)], cache=False)

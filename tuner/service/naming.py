@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from tuner.disk import file_name
+from tuner.core.disk import file_name
 
 _SIDE_CARS = (".yaml", ".yml")
 

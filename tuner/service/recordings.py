@@ -13,8 +13,8 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 
-from tuner.disk import inside
-from tuner.errors import InputError
+from tuner.core.disk import inside
+from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, shown
 from tuner.service.incoming import Upload

@@ -10,16 +10,17 @@ from typing import Annotated, Any, TypeVar
 from annotated_types import Interval, Len
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from tuner.config import ControllerFile, Options, VehicleFile, settle
+from tuner.config import Options, settle
 from tuner.config.job import JobFile, Method
 from tuner.config.settings import is_among
-from tuner.disk import inside
-from tuner.errors import ConfigError, InputError, did_you_mean
-from tuner.flights.topics import TopicMap
+from tuner.core.disk import inside
+from tuner.core.errors import ConfigError, InputError, did_you_mean
+from tuner.core.shipped import Kind, configs_folder
+from tuner.core.yaml_document import dump_yaml
+from tuner.core.yaml_section import Flag, Number, Section, Whole, build, refuse
+from tuner.recordings.topics import TopicMap
 from tuner.service.naming import last_part, recording_name, stems
-from tuner.yaml_files.document import dump_yaml
-from tuner.yaml_files.section import Flag, Number, Section, Whole, build, refuse
-from tuner.yaml_files.shipped import Kind, configs_folder
+from tuner.vehicle import ControllerFile, VehicleFile
 
 JOB_FILE = "tune.yaml"
 FLIGHTS = "flights"

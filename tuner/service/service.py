@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
-from tuner.disk import make_folder, write_text
+from tuner.core.disk import make_folder, write_text
+from tuner.core.errors import InputError
 from tuner.engine.engine import Engine
-from tuner.errors import InputError
 from tuner.service.database import Database
 from tuner.service.dispatcher import Dispatcher
 from tuner.service.queue import Queue

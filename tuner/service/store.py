@@ -17,7 +17,7 @@ from typing import IO
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service.errors import NoSpaceError
 
 BLOCK = 2**20

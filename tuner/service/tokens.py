@@ -9,7 +9,7 @@ import time
 
 from sqlalchemy import delete, select
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.tables import SessionRow, TokenRow
 

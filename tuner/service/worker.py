@@ -20,11 +20,11 @@ from typing import IO, Any
 
 from pydantic import BaseModel
 
-from tuner.errors import InputError
+from tuner.core.errors import InputError
+from tuner.core.shipped import configs_folder
 from tuner.service.limiting import limit_process
 from tuner.service.request import Asked
 from tuner.service.settings import Limits, size_in_words
-from tuner.yaml_files.shipped import configs_folder
 
 RESULT = Path("result")
 LOCK = ".lock"
@@ -88,7 +88,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
     """Run the job and return how it ended."""
     limits, asked = assignment.limits, assignment.asked
     limit_process(memory_bytes=limits.memory_bytes, file_bytes=limits.file_bytes)
-    from tuner.runtime import configure  # noqa: PLC0415 (jax after the limits)
+    from tuner.core.runtime import configure  # noqa: PLC0415 (jax after the limits)
 
     if assignment.cores and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, assignment.cores)
@@ -119,7 +119,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
 
 def _listener(channel: IO[str]) -> Any:
     """Return a listener that writes what it hears as lines of JSON."""
-    from tuner.job.listener import Listener  # noqa: PLC0415
+    from tuner.search.listener import Listener  # noqa: PLC0415
 
     def say(kind: str, **content: object) -> None:
         channel.write(json.dumps({"kind": kind, **content}) + "\n")

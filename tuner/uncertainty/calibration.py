@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
-from tuner.files import Part
+from tuner.core.files import Part
 
 FILE = Path(__file__).with_name("calibration.json")
 LEVELS = ("50", "80", "95")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import Inverse, scaled_root, symmetric_eigen
+from tuner.core.numerics import Inverse, scaled_root, symmetric_eigen
 from tuner.uncertainty.independent import IndependentErrors
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.stretches import Stretches, stretches_of

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import scale_group
-from tuner.files import Part
-from tuner.numerics import symmetric_eigen
+from tuner.core.files import Part
+from tuner.core.numerics import symmetric_eigen
+from tuner.vehicle import scale_group
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.coefficients.space import Parameter, Space
-from tuner.numerics import Z95, scaled_inverse
+from tuner.core.numerics import Z95, scaled_inverse
 from tuner.objective.criterion import Point
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
@@ -21,6 +19,8 @@ from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.information import FisherInformation, information_at
 from tuner.uncertainty.parts import Spread, spread_of
 from tuner.uncertainty.verdict import Precision, Reason, Verdict, judge
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.space import Parameter, Space
 
 Array = NDArray[np.float64]
 

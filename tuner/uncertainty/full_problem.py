@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.coefficients.size import Size, sized
-from tuner.coefficients.space import Parameter, Space
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.size import Size, sized
+from tuner.vehicle.space import Parameter, Space
 
 
 @dataclass(frozen=True)

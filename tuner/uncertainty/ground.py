@@ -6,11 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients.space import Space
-from tuner.numerics import scaled_inverse, unit_diagonal
+from tuner.core.numerics import scaled_inverse, unit_diagonal
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.sources import Sources
+from tuner.vehicle.space import Space
 
 Array = NDArray[np.float64]
 

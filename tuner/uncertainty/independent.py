@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import Inverse
+from tuner.core.numerics import Inverse
 from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.overdispersion import allowed_for
 

@@ -14,10 +14,10 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients.space import Space
-from tuner.numerics import huber_weights
+from tuner.core.numerics import huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
+from tuner.vehicle.space import Space
 
 Array = NDArray[np.float64]
 

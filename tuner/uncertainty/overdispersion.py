@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special  # scipy.stats takes a quarter of a second to import
 
-from tuner.numerics import Z95
+from tuner.core.numerics import Z95
 
 Array = NDArray[np.float64]
 

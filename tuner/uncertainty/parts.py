@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.numerics import Z95, Inverse
+from tuner.core.numerics import Z95, Inverse
 from tuner.objective.alternatives import DRAWS, READINGS, STEP
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.independent import IndependentErrors

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.coefficients import COEFFICIENTS
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin, on_host
@@ -21,6 +20,7 @@ from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import FullProblem
 from tuner.uncertainty.profiles_json import THRESHOLD, Profile
+from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]
 

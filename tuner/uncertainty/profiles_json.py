@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.disk import write_text
-from tuner.files import FiniteOrNone, Part, ResultFile, csv_text
+from tuner.core.disk import write_text
+from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
 
 PROFILES_TABLE = "profiles.csv"
 THRESHOLD = 3.841459

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import Inverse
+from tuner.core.numerics import Inverse
 from tuner.uncertainty.information import BLOCK, FisherInformation
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Literal
 
-from tuner.files import Part
-from tuner.numerics import Z95
+from tuner.core.files import Part
+from tuner.core.numerics import Z95
 from tuner.uncertainty.directions import Direction
 
 WELL_KNOWN = 0.05

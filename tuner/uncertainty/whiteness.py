@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.numerics import Z95
+from tuner.core.numerics import Z95
 from tuner.objective.criterion import Criterion, Jacobian
 from tuner.objective.normal import Objective
 from tuner.uncertainty.residual import Residual

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from tuner.bench.bench_json import BenchRecord, ExperimentRecord
-from tuner.bench.combine import DISAGREE
-from tuner.bench.scales import error_of, value_of
-from tuner.coefficients import COEFFICIENTS
+from tuner.ground.bench_json import BenchRecord, ExperimentRecord
+from tuner.ground.combine import DISAGREE
+from tuner.ground.scales import error_of, value_of
+from tuner.vehicle import COEFFICIENTS
 from tuner.wording.phrases import listed
 
 #: Code of a remark -> sentence, with its numbers in braces.

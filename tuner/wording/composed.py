@@ -1,6 +1,6 @@
 """Sentences of findings that take more than a text with the finding's numbers in it.
 
-Each is named after its code in `tuner.findings.Code`.
+Each is named after its code in `tuner.core.findings.Code`.
 """
 
 from __future__ import annotations
@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tuner.findings import Code, Finding
-from tuner.flights.damage import Cause, Damage
-from tuner.flights.notes import Note, NoteCode
+from tuner.core.findings import Code, Finding
+from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Note, NoteCode
 from tuner.wording.notes import damage_sentence, note_in_words
 from tuner.wording.phrases import as_sentence, listed
 from tuner.wording.result import PREDICTED

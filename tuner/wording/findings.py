@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from tuner.findings import Code, Finding
-from tuner.motor_orders import order_in_words
+from tuner.core.findings import Code, Finding
+from tuner.vehicle.motor_orders import order_in_words
 from tuner.wording import composed
 from tuner.wording.phrases import as_sentence, listed, percent
 

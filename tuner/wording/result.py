@@ -6,8 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from math import sqrt
 from pathlib import Path
 
-from tuner.coefficients import REGISTRY, Coefficient, NotCarried, Written
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.result import (
     RMSE_UNITS,
     EffectiveResult,
@@ -17,8 +16,9 @@ from tuner.result import (
     PoseRmse,
     RunResult,
 )
-from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.uncertainty.calibration import Calibration
+from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.wording.phrases import listed, percent
 
 APART = 2.0

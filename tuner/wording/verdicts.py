@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from tuner.coefficients import scale_group
-from tuner.numerics import Z95
+from tuner.core.numerics import Z95
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
+from tuner.vehicle import scale_group
 from tuner.wording.phrases import listed, percent, quantity
 
 NEGLIGIBLE = 0.01

@@ -74,7 +74,7 @@ def lab(tmp_path, make_run, monkeypatch):
     (tmp_path / "spin.bag").write_bytes(BAG.read_bytes())
     access = os.access  # whoever runs the tests may be allowed everything
     monkeypatch.setattr(
-        "tuner.disk.os.access",
+        "tuner.core.disk.os.access",
         lambda path, mode: "locked" not in Path(path).parts and access(path, mode),
     )
     return tmp_path
@@ -116,7 +116,7 @@ def test_a_disk_that_fails_midway_through_a_recording(command, lab, capsys, monk
         raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setenv("TUNE_CACHE_DIR", str(lab.parent / f"{lab.name}_cache"))
-    monkeypatch.setattr("tuner.flights.ros.bag1.Bag1._locate", fails)
+    monkeypatch.setattr("tuner.recordings.ros.bag1.Bag1._locate", fails)
     refused(command, "spin.bag: cannot be read (Input/output error); check", lab, capsys)
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from tuner.config import configs_folder
+from tuner.core.shipped import configs_folder
 
 
 @pytest.fixture

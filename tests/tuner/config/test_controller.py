@@ -1,7 +1,8 @@
 import pytest
 
-from tuner.config import ControllerFile, configs_folder, read_controller
-from tuner.errors import ConfigError
+from tuner.core.errors import ConfigError
+from tuner.core.shipped import configs_folder
+from tuner.vehicle import ControllerFile, read_controller
 
 
 def read(tmp_path, text):

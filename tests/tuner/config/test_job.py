@@ -2,7 +2,7 @@ import re
 
 import pytest
 
-from tuner.config import JobFile, configs_folder, read_job
+from tuner.config import JobFile, read_job
 from tuner.config.job import (
     CHANNELS,
     CoefficientSettings,
@@ -11,7 +11,8 @@ from tuner.config.job import (
     Search,
     TrajectorySettings,
 )
-from tuner.errors import ConfigError
+from tuner.core.errors import ConfigError
+from tuner.core.shipped import configs_folder
 
 
 def read(tmp_path, text):

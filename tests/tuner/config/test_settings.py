@@ -2,9 +2,10 @@ import shutil
 
 import pytest
 
-from tuner.config import Options, configs_folder, find_job_file, settle
-from tuner.errors import ConfigError, InputError
-from tuner.recording_paths import find_flights
+from tuner.config import Options, find_job_file, settle
+from tuner.core.errors import ConfigError, InputError
+from tuner.core.recording_paths import find_flights
+from tuner.core.shipped import configs_folder
 
 
 @pytest.fixture

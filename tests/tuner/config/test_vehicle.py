@@ -2,11 +2,17 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import check_mixer, read_vehicle, values_of, with_values, write_vehicle
-from tuner.config.vehicle import Aerodynamics, Inertia, Motor, Setup
-from tuner.errors import ConfigError
-from tuner.yaml_files.shipped import configs_folder
+from tuner.core.errors import ConfigError
+from tuner.core.shipped import configs_folder
+from tuner.vehicle import (
+    COEFFICIENTS,
+    check_mixer,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
+from tuner.vehicle.vehicle import Aerodynamics, Inertia, Motor, Setup
 
 SHIPPED = sorted((configs_folder() / "vehicles").glob("*.yaml"))
 ORIGINAL = configs_folder() / "vehicles" / "hovergames.yaml"

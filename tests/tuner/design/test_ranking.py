@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
+from tuner.core.errors import InputError
 from tuner.design import candidate_problem
 from tuner.design.candidates import CLEARANCE, Arena, candidates
 from tuner.design.next_flight_json import (
     Proposals,
 )
 from tuner.design.ranking import rank_next_flights
-from tuner.errors import InputError
-from tuner.examination.examination import Examination, examine
 from tuner.objective import flown
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
+from tuner.uncertainty.examination import Examination, examine
 from tuner.wording.proposals import proposals_in_words
 
 FREE = ("inertia_xx", "inertia_zz", "input_scaling", "motor_constant", "moment_constant")

@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 
-from tuner.errors import RecordingError
+from tuner.core.errors import RecordingError
 
 
 def square(number, report):

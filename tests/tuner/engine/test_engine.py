@@ -5,9 +5,9 @@ import time
 import pytest
 
 from tests.tuner.engine import tasks
+from tuner.core.errors import InputError, RecordingError
 from tuner.engine import HERE, current, engine_for, using
 from tuner.engine.engine import Here
-from tuner.errors import InputError, RecordingError
 
 
 @pytest.fixture(params=["here", "two workers"])

@@ -44,7 +44,7 @@ USER = """
 import sys
 from tests.tuner.engine import tasks
 from tuner.engine import engine_for
-from tuner.errors import EngineError
+from tuner.core.errors import EngineError
 
 with engine_for(cluster=sys.argv[1]) as engine:
     assert engine.map(tasks.square, [3]) == [9]
@@ -78,7 +78,7 @@ GREEDY = """
 import sys
 from tests.tuner.engine import tasks
 from tuner.engine import engine_for
-from tuner.errors import EngineError
+from tuner.core.errors import EngineError
 
 if __name__ == "__main__":
     with engine_for(cluster=sys.argv[1]) as engine:

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 
 from tests.tuner.engine import tasks
-from tuner.config import ControllerFile, Options, TrajectorySettings, settle
+from tuner.config import Options, TrajectorySettings, settle
 from tuner.engine import using
-from tuner.job.bootstrap import BOOTSTRAP_FILE, bootstrap
-from tuner.job.cross_validation import CROSS_VALIDATION_FILE, cross_validate
-from tuner.job.prepare import job_of
-from tuner.job.unfitted import unfitted
+from tuner.evaluate import simulate as simulation
+from tuner.evaluate.cross_validation import CROSS_VALIDATION_FILE, cross_validate
+from tuner.evaluate.simulate import simulate
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Point
+from tuner.objective.job_flights import read_recordings
 from tuner.objective.many_points import sums_at
-from tuner.recordings import read_recordings
-from tuner.simulation import simulate as simulation
-from tuner.simulation.simulate import simulate
+from tuner.search.problem import job_of
+from tuner.search.unfitted import unfitted
+from tuner.uncertainty.bootstrap import BOOTSTRAP_FILE, bootstrap
+from tuner.vehicle import ControllerFile
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 

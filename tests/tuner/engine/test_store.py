@@ -3,8 +3,8 @@ import pickle
 
 import pytest
 
+from tuner.core.errors import InputError
 from tuner.engine.store import Store
-from tuner.errors import InputError
 
 
 @pytest.fixture(params=["folder", "memory"])

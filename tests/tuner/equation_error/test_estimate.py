@@ -13,10 +13,10 @@ from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.measured import measured
 from tuner.equation_error.turning import predicts_turning, regressors
-from tuner.flights.flight import Series
 from tuner.job.accelerations import with_accelerations
-from tuner.job.prepare import job_of
-from tuner.recordings import read_usable
+from tuner.objective.job_flights import read_usable
+from tuner.recordings.flight import Series
+from tuner.search.problem import job_of
 
 SECONDS = 7.0
 TILTING = ("inertia_xx", "inertia_yy")

@@ -2,8 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.config import configs_folder, read_vehicle, values_of, with_values, write_vehicle
+from tuner.core.shipped import configs_folder
 from tuner.result import (
     AxesRmse,
     CoefficientResult,
@@ -12,6 +11,7 @@ from tuner.result import (
     SearchResult,
     read_run,
 )
+from tuner.vehicle import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
 
 MODELS = Path(__file__).resolve().parents[3] / "examples" / "models"
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.audit import audit
 from tuner.exporters.px4_parameters import parameters_text
 from tuner.exporters.simulators import GZ_SIM

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.exporters.conftest import as_the_run_says
-from tuner.config import read_vehicle, values_of
-from tuner.errors import ExportError, InputError
-from tuner.examination.sensitivity_json import Knowledge
+from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of
 from tuner.exporters.export import export_draws
 from tuner.exporters.targets.isaaclab import read_configuration
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.vehicle import read_vehicle, values_of
 
 NAMES = ("inertia_xx", "motor_constant", "moment_constant", "estimate_latency")
 CORRELATION = np.array(

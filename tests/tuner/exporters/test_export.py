@@ -4,13 +4,13 @@ from datetime import date
 import pytest
 
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
-from tuner.config import read_vehicle
 from tuner.config.job import ExportSettings
-from tuner.errors import ExportError, InputError
+from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export, exports_of_job
 from tuner.exporters.gates import check
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
+from tuner.vehicle import read_vehicle
 from tuner.wording.result import export_sentence
 
 TODAY = date(2024, 5, 6)

@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import write
 from tuner.exporters.px4_parameters import Parameter, outside_range, read_parameters
 from tuner.exporters.simulators import GZ_SIM, SIH

@@ -4,30 +4,30 @@ import pytest
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
-from tuner.coefficients import COEFFICIENTS
-from tuner.comparison.comparison import Comparison
-from tuner.config import (
-    ControllerFile,
-    JobFile,
-    read_vehicle,
-    values_of,
-    with_values,
-    write_vehicle,
-)
-from tuner.errors import ExportError
+from tuner.config import JobFile
+from tuner.core.errors import ExportError
+from tuner.evaluate.comparison import Comparison
+from tuner.exporters import effective_of_run
 from tuner.exporters import refly as refly_module
+from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
 from tuner.exporters.simulators import GZ_SIM
-from tuner.job import effective_of_run
-from tuner.job.effective_of_run import kept_effective
-from tuner.recordings import Recording
+from tuner.objective.job_flights import Recording
 from tuner.result import (
     CoefficientResult,
     FlightResult,
     RunResult,
     SearchResult,
     read_run,
+)
+from tuner.vehicle import (
+    COEFFICIENTS,
+    ControllerFile,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
 )
 
 

@@ -7,9 +7,7 @@ import pytest
 from lxml import etree
 
 from tests.tuner.exporters.conftest import MODELS
-from tuner.coefficients import REGISTRY, Written
-from tuner.config import values_of
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import write
 from tuner.exporters.sdf.model import read_model
 from tuner.exporters.sdf.patch import sdf_draft
@@ -20,6 +18,7 @@ from tuner.exporters.sdf.template import blanked, rendered
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import Choices, not_carried, target_of
 from tuner.exporters.targets.sdf import TARGET
+from tuner.vehicle import REGISTRY, Written, values_of
 
 CLASSIC, GZ, TEMPLATE = (
     MODELS / "quad_x.sdf",

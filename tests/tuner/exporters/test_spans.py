@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.sdf.spans import Edit, append_child, apply, number, parse, set_value
 
 PATH = Path("model.sdf")

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.exporters.conftest import MODELS
-from tuner.config import values_of
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import read_file, write
 from tuner.exporters.sdf.includes import assembled
 from tuner.exporters.sdf.model import read_model
@@ -19,6 +18,7 @@ from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.read_back import composite
 from tuner.exporters.sdf.template import rendered
 from tuner.exporters.simulators import GZ_SIM
+from tuner.vehicle import values_of
 
 SHIPPED = Path(__file__).resolve().parents[4] / "shared" / "models"
 shipped = pytest.mark.skipif(

@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from tests.tuner.job.test_windows import stage_for
-from tuner import recordings
-from tuner.config import ControllerFile, JobFile, Options, settle, values_of, with_values
+from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
-from tuner.findings import Code
-from tuner.flights.flight import Series
-from tuner.job.prepare import job_of
-from tuner.job.search import search
+from tuner.core.findings import Code
+from tuner.objective import job_flights as recordings
 from tuner.objective.choice import choose_inlet
 from tuner.objective.inlets import TURNING
+from tuner.objective.job_flights import read_usable, recordings_of
 from tuner.objective.motor_order import MotorOrder
-from tuner.recordings import read_usable, recordings_of
+from tuner.recordings.flight import Series
+from tuner.search.estimation import search
+from tuner.search.problem import job_of
+from tuner.vehicle import ControllerFile, values_of, with_values
 from tuner.wording.findings import one_line
 
 EXPONENT = 0.8

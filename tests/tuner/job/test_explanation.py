@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tuner.config import Options
-from tuner.errors import OutputError
-from tuner.findings import LARGEST, Code, Finding
-from tuner.job import disturbances
+from tuner.core.errors import OutputError
+from tuner.core.findings import LARGEST, Code, Finding
+from tuner.disturbances import estimation as disturbances
 from tuner.job.explanation import Explanation
-from tuner.job.listener import SILENT, Listener
 from tuner.job.run import run
 from tuner.result import read_run
+from tuner.search.listener import SILENT, Listener
 from tuner.uncertainty.verdict import Verdict
 from tuner.wording.findings import one_line
 

@@ -5,10 +5,11 @@ from types import SimpleNamespace
 import jax.numpy as jnp
 import pytest
 
-from tuner.coefficients.space import space_of
-from tuner.config import ControllerFile, JobFile
-from tuner.config.controller import Filters
+from tuner.config import JobFile
 from tuner.job.results import best_values
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.controller import Filters
+from tuner.vehicle.space import space_of
 
 
 @pytest.mark.parametrize(("name", "initial"), [("gyro_cutoff", 30.0), ("fuselage_drag", 0.0)])

@@ -14,19 +14,20 @@ import yaml
 from markupsafe import escape
 
 from tuner.cli import main
-from tuner.comparison.comparison import Comparison
-from tuner.config import ControllerFile, Options, read_controller, read_vehicle, values_of
-from tuner.errors import InputError
-from tuner.findings import Code
-from tuner.flights.damage import Cause
-from tuner.flights.load import load_flight
-from tuner.job.listener import Listener
+from tuner.config import Options
+from tuner.core.errors import InputError
+from tuner.core.findings import Code
+from tuner.evaluate.comparison import Comparison
 from tuner.job.run import run
-from tuner.recordings import Recording
+from tuner.objective.job_flights import Recording
+from tuner.recordings.damage import Cause
+from tuner.recordings.load import load_flight
 from tuner.report import render
 from tuner.report.record import SearchRecord
 from tuner.result import read_run
+from tuner.search.listener import Listener
 from tuner.search.point_estimate import PointEstimate
+from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
 from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

@@ -6,9 +6,10 @@ import pytest
 
 import tuner
 from tuner.cli import main
-from tuner.config import ControllerFile, configs_folder
-from tuner.errors import InputError
+from tuner.core.errors import InputError
+from tuner.core.shipped import configs_folder
 from tuner.job.examination_files import arena_of
+from tuner.vehicle import ControllerFile
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tuner.config import Options
-from tuner.errors import InputError
-from tuner.findings import Code
+from tuner.core.errors import InputError
+from tuner.core.findings import Code
 from tuner.job.run import run
 from tuner.result import read_run
 

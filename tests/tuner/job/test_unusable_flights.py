@@ -7,22 +7,23 @@ import numpy as np
 import pytest
 
 from sim_jax.schedule import Schedule
-from tests.tuner.comparison.test_errors import errors
-from tuner import recordings as recordings_module
-from tuner.coefficients.space import space_of
-from tuner.config import ControllerFile, JobFile, Options, settle
+from tests.tuner.evaluate.test_rmse import errors
+from tuner.config import JobFile, Options, settle
 from tuner.config.job import Search
-from tuner.errors import ConfigError, RecordingError
-from tuner.findings import Code, Finding
-from tuner.flights.flight import Series
-from tuner.flights.notes import Note, NoteCode
-from tuner.flights.outliers import HONEST, sticking_out
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.findings import Code, Finding
 from tuner.job.check import said_once
 from tuner.job.findings import flights_worse, turning_unexplained
+from tuner.objective import job_flights as recordings_module
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by
+from tuner.objective.job_flights import read_usable, recordings_of
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
-from tuner.recordings import read_usable, recordings_of
+from tuner.recordings.flight import Series
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.outliers import HONEST, sticking_out
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.space import space_of
 
 
 def without_commands(flight, begin, end):

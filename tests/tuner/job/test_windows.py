@@ -5,18 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.comparison.comparison import Comparison
-from tuner.config import JobFile, Options, settle, values_of, with_values
+from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
-from tuner.errors import ConfigError
-from tuner.findings import Code
+from tuner.core.errors import ConfigError
+from tuner.core.findings import Code
+from tuner.evaluate.comparison import Comparison
 from tuner.job.check import check
-from tuner.job.holding import with_undetermined_held
-from tuner.job.prepare import job_of
-from tuner.job.search import search
-from tuner.recordings import recordings_of
+from tuner.objective.job_flights import recordings_of
+from tuner.search.estimation import search
+from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan
+from tuner.uncertainty.holding import with_undetermined_held
+from tuner.vehicle import values_of, with_values
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
 FREE = ("inertia_xx", "inertia_yy", "motor_constant", "moment_constant", "rotor_drag_coefficient")

@@ -6,8 +6,8 @@ import pytest
 import yaml
 
 from tuner.config import Options
-from tuner.findings import Code
-from tuner.job.bench import bench
+from tuner.core.findings import Code
+from tuner.ground.job import bench
 from tuner.job.run import run
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

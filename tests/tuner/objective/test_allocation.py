@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.config import configs_folder, read_vehicle
-from tuner.flights.flight import Series
-from tuner.flights.notes import NoteCode
+from tuner.core.shipped import configs_folder
 from tuner.objective.allocation import commands_of, with_commands
 from tuner.objective.explained import levers, squared_speed
+from tuner.recordings.flight import Series
+from tuner.recordings.notes import NoteCode
+from tuner.vehicle import read_vehicle
 
 
 @pytest.mark.parametrize("quadratic", [0.0, 200.0])

@@ -16,8 +16,7 @@ from tests.tuner.uncertainty.making import (
     vehicle_file,
     with_data,
 )
-from tuner.errors import RecordingError
-from tuner.flights.flight import Flight, InitialState, Series
+from tuner.core.errors import RecordingError
 from tuner.objective.alternatives import DRAWS, STEP, alternatives_of
 from tuner.objective.battery import (
     log_voltage_of,
@@ -27,6 +26,7 @@ from tuner.objective.battery import (
 from tuner.objective.criterion import Point
 from tuner.objective.voltage import IDLE, _resistance, read_again, voltages_of
 from tuner.objective.windows import Window
+from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.normal_equations import normal_equations
 
 NOISE = 0.02

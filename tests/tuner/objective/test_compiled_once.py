@@ -10,10 +10,10 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
-from tuner.flights.flight import Series
-from tuner.job.prepare import job_of
 from tuner.objective import flown
-from tuner.recordings import recordings_of
+from tuner.objective.job_flights import recordings_of
+from tuner.recordings.flight import Series
+from tuner.search.problem import job_of
 
 
 def built(objective):

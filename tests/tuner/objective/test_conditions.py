@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
-from tuner.coefficients import conditions
 from tuner.objective.criterion import OFFSET_SD, Point, units_of
 from tuner.objective.normal import with_conditions
 from tuner.objective.segments import OFFSETS
 from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.information import information_at
+from tuner.vehicle import conditions
 
 NAMES = ("wind_x", "wind_y", "battery_decline")
 TRUTH = np.array([[0.3, -0.2], [0.1, 0.25], [1e-3, 3e-3]])

@@ -11,11 +11,11 @@ import pytest
 
 from lanes import joined
 from tuner.config import Options, settle
-from tuner.job.prepare import job_of
-from tuner.model import with_coefficients
 from tuner.objective import flown
 from tuner.objective.flight import simulate_segments, trace_of
-from tuner.recordings import recordings_of
+from tuner.objective.job_flights import recordings_of
+from tuner.search.problem import job_of
+from tuner.vehicle.model import with_coefficients
 
 MOVING = ("inertia_xx", "time_constant_up", "rotor_drag_coefficient", "estimate_latency")
 SAMPLES = 120

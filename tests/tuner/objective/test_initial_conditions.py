@@ -18,9 +18,7 @@ from tests.tuner.uncertainty.making import (
     vehicle_file,
     with_data,
 )
-from tuner.filter_error.predictor import unscaled
-from tuner.flights.load import load_flight
-from tuner.model import model_of
+from tuner.disturbances.predictor import unscaled
 from tuner.objective.initial_conditions import (
     ROWS,
     eliminated,
@@ -31,6 +29,8 @@ from tuner.objective.initial_conditions import (
     whole,
 )
 from tuner.objective.segments import segments_of
+from tuner.recordings.load import load_flight
+from tuner.vehicle.model import model_of
 
 ROOT = Path(__file__).resolve().parents[3]
 COUNT = len(freedom_of(()))

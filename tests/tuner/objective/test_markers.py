@@ -10,11 +10,11 @@ from tests.tuner.uncertainty.making import (
     problem,
     with_data,
 )
-from tuner.coefficients import COEFFICIENTS
-from tuner.coefficients.coefficient import NotCarried
 from tuner.objective.criterion import Point
 from tuner.search.loop import Loop, with_loop
 from tuner.search.normal_equations import normal_equations
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.coefficient import NotCarried
 
 TRUTH = {
     "marker_offset_x": 0.012,

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.flights.flight import Series
 from tuner.objective.noise import repeats, white_noise
 from tuner.objective.segments import segments_of
+from tuner.recordings.flight import Series
 
 
 @pytest.mark.parametrize("sigma", [5e-4, 5e-3])

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.config import ControllerFile
-from tuner.findings import Code
-from tuner.flights.flight import Series
+from tuner.core.findings import Code
 from tuner.objective.choice import choose_inlet
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
+from tuner.recordings.flight import Series
+from tuner.vehicle import ControllerFile
 from tuner.wording.findings import one_line
 
 OURS = ControllerFile()

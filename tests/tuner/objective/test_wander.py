@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sim_jax.numeric import GRAVITY
-from tuner.flights.flight import Flight, InitialState, Series
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.wander import wander_of
+from tuner.recordings.flight import Flight, InitialState, Series
 
 NOISE = {"position": 5e-4, "attitude": 2.5e-4, "body_rate": 0.01}
 TRIM = (0.01, -0.02)

@@ -7,18 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.comparison.compare import table_of
-from tuner.comparison.errors import FlightErrors, SignalErrors
-from tuner.config import VehicleFile, read_vehicle, values_of, write_vehicle
+from tuner.core.shipped import find_config
 from tuner.design.log_proposal import LogProposal
-from tuner.examination.sensitivity_json import (
-    CoefficientKnowledge,
-    EffectOverTime,
-    Knowledge,
-    OutputSensitivity,
-)
-from tuner.examination.tables import write_files
+from tuner.evaluate.compare import table_of
+from tuner.evaluate.forces import Forces
+from tuner.evaluate.rmse import FlightErrors, SignalErrors
 from tuner.report import write_traces
 from tuner.report.record import SearchRecord, Start
 from tuner.result import (
@@ -34,13 +27,19 @@ from tuner.result import (
     Status,
 )
 from tuner.search.iteration import Iteration
-from tuner.selection.table import SelectionCode, SelectionRow
-from tuner.simulation.forces import Forces
+from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.residual import Residual
+from tuner.uncertainty.sensitivity_json import (
+    CoefficientKnowledge,
+    EffectOverTime,
+    Knowledge,
+    OutputSensitivity,
+)
+from tuner.uncertainty.tables import write_files
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
+from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.wording.verdicts import judgement_in_words
-from tuner.yaml_files.shipped import find_config
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
 FLIGHTS = ("swing", "spin")

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.tuner.report import making
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.report import render
 from tuner.report.contents import read_contents
 from tuner.report.sections.selection import selection

@@ -15,7 +15,7 @@ from tuner.cli import main
 from tuner.client import folder as folder_module
 from tuner.client.job_request import request_of
 from tuner.config import Options
-from tuner.errors import InputError, ServerFaultError
+from tuner.core.errors import InputError, ServerFaultError
 from tuner.result import Run
 
 
@@ -130,7 +130,7 @@ def test_a_recording_that_the_server_has_is_not_sent_again(server, table):
 
 
 def test_files_that_options_name_travel_as_their_contents(table, tmp_path, updated):
-    from tuner.config import write_vehicle  # noqa: PLC0415
+    from tuner.vehicle import write_vehicle  # noqa: PLC0415
 
     lab = tmp_path / "lab"
     lab.mkdir()

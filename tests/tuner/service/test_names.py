@@ -9,12 +9,13 @@ from hypothesis import strategies as st
 from tests.tuner.exporters.conftest import as_the_run_says, make_run
 from tests.tuner.service.conftest import listening
 from tests.tuner.test_names import EXAMPLES, NAMES, nothing_outside
-from tuner.config import ControllerFile, settle, write_vehicle
+from tuner.config import settle
 from tuner.config.job import ExportSettings
 from tuner.exporters.export import exports_of_job
 from tuner.result import BEST_FIT_FILE
 from tuner.service.attempt import prepare
 from tuner.service.queue import Queue
+from tuner.vehicle import ControllerFile, write_vehicle
 
 __all__ = ["make_run"]
 

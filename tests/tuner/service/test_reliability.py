@@ -20,7 +20,7 @@ import pytest
 
 from tests.tuner.service import serving
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service import attempt, jobs
 from tuner.service import database as database_module
 from tuner.service.database import Database

@@ -3,10 +3,10 @@
 import pytest
 
 from tests.tuner.service.conftest import LIMITS, listening, submit, upload
-from tuner.config import ControllerFile, VehicleFile
 from tuner.service.request import FLIGHTS, JobRequest, checked
 from tuner.service.service import Service
 from tuner.service.settings import ServiceSettings
+from tuner.vehicle import ControllerFile, VehicleFile
 
 FLIGHT = ("circle_3.bag", "circle_4.bag")
 IDS = ("0" * 64, "1" * 64)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.service import tokens
 from tuner.service.naming import recording_name
 from tuner.service.safety import COOKIE, RateLimit

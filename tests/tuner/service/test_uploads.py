@@ -14,7 +14,7 @@ import pytest
 
 from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
 from tuner.config import Options
-from tuner.errors import RecordingError
+from tuner.core.errors import RecordingError
 from tuner.service import incoming, inspecting, recordings
 from tuner.service.service import Service
 from tuner.service.settings import MIB

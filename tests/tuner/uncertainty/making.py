@@ -19,14 +19,15 @@ from sim_jax.crash import AIRBORNE
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.state import hover
 from sim_jax.vector import Vec3
-from tuner.coefficients.space import space_of
-from tuner.config import ControllerFile, JobFile, VehicleFile, read_vehicle
-from tuner.model import model_of, schedule_of
+from tuner.config import JobFile
+from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.search.fitted import Fitted
-from tuner.yaml_files.shipped import find_config
+from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle
+from tuner.vehicle.model import model_of, schedule_of
+from tuner.vehicle.space import space_of
 
 NOISE = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 4.0}
 SECONDS = 6.0

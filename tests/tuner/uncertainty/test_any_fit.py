@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from tuner.numerics import scaled_solve
+from tuner.core.numerics import scaled_solve
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import _shares
 from tuner.uncertainty.information import FisherInformation

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.errors import InputError
+from tuner.core.errors import InputError
 from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted

@@ -1,14 +1,14 @@
 import re
 from pathlib import Path
 
-import tuner.bench
+import tuner.ground
 import tuner.inertial
-from tuner.bench.bench_json import ExperimentRecord, RemarkRecord
+from tuner.ground.bench_json import ExperimentRecord, RemarkRecord
 from tuner.wording.bench import REMARKS, numbers_in_words, remarks_in_words
 
 
 def test_every_remark_has_a_sentence():
-    folders = [Path(package.__file__).parent for package in (tuner.bench, tuner.inertial)]
+    folders = [Path(package.__file__).parent for package in (tuner.ground, tuner.inertial)]
     sources = [path for folder in folders for path in folder.glob("*.py")]
     codes = {code for path in sources for code in re.findall(r'Remark\("(\w+)"', path.read_text())}
     assert codes == set(REMARKS)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tuner.findings import Code, Finding
+from tuner.core.findings import Code, Finding
 from tuner.wording.findings import one_line, remedy, sentence
 
 #: What each code's maker gives beside it.

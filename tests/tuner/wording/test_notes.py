@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from tuner.flights.notes import Note, NoteCode
+from tuner.recordings.notes import Note, NoteCode
 from tuner.wording.notes import PASSED_OVER, TEXTS, note_in_words
 
 NUMBERS = dict.fromkeys(

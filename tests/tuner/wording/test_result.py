@@ -4,10 +4,10 @@ import pytest
 
 from benchmarks.calibration import KINDS
 from tests.tuner.exporters.test_export import EFFECTIVE
-from tuner.coefficients import Written
 from tuner.result import PoseRmse
-from tuner.selection.table import SelectionCode, SelectionRow
+from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.uncertainty.calibration import LEVELS, Calibration, Held, calibration
+from tuner.vehicle import Written
 from tuner.wording.result import (
     calibration_in_words,
     effective_in_words,

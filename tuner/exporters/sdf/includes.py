@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.sdf.spans import Edit, Element, content, parse
 
 MERGED = "merged__"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.sdf.composite import IDENTITY, Inertial, Pose, pose_of
 from tuner.exporters.sdf.includes import MERGED, model_in
 from tuner.exporters.sdf.spans import Element, content, number, parse

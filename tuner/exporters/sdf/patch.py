@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from tuner.config import VehicleFile
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import Draft, Gate, differences, read_file
 from tuner.exporters.hover import rotor_speed
 from tuner.exporters.sdf import spans, tags
@@ -27,6 +26,7 @@ from tuner.exporters.simulators import (
     gz_unit,
     with_speeds_in,
 )
+from tuner.vehicle import VehicleFile
 
 #: Products of inertia below this part of the trace are taken as none.
 NO_PRODUCT = 1e-9

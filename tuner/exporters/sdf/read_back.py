@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from tuner.config import VehicleFile
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.sdf.composite import Array, Inertial, together
 from tuner.exporters.sdf.model import Model, inertials, read_model
 from tuner.exporters.sdf.spans import without_comments
@@ -21,6 +20,7 @@ from tuner.exporters.sdf.tags import (
     of_rotor,
     tags_in,
 )
+from tuner.vehicle import VehicleFile
 
 
 def values_in(text: str, path: Path, vehicle: VehicleFile) -> dict[str, float]:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from tuner.config import VehicleFile
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.read_back import values_in
 from tuner.exporters.simulators import GZ_SIM, Simulator, gz_unit, with_speeds_in
+from tuner.vehicle import VehicleFile
 
 TEMPLATE = Path(__file__).parent / "snippet.sdf.jinja"
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from tuner.coefficients import COEFFICIENTS, Written
-from tuner.config import VehicleFile, values_of, with_values
+from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 
 Parent = Literal["inertial", "inertia", "motor", "channel"]
 

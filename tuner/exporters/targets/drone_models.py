@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.config import VehicleFile
-from tuner.disk import file_name
+from tuner.core.disk import file_name
+from tuner.core.numerics import GRAVITY
+from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, Gate, differences, read_file
 from tuner.exporters.elsewhere import flier
 from tuner.exporters.hover import rotor_speed, thrust_at
 from tuner.exporters.simulators import DRONE_MODELS
 from tuner.exporters.target import Choices, Target
-from tuner.numerics import GRAVITY
-from tuner.yaml_files.document import commented
+from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
 

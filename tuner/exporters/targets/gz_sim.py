@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tuner.config import VehicleFile
 from tuner.exporters.draft import Draft
 from tuner.exporters.simulators import GZ_SIM
 from tuner.exporters.target import Choices, Target
 from tuner.exporters.targets.sdf import TARGET as SDF
+from tuner.vehicle import VehicleFile
 
 
 def _draft(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:

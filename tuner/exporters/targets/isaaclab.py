@@ -7,13 +7,13 @@ import math
 from pathlib import Path
 from typing import Any
 
-from tuner.config import VehicleFile
+from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.hover import hover_speed, rotor_speed, thrust_at
 from tuner.exporters.simulators import ISAAC_LAB
 from tuner.exporters.target import Choices, Target
 from tuner.exporters.targets.drone_models import flattened
-from tuner.yaml_files.document import commented
+from tuner.vehicle import VehicleFile
 
 TURN = 2 * math.pi
 """rad of a turn: Isaac Lab counts rotor speeds in turns per second."""

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tuner.coefficients import COEFFICIENTS, Written
-from tuner.config import VehicleFile, values_of
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.hover import full_thrust, hover_command, hover_speed, thrust_to_weight
 from tuner.exporters.target import Choices, Target
+from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of
 
 
 def json_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:

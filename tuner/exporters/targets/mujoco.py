@@ -11,13 +11,13 @@ import numpy as np
 from lxml import etree
 from numpy.typing import NDArray
 
-from tuner.config import VehicleFile
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.elsewhere import flier
 from tuner.exporters.hover import full_thrust, rotor_speed, thrust_at
 from tuner.exporters.simulators import MUJOCO, drag_at_hover
 from tuner.exporters.target import Choices, Target
+from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
 

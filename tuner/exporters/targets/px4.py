@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from tuner.config import VehicleFile
-from tuner.errors import ExportError
+from tuner.core.errors import ExportError
 from tuner.exporters.draft import Draft, Gate
 from tuner.exporters.hover import full_thrust, hover_command, hover_speed, rotor_speed
 from tuner.exporters.px4_parameters import (
@@ -29,6 +28,7 @@ from tuner.exporters.simulators import (
     gz_unit,
 )
 from tuner.exporters.target import Choices, Target
+from tuner.vehicle import VehicleFile
 
 #: To how many digits a file holds a number.
 DIGITS = 1e-8

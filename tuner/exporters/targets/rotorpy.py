@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.config import VehicleFile
+from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.elsewhere import flier
 from tuner.exporters.hover import rotor_speed
 from tuner.exporters.simulators import ROTORPY
 from tuner.exporters.target import Choices, Target
-from tuner.yaml_files.document import commented
+from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from tuner.config import VehicleFile
 from tuner.exporters.draft import Draft
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
 from tuner.exporters.sdf.snippet import snippet_draft
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import Choices, Target
+from tuner.vehicle import VehicleFile
 
 
 def sdf_or_snippet(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.coefficients import Written
-from tuner.config import VehicleFile, read_vehicle, vehicle_text
 from tuner.exporters.draft import Draft
 from tuner.exporters.target import Choices, Target
+from tuner.vehicle import VehicleFile, Written, read_vehicle, vehicle_text
 
 
 def yaml_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:

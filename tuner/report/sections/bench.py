@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.bench.bench_json import CurveRecord, ExperimentRecord
+from tuner.ground.bench_json import CurveRecord, ExperimentRecord
 from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section

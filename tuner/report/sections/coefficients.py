@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuner.coefficients import COEFFICIENTS
-from tuner.examination.sensitivity_json import CoefficientKnowledge
-from tuner.numerics import Z95
+from tuner.core.numerics import Z95
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.result import CoefficientResult
 from tuner.uncertainty.calibration import calibration
+from tuner.uncertainty.sensitivity_json import CoefficientKnowledge
 from tuner.uncertainty.verdict import ReasonCode, Verdict
+from tuner.vehicle import COEFFICIENTS
 from tuner.wording.result import calibration_in_words
 from tuner.wording.verdicts import (
     judgement_in_words,

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.examination.sensitivity_json import Knowledge, OutputSensitivity
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.uncertainty.sensitivity_json import Knowledge, OutputSensitivity
 
 FAINTEST = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""

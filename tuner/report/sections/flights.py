@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.flights.flight import Array
+from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,
     INITIAL,

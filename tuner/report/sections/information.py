@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tuner.examination.sensitivity_json import Knowledge
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section
+from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.wording.verdicts import direction_in_words
 
 NOTICED = 0.05

@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 
-from tuner.coefficients import COEFFICIENTS
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.uncertainty.sources import CONFLICT
+from tuner.vehicle import COEFFICIENTS
 from tuner.wording.findings import remedy, sentence
 from tuner.wording.phrases import percent
 from tuner.wording.proposals import next_log_in_words

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
-from tuner.coefficients.registry import at_mass
-from tuner.files import MAX_BYTES
+from tuner.core.files import MAX_BYTES
 from tuner.result import RMSE_UNITS, CoefficientResult, FlightResult, RunResult
 from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.store import Store
+from tuner.vehicle.registry import at_mass
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,10 @@ from pydantic import ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 
-from tuner.errors import ConfigError, InputError
+from tuner.core.errors import ConfigError, InputError
+from tuner.core.shipped import configs_folder
+from tuner.core.validation import config_error
+from tuner.core.yaml_document import read_yaml
 from tuner.report import summary
 from tuner.result import EXPORTS, RMSE_UNITS
 from tuner.service import jobs, recordings, tokens
@@ -34,9 +37,6 @@ from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render
 from tuner.service.web.words import on_the_web
-from tuner.validation import config_error
-from tuner.yaml_files.document import read_yaml
-from tuner.yaml_files.shipped import configs_folder
 
 web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -9,8 +9,8 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
-from tuner.flights.damage import Cause, Damage
-from tuner.flights.notes import Note
+from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Note
 from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso

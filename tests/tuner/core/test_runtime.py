@@ -1,0 +1,78 @@
+import gc
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from tuner.core import runtime
+
+REPORT = """
+import json, os
+{before}
+from tuner import runtime
+runtime.configure()
+import jax, jax.numpy as jnp
+print(json.dumps(dict(
+    dtype=str(jnp.zeros(2).dtype), nproc=os.environ["NPROC"],
+    cache=jax.config.jax_compilation_cache_dir,
+    answer=float(jnp.arange(4.0).sum()), line=runtime.describe(),
+)))
+"""
+
+
+def in_fresh_python(tmp_path: Path, before: str = "", **environment: str) -> dict[str, object]:
+    clean = {k: v for k, v in os.environ.items() if k not in {"NPROC", "XLA_FLAGS"}}
+    clean = {k: v for k, v in clean.items() if not k.startswith("JAX_")}
+    root = Path(runtime.__file__).parents[2]
+    clean |= {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT.format(before=before)],
+        env=clean | environment,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return json.loads(done.stdout)
+
+
+def test_one_thread_double_precision_and_a_kept_cache(tmp_path: Path) -> None:
+    report = in_fresh_python(tmp_path)
+    assert report["dtype"] == "float64"
+    assert report["nproc"] == "1"
+    assert report["answer"] == 6.0
+    assert any((tmp_path / "multirotor-tune" / "compiled").iterdir())
+    assert "NPROC=1" in str(report["line"])
+
+
+def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
+    report = in_fresh_python(
+        tmp_path,
+        NPROC="2",
+        JAX_ENABLE_X64="0",
+        JAX_COMPILATION_CACHE_DIR=str(tmp_path / "elsewhere"),
+    )
+    assert report["dtype"] == "float32"
+    assert report["nproc"] == "2"
+    assert report["cache"] == str(tmp_path / "elsewhere")
+
+
+def test_a_program_that_has_already_computed_goes_on(tmp_path: Path) -> None:
+    report = in_fresh_python(tmp_path, before="import jax.numpy as jnp; jnp.ones(3).sum()")
+    assert report["dtype"] == "float64"
+    assert report["answer"] == 6.0
+
+
+def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> None:
+    before = gc.get_threshold()
+    try:
+        gc.set_threshold(700, 10, 10)
+        runtime.collect_rarely()
+        rarely = gc.get_threshold()
+        assert rarely[0] > 10_000
+        gc.set_threshold(10 * rarely[0], 1, 1)
+        runtime.collect_rarely()
+        assert gc.get_threshold() == (10 * rarely[0], 1, 1)
+    finally:
+        gc.set_threshold(*before)

@@ -1,0 +1,176 @@
+"""Fits that noise alone is left of are not touched; when two fits contradict each other."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from tuner.config import JobFile
+from tuner.disturbances import estimation as disturbances
+from tuner.disturbances.disturbances import USUAL
+from tuner.disturbances.estimation import ROUGHLY, with_disturbances
+from tuner.disturbances.refit import STEPS
+from tuner.search.fitted import COLOURED, Fitted
+from tuner.search.problem import Job
+from tuner.terms.selection_state import Selected
+
+NOBODY = cast(Any, None)
+
+
+def fitted(scale: float) -> Fitted:
+    return Fitted(
+        objective=NOBODY,
+        point=NOBODY,
+        criterion=NOBODY,
+        noise={},
+        scales={"circle": {"position": 1.0, "command": scale}},
+        iterations=(),
+        outcomes=(),
+        method="gradient",
+        evaluations=0,
+        wall_time=0.0,
+        loss_best=1.0,
+        converged=True,
+    )
+
+
+@pytest.mark.parametrize(
+    ("fit", "asked"),
+    [
+        (fitted(1.05), "follow"),
+        (replace(fitted(2.0 * COLOURED), polished=False), "follow"),
+        (fitted(2.0 * COLOURED), "none"),
+        (fitted(2.0 * COLOURED), "auto"),
+    ],
+    ids=["nothing but noise is left", "the search is not at its end", "not asked for", "no terms"],
+)
+def test_nothing_is_fitted_again_without_need(fit: Fitted, asked: str) -> None:
+    said: list[str] = []
+    settings = SimpleNamespace(job=JobFile(disturbances=asked, terms="none"))
+    job = cast(Job, SimpleNamespace(settings=settings))
+    assert with_disturbances(Selected(job, fit), lambda *_: None, said.append) is None
+    assert said == []
+
+
+@pytest.mark.parametrize(("gains", "says"), [(501, True), (500, False)])
+def test_flights_whose_gains_would_not_fit_are_left_to_the_intervals(monkeypatch, gains, says):
+    full = SimpleNamespace(objective=SimpleNamespace(memory=1000), point=NOBODY)
+    predictor = SimpleNamespace(memory=gains)
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    job = cast(
+        Job,
+        SimpleNamespace(settings=SimpleNamespace(job=JobFile(disturbances="follow")), fitted=()),
+    )
+    said: list[str] = []
+    with nullcontext() if says else pytest.raises(AttributeError):  # goes on with what lacks
+        selected = Selected(job, fitted(2.0 * COLOURED))
+        found = with_disturbances(selected, lambda *_: None, said.append)
+        assert found is None
+    assert ("What pushed the flights is not followed" in said[0]) == says
+
+
+@pytest.mark.parametrize(
+    ("moved", "errors", "agrees"),
+    [
+        (3.9, (1.0, 0.1), True),
+        (4.2, (1.0, 0.1), False),
+        (20.0, (1.0, 10.0), True),
+        (50.0, (1.0, 10.0), False),
+    ],
+    ids=["within chance", "beyond", "hardly told by set-points", "beyond that"],
+)
+def test_two_fits_contradict_each_other_by_the_errors_of_both(moved, errors, agrees):
+    old, new = (
+        cast(Any, SimpleNamespace(estimates={"drag": SimpleNamespace(value=at, std_error=error)}))
+        for at, error in zip((0.0, moved), errors, strict=True)
+    )
+    new.estimates["freed"] = SimpleNamespace(value=1e9, std_error=1.0)
+    assert disturbances._agree(new, old) == agrees
+
+
+@pytest.mark.parametrize(
+    ("called_for", "descents"),
+    [
+        ([None, None], [ROUGHLY, STEPS]),
+        (["drag", None], [ROUGHLY, STEPS]),
+        ([None, "drag", None], [ROUGHLY, STEPS, STEPS]),
+        (["drag", "battery", "inflow", "more"], [ROUGHLY, STEPS, STEPS, STEPS]),
+    ],
+    ids=["nothing", "at once", "later", "again and again"],
+)
+def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_for, descents):
+    """What is missing would be taken for disturbances by a descent to its end."""
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    predictor = SimpleNamespace(memory=0, keeps_track=False)
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=()))
+    begin = Selected(job, fitted(2.0 * COLOURED))
+    taken, within, asked = [], [], iter(called_for)
+
+    def descended(selected: Selected, there: Fitted, own: Any, steps: int = STEPS) -> Any:
+        taken.append(steps)
+        within.append([row.group for row in selected.rows])
+        return there, own
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        def selection(had: Any, *, first: bool) -> Selected | None:
+            assert first == (len(taken) == 1)
+            assert not had
+            group = next(asked)
+            row = SimpleNamespace(group=group, kept=True)
+            return replace(selected, rows=(*selected.rows, row)) if group else None
+
+        return SimpleNamespace(selected=selected, selection=selection)
+
+    monkeypatch.setattr(disturbances, "_descended", descended)
+    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    assert with_disturbances(begin, lambda *_: None, lambda _: None) is None  # keeps no track
+    assert taken == descents
+    assert within[-1] == [group for group in called_for[: len(descents) - 1] if group]
+
+
+@pytest.mark.parametrize(("group", "titles"), [("angular_drag", 2), ("fuselage_drag", 1)])
+def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, group, titles):
+    """What stood in for other terms made another model of it: it cannot contradict this one."""
+    full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
+    predictor = SimpleNamespace(memory=0, keeps_track=True, strengths=USUAL)
+    settings = SimpleNamespace(job=JobFile(disturbances="follow"))
+    job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
+    row = SimpleNamespace(group=group, kept=True)
+    begin = Selected(job, fitted(2.0 * COLOURED), (cast(Any, row),))
+    polished, examined, chosen = [], [], iter([replace(begin, rows=()), None])
+
+    def seen(selected: Selected, *_: Any) -> Any:
+        return SimpleNamespace(
+            selected=selected, selection=lambda *_, **__: next(chosen), in_doubt=dict
+        )
+
+    def polish(_: Job, fit: Fitted, *, title: str, **__: Any) -> Fitted:
+        polished.append(title)
+        return replace(fit, wall_time=float(len(polished)))
+
+    def examine(fit: Fitted, **_: Any) -> Any:
+        examined.append(fit)
+        return SimpleNamespace(uncertainty=NOBODY)
+
+    monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
+    monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
+    monkeypatch.setattr(disturbances, "_descended", lambda _, there, own, **__: (there, own))
+    monkeypatch.setattr(disturbances.Innovations, "of", seen)
+    monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
+    monkeypatch.setattr(disturbances, "polished", polish)
+    monkeypatch.setattr(disturbances, "alternatives_of", lambda *_: {})
+    monkeypatch.setattr(disturbances, "examine", examine)
+    monkeypatch.setattr(disturbances, "_agree", lambda *_: True)
+    monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)
+    assert with_disturbances(begin, lambda *_: None, lambda _: None) is not None
+    assert polished == ["clocks", "simulated"][:titles]
+    assert (examined[-1] is begin.fitted) == (titles == 1)

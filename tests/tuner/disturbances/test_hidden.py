@@ -1,0 +1,80 @@
+"""What set-points hide is known as well as least squares knew it beside all the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
+from tuner.disturbances.information import hidden, with_hidden, with_strengths
+from tuner.uncertainty.estimates import _shares
+from tuner.uncertainty.information import FisherInformation
+
+NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
+FITTED, HIDDEN = 3, 1
+"""The last one is fixed: what is known of it does not count."""
+
+
+def looped() -> FisherInformation:
+    """Return the information of two channels, three flights and four stretches."""
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((2, 3, 4, 30, len(NAMES)))
+    return FisherInformation(
+        channels=("position", "body_rate"),
+        flight=np.arange(3),
+        blocks=np.einsum("cfbnp,cfbnq->cfbpq", rows, rows),
+        score=rng.standard_normal((2, 3, 4, len(NAMES))),
+        spread=np.ones((2, 3)),
+        nuisance_prior=np.zeros((len(NAMES), len(NAMES))),
+        prior=np.eye(len(NAMES)) * 0.1,
+        crashed=np.zeros(3, bool),
+        begins=np.zeros(3),
+        scale=np.ones((2, 3)),
+    )
+
+
+def predicted() -> FisherInformation:
+    """Return what innovations say: ten times as much, of the hidden one nothing."""
+    found, sees = looped(), np.arange(len(NAMES)) != HIDDEN
+    return replace(
+        found, blocks=10.0 * found.blocks * np.outer(sees, sees), score=found.score * sees
+    )
+
+
+def test_its_error_is_that_of_least_squares_with_all_others_free():
+    joined = with_hidden(predicted(), looped(), NAMES, FITTED)
+    own = np.linalg.inv(joined.total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
+    beside = np.linalg.inv(looped().total[:FITTED, :FITTED])[HIDDEN, HIDDEN]
+    # the prior of the others counts for a little of what they leave
+    np.testing.assert_allclose(own, beside, rtol=0.01)
+
+
+def test_what_innovations_say_of_the_others_stays():
+    joined, others = with_hidden(predicted(), looped(), NAMES, FITTED), [0, 2, 3]
+    np.testing.assert_array_equal(
+        joined.blocks[..., others, :][..., others], predicted().blocks[..., others, :][..., others]
+    )
+    np.testing.assert_array_equal(joined.blocks[..., HIDDEN, others], 0.0)
+    np.testing.assert_array_equal(joined.score[..., others], predicted().score[..., others])
+
+
+def test_how_high_markers_sit_is_told_by_the_loop_alone():
+    names = ("inertia_xx", "estimate_latency", "marker_offset_x", "marker_offset_z")
+    assert hidden(names).tolist() == [False, True, False, True]
+
+
+def test_what_strengths_take_is_taken_from_the_flights_and_shares_still_add_up() -> None:
+    """Nothing of it counts as the priors'."""
+    random, said = np.random.default_rng(1), looped()
+    across = {name: 5.0 * random.standard_normal((3, len(NAMES))) for name in STRENGTHS}
+    learnt = with_strengths(
+        replace(said, changes=across), 100.0 * np.eye(len(STRENGTHS)), 0.5 * (LEAST + MOST)
+    )
+    assert not learnt.changes
+    error, wider = (np.sqrt(np.diag(np.linalg.inv(i.total))) for i in (said, learnt))
+    assert (wider > error).all()
+    assert (np.linalg.eigvalsh(learnt.prior + learnt.nuisance_prior) > 0.0).all()
+    flights, priors = _shares(learnt, 3)
+    np.testing.assert_allclose(flights.sum(axis=(0, 1)) + priors, 1.0)
+    assert (priors > 0.0).all()

@@ -1,0 +1,360 @@
+"""Two gusty flights: the gust is learnt, the fit sharper than least squares, and honest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sim_jax.crash import Limits
+from sim_jax.rollout import rollout
+from tests.tuner.uncertainty import making
+from tuner.disturbances.disturbances import (
+    COMMAND_NOISE,
+    COUNT,
+    LEAST,
+    MOST,
+    USUAL,
+    disturbance_of,
+    processes_of,
+    within,
+)
+from tuner.disturbances.disturbances import STRENGTHS as NAMED
+from tuner.disturbances.extended_kalman_filter import GATE
+from tuner.disturbances.information import USUALLY, with_strengths
+from tuner.disturbances.observer import Observer
+from tuner.disturbances.predictor import Predictor, likelihood_of, unscaled
+from tuner.disturbances.refit import _equations, with_least_innovations
+from tuner.disturbances.strengths import Likelihood, slopes_of, steps_from
+from tuner.objective.alternatives import STEP, alternatives_of
+from tuner.objective.criterion import Point
+from tuner.objective.flight import beginning_of, trace_of
+from tuner.objective.normal import Objective
+from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.uncertainty.covariance import covariance_of
+from tuner.uncertainty.examination import examine
+from tuner.uncertainty.information import information_at, information_from_jacobian
+
+pytestmark = [pytest.mark.slow, pytest.mark.long]
+
+FREE = ("inertia_xx", "inertia_yy", "time_constant_up", "motor_constant", "rotor_drag_coefficient")
+STRENGTHS = np.log([0.004, 1e-4, 1e-4, 0.004, 1.0, 0.03, 1.0])
+NOISE = {**making.NOISE, "command": 3e-4}
+OFFSETS = np.zeros((5, 2), bool)
+
+
+@eqx.filter_jit
+def flown(objective: Objective, pushes: jax.Array):
+    """Fly a problem at its truth, pushed by the processes' values (D, ticks, F)."""
+    model, segments, schedule = objective.model, objective.segments, objective.schedule
+    start, inlet, around = beginning_of(model, segments, schedule)
+    pushing = disturbance_of(pushes)
+    pushing = jax.tree.map(lambda leaf: leaf[0], pushing)  # their own axis of time for the ticks
+    flight = rollout(
+        model.vehicle,
+        model.controller,
+        schedule,
+        inlet,
+        start,
+        samples=objective.samples,
+        environment=replace(around, disturbance=pushing),
+        limits=objective.limits,
+    )
+    return trace_of(flight, model, segments).channels, flight.log.setpoints
+
+
+def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:
+    """Return the problem and its flights with gusts, turbulence and measurement noise."""
+    rng, rate = np.random.default_rng(seed), 100.0
+    processes = processes_of(exact.model.vehicle, jnp.asarray(STRENGTHS), rate)
+    ticks = round(making.SECONDS * rate) + 2
+    pushes = np.zeros((COUNT, ticks, 2))
+    pushes[:, 0] = np.asarray(processes.sd)[:, None] * rng.standard_normal((COUNT, 2))
+    for tick in range(1, ticks):
+        fresh = np.sqrt(processes.added)[:, None] * rng.standard_normal((COUNT, 2))
+        pushes[:, tick] = np.asarray(processes.keeps)[:, None] * pushes[:, tick - 1] + fresh
+    pushes *= np.asarray(processes.acts)[:, None, None]
+    channels, setpoints = flown(exact, jnp.asarray(pushes))
+    every, measured = making.SAMPLE_EVERY, {}
+    for channel, old in exact.segments.measured.items():
+        values = np.asarray(channels[channel])[every : exact.samples - 1 : every]
+        noise = rng.standard_normal(values.shape) * NOISE[channel]
+        if channel == "attitude":
+            noise[:, 0] *= 0.0
+            noise /= 2.0  # of small turns about nearly level axes
+        measured[channel] = replace(old, values=jnp.asarray(values + noise))
+    per_tick = exact.schedule.log_rate // exact.schedule.position_control_rate
+    stamps = np.arange(0, exact.samples, per_tick) / exact.schedule.log_rate
+    unknown = np.full(4, np.nan)
+    initial = InitialState(np.zeros(3), np.zeros(3), np.eye(4)[0], np.zeros(3), unknown, unknown)
+    flights = []
+    for number, name in enumerate(making.FLIGHTS):
+        rates = np.asarray(setpoints.rate.stacked())[:, ::per_tick, number].T
+        thrust = np.asarray(setpoints.thrust)[::per_tick, number, None]
+        series = {
+            "rate_setpoint": Series(stamps, rates),
+            "thrust_setpoint": Series(stamps, thrust),
+        }
+        flights.append(Flight(name, "", "", 100.0, stamps, {}, series, initial))
+    return eqx.tree_at(lambda o: o.segments.measured, exact, measured), flights
+
+
+@pytest.fixture(scope="module")
+def exact() -> Objective:
+    return making.problem(FREE)
+
+
+@pytest.fixture(scope="module")
+def fitted(exact: Objective) -> tuple[Objective, Predictor, Point]:
+    """A gusty pair, and where its innovations are least."""
+    problem, flights = gusty(exact, 1)
+    truth = making.truth(exact)
+    criterion = making.fitted_of(problem, truth).criterion
+    moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
+    predictor = Predictor.of(problem, truth, flights)
+    assert predictor is not None
+    return problem, *with_least_innovations(predictor, flights, (problem, truth, criterion), moves)
+
+
+def test_what_is_learnt_of_the_disturbances_is_what_pushed(fitted) -> None:
+    _, predictor, _ = fitted
+    gust = np.exp(predictor.strengths[0] - STRENGTHS[0])
+    assert 1.0 / 3.0 < gust < 3.0  # of twelve seconds, in which gusts last one
+    turbulence = np.exp(predictor.strengths[3] - STRENGTHS[3])
+    assert turbulence == pytest.approx(1.0, abs=0.15)  # 0.75 where it begins
+
+
+def test_the_fit_is_sharper_than_least_squares_and_its_errors_hold_the_truth(fitted, exact) -> None:
+    problem, predictor, point = fitted
+    criterion = making.fitted_of(problem, point).criterion
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    plain = covariance_of(information_at(problem, point, criterion, offsets_fitted=OFFSETS)).error
+    assert np.median(error / plain) < 0.6
+    space = exact.space
+    missed = (np.asarray(point.coefficients) - space.initial) * space.slope(space.initial)
+    assert (np.abs(missed) < 3.5 * error).all()
+
+
+def test_errors_are_those_of_coefficients_and_strengths_that_are_learnt_together(fitted) -> None:
+    problem, predictor, point = fitted
+    slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
+    fixed = predictor.information(problem, point, criterion)
+    moving = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
+    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    assert learnt.changes.keys() == fixed.changes.keys()
+    alone, together = (np.linalg.inv(found.total) for found in (fixed, learnt))
+    free = np.flatnonzero((predictor.strengths > LEAST) & (predictor.strengths < MOST))
+    across = np.array([moving.changes[name].sum(axis=0) for name in NAMED])[free]
+    own = slopes.information[np.ix_(free, free)] + np.eye(len(free)) / USUALLY**2
+    both = np.linalg.inv(np.block([[fixed.total, across.T], [across, own]]))
+    np.testing.assert_allclose(together, both[: len(FREE), : len(FREE)], rtol=1e-6)
+    wider = np.sqrt(np.diag(together) / np.diag(alone))
+    assert (wider >= 1.0).all()
+    assert wider.max() > 1.001  # 1.2 of inertias where commands were recorded, too
+
+
+def test_a_strength_is_taken_for_what_moves_innovations(fitted) -> None:
+    """What innovations say of a coefficient and a strength together is what the fit steps by."""
+    problem, predictor, point = fitted
+    slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
+    information = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
+    across = np.array([information.changes[name].sum(axis=0) for name in NAMED])
+    hessian = _equations(predictor, problem, point, unscaled(criterion), range(len(FREE))).hessian[
+        -len(NAMED) :, : len(FREE)
+    ]
+    expected = hessian / problem.space.slope(np.asarray(point.coefficients))
+    np.testing.assert_allclose(across, expected, atol=1e-6 * np.abs(expected).max())
+
+
+def test_an_examination_counts_that_strengths_are_learnt_of_all_flights_together(fitted) -> None:
+    problem, predictor, point = fitted
+    fit = making.fitted_of(problem, point)
+    in_turns = examine(
+        making.fitted_of(replace(problem, memory=1), point), predictor=predictor
+    ).information
+    at_once = examine(fit, predictor=predictor).information
+    slopes = predictor.slopes(problem, point)
+    moving = predictor.information(problem, point, fit.criterion, by_strengths=slopes.moved)
+    learnt = with_strengths(moving, slopes.information, predictor.strengths)
+    lost = learnt.lost
+    for found in (at_once, in_turns):
+        known = found.lost[: len(FREE), : len(FREE)]
+        # differences of what filters of other programs made, in single precision
+        np.testing.assert_allclose(known, lost, atol=5e-3 * np.abs(lost).max())
+    assert np.linalg.eigvalsh(lost).max() > 0.0
+
+
+def test_from_far_off_it_ends_in_the_same_place(fitted, exact) -> None:
+    """Where coefficients and disturbances explain each other's innovations, both have to move."""
+    problem, predictor, point = fitted
+    flights = gusty(exact, 1)[1]
+    criterion = making.fitted_of(problem, point).criterion
+    vector, free = np.array(point.coefficients), np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
+    wrong = {"inertia_xx": 1.15, "inertia_yy": 1.2, "time_constant_up": 1.8}
+    for name, factor in wrong.items():
+        vector[exact.space.names.index(name)] *= factor
+    begin = replace(predictor, strengths=USUAL + np.log([2.0, 3.0, 0.3, 4.0, 1.0, 3.0, 1.0]))
+    where = Point(jnp.asarray(vector), point.offsets)
+    again, there = with_least_innovations(begin, flights, (problem, where, criterion), free)
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    slope = exact.space.slope(np.asarray(point.coefficients))
+    moved = (np.asarray(there.coefficients) - np.asarray(point.coefficients)) * slope
+    assert (np.abs(moved) < 0.5 * error).all()
+    assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=0.5)
+
+
+def test_disturbances_that_are_taken_for_five_times_too_strong_are_given_up_in_four_steps(
+    fitted, exact
+) -> None:
+    """Fisher's information alone says how far: with the slope added to it eight were needed."""
+    problem, predictor, point = fitted
+    criterion = making.fitted_of(problem, point).criterion
+    stronger = np.log([5.0, 5.0, 5.0, 5.0, 1.0, 1.0, 1.0])
+    begin = replace(predictor, strengths=within(predictor.strengths + stronger))
+    free = np.concatenate([np.ones(5, bool), OFFSETS.ravel()])
+    again, _ = with_least_innovations(
+        begin, gusty(exact, 1)[1], (problem, point, criterion), free, steps=4
+    )
+    assert again.found.loss.sum() == pytest.approx(predictor.found.loss.sum(), abs=2.0)
+
+
+def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitted) -> None:
+    problem, predictor, point = fitted
+    ticks = predictor.ticks
+
+    def alone(strengths: np.ndarray) -> Likelihood:
+        return likelihood_of(
+            replace(predictor, strengths=strengths).at(problem, point).found, ticks
+        )
+
+    steps = steps_from(predictor.strengths)
+    beside = [alone(predictor.strengths + step) for step in np.diag(steps)]
+    slope, information, moved = slopes_of(alone(predictor.strengths), beside, steps)
+    found = predictor.slopes(problem, point)
+    most = information.max()  # of commands, of which none were recorded, there is none
+    np.testing.assert_allclose(found.slope, slope, atol=1e-6 * np.sqrt(most))
+    np.testing.assert_allclose(found.information, information, atol=1e-6 * most)
+    moved = np.moveaxis(moved.reshape(7, ticks, -1, moved.shape[-1]), -1, 2)
+    np.testing.assert_allclose(found.moved, moved, atol=1e-5 * np.abs(moved).max())
+
+
+def test_noise_that_a_wrong_beginning_took_for_more_is_taken_back(fitted) -> None:
+    problem, predictor, point = fitted
+    noisy = replace(predictor, noise=dict.fromkeys(predictor.noise, 1.3)).at(problem, point)
+    assert all(noise == 1.0 for noise in noisy.as_noisy(problem, point).noise.values())
+
+
+@pytest.mark.parametrize("claimed", [2.0, 0.7])
+def test_how_noisy_commands_are_is_learnt_whatever_is_claimed(exact, claimed) -> None:
+    """Taken for a quarter noisier than they are, commands bend inertias by their errors."""
+    others = exact.segments.measured["rotor_speed"]
+    commands = replace(others, weight=0.0 * others.weight + 1.0 / (claimed * NOISE["command"]))
+    measured = {**exact.segments.measured, "command": commands}
+    problem, flights = gusty(replace(exact, segments=replace(exact.segments, measured=measured)), 2)
+    truth = making.truth(exact)
+    criterion = making.fitted_of(problem, truth).criterion
+    predictor = Predictor.of(problem, truth, flights)
+    assert predictor is not None
+    moves = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
+    predictor, point = with_least_innovations(
+        predictor, flights, (problem, truth, criterion), moves
+    )
+    noise = claimed * np.exp(predictor.strengths[COMMAND_NOISE])
+    assert noise == pytest.approx(1.0, abs=0.1)
+    told = predictor.jacobian(problem, point, range(len(FREE)))
+    error = covariance_of(
+        information_from_jacobian(problem, point, unscaled(criterion), told, offsets_fitted=OFFSETS)
+    ).error
+    away = problem.space.scaled(point.coefficients) - problem.space.scaled(truth.coefficients)
+    assert np.abs(np.asarray(away) / error).max() < 3.0
+
+
+def test_what_was_not_sampled_is_as_likely_with_any_noise(fitted) -> None:
+    problem, predictor, point = fitted
+    sample = predictor.feed.samples["rotor_speed"]
+    without = eqx.tree_at(
+        lambda f: f.samples["rotor_speed"].weight, predictor.feed, jnp.zeros_like(sample.weight)
+    )
+    losses = [
+        float(replace(predictor, feed=without, noise=noise).at(problem, point).found.loss.sum())
+        for noise in (predictor.noise, {**predictor.noise, "rotor_speed": 3.0})
+    ]
+    assert losses[0] == pytest.approx(losses[1])
+
+
+def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
+    """A simulation would end there: the state frozen, and all samples that follow lost."""
+    problem, predictor, point = fitted
+    strict = replace(predictor.simulator, limits=Limits(floor=5.0))  # above what is flown
+    expected = predictor._expected(problem, point)
+    model = expected.tunable.at(expected.coefficients)
+    observer, state = Observer.of(strict, predictor.feed, model, expected.strengths)
+    after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
+    assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
+
+
+def test_a_sample_at_a_tick_tells_as_much_just_before_it_as_just_after(fitted) -> None:
+    """Samples lie on ticks here: a clock's hair's breadth must not put them out of use."""
+    problem, predictor, point = fitted
+    flights = gusty(problem, 1)[1]
+    losses = []
+    for late in (-1e-3, 1e-3):  # of 10 ms: a five-hundredth of a tick
+        moved = Point(point.coefficients, jnp.full_like(point.offsets, late).at[2:].set(0.0))
+        laid = Predictor.of(problem, moved, flights)
+        assert laid is not None
+        laid = replace(laid, strengths=predictor.strengths, noise=predictor.noise)
+        losses.append(np.sum(np.asarray(laid.at(problem, moved).found.loss)))
+    assert abs(losses[0] - losses[1]) < 5.0
+
+
+def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has_them(
+    fitted,
+) -> None:
+    problem, predictor, point = fitted
+    late = eqx.tree_at(
+        lambda o: o.model.vehicle.setup.actuator_latency, problem, jnp.asarray(0.007)
+    )  # two commands on their way, three in finer steps
+    finer = alternatives_of(late, point)[STEP]
+    predictor = replace(predictor, simulator=late.simulator).at(late, point)
+    own = Predictor.of(finer, point, gusty(problem, 1)[1])
+    assert own is not None
+    own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
+    stepped = predictor._stepped(finer, point)
+    here, there = (np.asarray(of.found.gains.gain) for of in (stepped, own))
+    expected = there[:, :, -COUNT - 12 : -COUNT]
+    on_their_way = here[:, :, -COUNT - 16 : -COUNT - 4] - expected
+    assert np.std(on_their_way) < 0.01 * np.std(expected)
+    coarse = predictor.jacobian(late, point, []).residuals
+    found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))
+    for channel in ("position", "attitude"):  # the others hardly change: rates are fed in
+        change = np.std(expected[channel] - coarse[channel])
+        assert np.std(found[channel] - expected[channel]) < 0.5 * change
+
+
+def test_one_outlier_is_not_believed_and_many_in_a_row_are(fitted) -> None:
+    """Markers that are moved by a metre, for a sample and for good."""
+    problem, predictor, point = fitted
+    sampled = predictor.feed.samples["position"]
+    ticks = np.flatnonzero(np.asarray(sampled.weight)[:, 0, 0])
+
+    def sizes(moved: np.ndarray) -> np.ndarray:
+        values = sampled.values.at[moved, 1, 0].add(1.0)
+        feed = eqx.tree_at(lambda f: f.samples["position"].values, predictor.feed, values)
+        found = replace(predictor, feed=feed).at(problem, point).found
+        return np.abs(np.asarray(found.white)[ticks, 1, 0])
+
+    middle = len(ticks) // 2
+    once, for_good = sizes(ticks[middle : middle + 1]), sizes(ticks[middle:])
+    assert min(once[middle], for_good[middle]) > 50.0
+    assert (np.delete(once, middle) < GATE).all()
+    assert (for_good[-50:] < GATE).all()  # of 150, as long as it takes to unlearn a velocity

@@ -1,0 +1,238 @@
+"""Innovations call for terms that are there, let go of those that are not, and doubt the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty import making
+from tuner.config import JobFile
+from tuner.disturbances import term_selection as innovations
+from tuner.disturbances.term_selection import Innovations
+from tuner.search.fitted import Fitted
+from tuner.search.problem import Job
+from tuner.terms.candidates import Groups, start_of
+from tuner.terms.linear import linear_of
+from tuner.terms.selection_state import Selected
+from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.uncertainty.information import FisherInformation
+from tuner.vehicle import COEFFICIENTS, term_groups
+from tuner.vehicle.space import Space, extended, space_of
+
+NOBODY = cast(Any, None)
+MODEL = ("inertia_xx", "estimate_latency")
+USUAL = {
+    "fuselage_drag": COEFFICIENTS["fuselage_drag"].prior_sd,
+    "thrust_inflow_coefficient": COEFFICIENTS["thrust_inflow_coefficient"].prior_sd,
+}
+STEPS, STRETCHES, FLIGHTS = 50, 40, 4
+TOLD = 10.0
+"""By how many of a row's noise a usual coefficient moves a row."""
+
+
+def wide_space(names: Sequence[str]) -> Space:
+    """Return the space of a model's coefficients, and of those of terms at neutral values."""
+    space = space_of(making.vehicle_file(), making.controller_file(), JobFile(free=MODEL))
+    return extended(space, tuple(names), JobFile(), start_of(names))
+
+
+def information(
+    space: Space, truth: Mapping[str, float], *, alike: Mapping[str, str], seed: int = 3
+) -> FisherInformation:
+    """Return what the rows of four flights say; ``truth`` in usual sizes from the point.
+
+    Each coefficient has a direction of its own, but for those that are alike; latencies none.
+    """
+    rng, count = np.random.default_rng(seed), len(space)
+    unit = {name: rng.standard_normal((FLIGHTS, STRETCHES, STEPS)) for name in space.names}
+    for name, other in alike.items():
+        unit[name] = 0.9 * unit[other] + np.sqrt(1.0 - 0.9**2) * unit[name]
+    seen = np.array([name != "estimate_latency" for name in space.names])
+    rows = np.stack([unit[name] for name in space.names], axis=-1) * seen
+    rows = rows * (0.1 * TOLD / space.prior_sd)
+    moved = np.array([truth.get(name, 0.0) for name in space.names]) * space.prior_sd
+    noise = rng.standard_normal(rows.shape[:3])
+    errors = noise - rows @ moved
+    return FisherInformation(
+        channels=("position",),
+        flight=np.arange(FLIGHTS),
+        blocks=np.einsum("fbnp,fbnq->fbpq", rows, rows)[None],
+        score=np.einsum("fbnp,fbn->fbp", rows, errors)[None],
+        spread=np.ones((1, FLIGHTS)),
+        nuisance_prior=np.zeros((count, count)),
+        prior=np.diag(space.prior_sd**-2.0),
+        crashed=np.zeros(FLIGHTS, bool),
+        begins=np.zeros(FLIGHTS),
+        scale=np.ones((1, FLIGHTS)),
+    )
+
+
+def row(group: str, reason: SelectionCode, *, kept: bool = False) -> SelectionRow:
+    return SelectionRow(group=group, names=term_groups()[group], kept=kept, reason=reason)
+
+
+def seen(
+    rows: Sequence[SelectionRow],
+    truth: Mapping[str, float],
+    alike: Mapping[str, str] | None = None,
+    *,
+    in_doubt: Mapping[str, float] | None = None,
+) -> Innovations:
+    """Return innovations of a fit of a model and the rows that are kept."""
+    kept = [name for r in rows if r.kept for name in r.names]
+    space = wide_space([*kept, *(name for r in rows if not r.kept for name in r.names)])
+    vector = space.initial
+    scaled = np.asarray(space.scaled(vector))
+    said = information(space, truth, alike=alike or {})
+    loss = 0.5 * FLIGHTS * STRETCHES * STEPS
+    fitted = cast(
+        Fitted,
+        SimpleNamespace(objective=SimpleNamespace(space=wide_space(kept)), held={}, findings=()),
+    )
+    base = (NOBODY, NOBODY)
+    selected = Selected(cast(Job, NOBODY), fitted, tuple(rows), in_doubt or {}, base)
+    linear = linear_of(said, scaled, scaled, loss)
+    return Innovations(selected, fitted, space, vector, linear)
+
+
+@pytest.fixture
+def chosen(monkeypatch: pytest.MonkeyPatch):
+    """Return what says which groups are chosen, and their numbers; None where nothing changes."""
+    found: dict[str, Any] = {}
+
+    def with_groups(
+        _: object, groups: Groups, fitted: object, vector: Mapping[str, float], **__: object
+    ) -> tuple[object, object]:
+        found.update(groups=groups, vector=vector)
+        return NOBODY, fitted
+
+    monkeypatch.setattr(innovations, "with_groups", with_groups)
+    monkeypatch.setattr(innovations, "findings_at", lambda *_: ())
+
+    def choose(
+        innovation: Innovations, had: Sequence[str] = (), *, first: bool = False
+    ) -> tuple[Selected, dict[str, Any]] | None:
+        selected = innovation.selection(had, first=first)
+        return None if selected is None else (selected, found)
+
+    return choose
+
+
+DRAG = row("fuselage_drag", SelectionCode.NOT_SIGNIFICANT)
+INFLOW = row("thrust_inflow", SelectionCode.IMMATERIAL)
+FLAPPING = row("flapping_moment", SelectionCode.NOT_PREDICTED)
+
+
+def test_a_term_that_least_squares_missed_is_called_for(chosen) -> None:
+    rows = [DRAG, INFLOW, FLAPPING]
+    innovation = seen(rows, {"fuselage_drag": 0.5})
+    selected, found = chosen(innovation)
+    assert set(found["groups"]) == {"fuselage_drag"}
+    assert [r.kept for r in selected.rows] == [True, False, False]
+    assert selected.rows[0].reason is SelectionCode.PREDICTS_SAMPLES
+    assert selected.left_out == (INFLOW.names, FLAPPING.names)
+    numbers = innovation.space.values(
+        np.array([found["vector"][name] for name in innovation.space.names])
+    )
+    assert float(numbers["fuselage_drag"]) == pytest.approx(0.5 * USUAL["fuselage_drag"], rel=0.05)
+
+
+def test_chance_calls_for_nothing(chosen) -> None:
+    assert chosen(seen([DRAG, INFLOW, FLAPPING], {})) is None
+
+
+def test_a_term_as_good_as_absent_is_not_worth_a_coefficient(chosen) -> None:
+    """However surely it is told: two simulators of a vehicle differ by as much."""
+    assert chosen(seen([DRAG], {"fuselage_drag": 0.05})) is None
+
+
+def test_a_term_that_stood_in_for_another_goes_as_that_one_comes(chosen) -> None:
+    there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
+    innovation = seen(
+        [there, INFLOW],
+        {"thrust_inflow_coefficient": 0.5, "angular_drag_x": 0.0},
+        {"angular_drag_x": "thrust_inflow_coefficient"},
+    )
+    selected, found = chosen(innovation)
+    assert set(found["groups"]) == {"thrust_inflow"}
+    assert [(r.group, r.reason) for r in selected.rows] == [
+        ("thrust_inflow", SelectionCode.PREDICTS_SAMPLES),
+        ("angular_drag", SelectionCode.NOT_SIGNIFICANT),
+    ]
+
+
+def test_what_least_squares_let_stand_in_goes_first_and_comes_back_where_nothing_else_does(
+    chosen,
+) -> None:
+    """Gusts pass for it, and from there what it stands in for looks as if it were not there."""
+    truth, had = {"angular_drag_x": 0.5}, ["angular_drag"]
+    there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
+    assert chosen(seen([there, INFLOW], truth), had) is None  # it stays where it was judged before
+    selected, found = chosen(seen([there, INFLOW], truth), had, first=True)
+    assert not found["groups"]
+    assert not any(r.kept for r in selected.rows)
+    gone = row("angular_drag", SelectionCode.NOT_SIGNIFICANT)
+    _, found = chosen(seen([gone, INFLOW], truth), had)
+    assert set(found["groups"]) == {"angular_drag"}
+    assert chosen(seen([gone, INFLOW], truth), ()) is None
+
+
+def test_others_are_judged_as_if_what_stood_in_were_not_there(chosen) -> None:
+    """A fit with it leaves nothing for another to do that does the same."""
+    there = row("angular_drag", SelectionCode.SIGNIFICANT, kept=True)
+    innovation = seen(
+        [there, INFLOW],
+        {},
+        {"angular_drag_x": "thrust_inflow_coefficient"},
+    )
+    moved = innovation.linear.scaled.copy()
+    moved[list(innovation.space.names).index("angular_drag_x")] = (
+        2.0 * COEFFICIENTS["angular_drag_x"].prior_sd
+    )
+    stood_in = replace(innovation, linear=replace(innovation.linear, scaled=moved))
+    _, found = chosen(stood_in, first=True)
+    assert set(found["groups"]) == {"thrust_inflow"}
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [row("linear_drag", SelectionCode.NOT_SIGNIFICANT)],
+        [row("marker_offset", SelectionCode.NOT_SIGNIFICANT)],
+        [row("fuselage_drag", SelectionCode.NO_INFORMATION)],
+        [row("fuselage_drag", SelectionCode.ASKED_FOR, kept=True)],
+    ],
+    ids=["stands in for others", "is hidden by set-points", "nothing tells it", "asked for"],
+)
+def test_of_some_terms_innovations_do_not_judge(chosen, rows) -> None:
+    assert chosen(seen(rows, {name: 0.5 for name in rows[0].names[:1] if not rows[0].kept})) is None
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_terms_left_out_are_in_doubt_by_what_innovations_say_of_them(alike: bool) -> None:
+    """As far as they do what a coefficient does; what set-points hide stays as it was."""
+    before = {"inertia_xx": 9.0, "estimate_latency": 7.0}
+    found = seen(
+        [DRAG], {}, {"fuselage_drag": "inertia_xx"} if alike else {}, in_doubt=before
+    ).in_doubt()
+    assert found["estimate_latency"] == 7.0
+    assert (found["inertia_xx"] < 2e-3) != alike
+    assert found["inertia_xx"] < 9.0
+
+
+def test_a_steady_wind_is_a_disturbance_like_others() -> None:
+    wind = SelectionRow(
+        group="wind",
+        names=("wind_x", "wind_y"),
+        kept=False,
+        reason=SelectionCode.NOT_SIGNIFICANT,
+    )
+    space = wide_space(())
+    innovation = seen([DRAG], {}, in_doubt={"inertia_xx": 9.0})
+    alone = replace(innovation, selected=replace(innovation.selected, rows=(wind,)), space=space)
+    assert alone.in_doubt() == {"inertia_xx": 9.0}

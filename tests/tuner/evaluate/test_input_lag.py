@@ -1,0 +1,123 @@
+"""The lateness of recorded inputs, to a fraction of a sample, before anything is fitted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+from tuner.core.findings import Code
+from tuner.evaluate.input_lag import input_lag, with_inputs_on_time
+from tuner.objective.job_flights import Recording
+from tuner.objective.motor_order import order_findings
+from tuner.recordings.flight import Flight, Series
+from tuner.recordings.initial import initial_state
+
+RATE = 500.0
+
+
+@pytest.fixture(scope="module")
+def broadband(updated):
+    """Return 20 s of a vehicle that random changes of its rotors' speeds push about."""
+    generator = np.random.default_rng(4)
+    time = np.arange(0.0, 20.0, 1.0 / RATE)
+    speed = 616.0 + _slow(generator.normal(0.0, 1.0, (len(time), 4)), 4.0) * 6.0
+    place = np.array([rotor.position for rotor in updated.rotors])
+    spin = np.array([1.0 if rotor.spin == "ccw" else -1.0 for rotor in updated.rotors])
+    thrust = updated.aerodynamics.motor_constant * speed**2
+    torque = np.column_stack([thrust @ place[:, 1], -thrust @ place[:, 0], -0.033 * thrust @ spin])
+    inertia = np.array([updated.inertia.xx, updated.inertia.yy, updated.inertia.zz])
+    rate, velocity = np.zeros((len(time), 3)), np.zeros((len(time), 3))
+    turned = [Rotation.identity()]
+    for k in range(len(time) - 1):
+        # a weak attitude loop, so that it stays upright
+        back = 8.0 * turned[-1].as_rotvec() + 4.0 * rate[k]
+        rate[k + 1] = rate[k] + (torque[k] / inertia - back) / RATE
+        turned.append(turned[-1] * Rotation.from_rotvec(rate[k] / RATE))
+        up = turned[k].apply([0.0, 0.0, thrust[k].sum() / updated.mass])
+        velocity[k + 1] = velocity[k] + (up - [0, 0, 9.81] - 1.0 * velocity[k]) / RATE
+    series = {
+        "position": Series(time, np.cumsum(velocity, axis=0) / RATE),
+        "velocity": Series(time, velocity),
+        "attitude": Series(time, Rotation.concatenate(turned).as_quat(scalar_first=True)),
+        "body_rate": Series(time, rate),
+        "rotor_speed": Series(time + 0.5 / RATE, speed),  # what acts over a step
+        "command": Series(time, (speed - 100.0) / 950.0),
+    }
+    clock = np.arange(0.0, 19.9, 0.01)
+    signals = {
+        name: np.column_stack([np.interp(clock, time, column) for column in signal.values.T])
+        for name, signal in series.items()
+    }
+    return Flight("a", "a.csv", "", 100.0, clock, signals, series, initial_state(series))
+
+
+def _slow(white, frequency):
+    share = 1.0 - np.exp(-2 * np.pi * frequency / RATE)
+    return lfilter([share], [1.0, share - 1.0], white, axis=0) / np.sqrt(share / 2)
+
+
+def late_by(flight, seconds, *, noise=0.0, name=None):
+    """Return a flight whose rotor speeds are stamped later, at 100 Hz, with noise."""
+    speed = flight.series["rotor_speed"]
+    stamps = np.arange(0.04, 19.9, 0.01)
+    columns = [np.interp(stamps - seconds, speed.time, column) for column in speed.values.T]
+    generator = np.random.default_rng(5)
+    values = np.column_stack(columns) + generator.normal(0.0, noise, (len(stamps), 4))
+    series = dict(flight.series) | {"rotor_speed": Series(stamps, values)}
+    return replace(flight, series=series, name=name or flight.name)
+
+
+@pytest.mark.parametrize("seconds", [-0.0173, 0.0, 0.0042, 0.02])
+def test_lateness_is_found_to_a_fraction_of_a_sample(broadband, updated, seconds):
+    lag = input_lag(late_by(broadband, seconds, noise=5.0), "rotor_speed", updated)
+    assert lag is not None
+    assert lag.seconds == pytest.approx(seconds, abs=0.003)
+    assert lag.sd < 0.0015
+
+
+def test_noise_alone_tells_nothing(broadband, updated):
+    generator = np.random.default_rng(1)
+    speed = broadband.series["rotor_speed"]
+    noise = Series(speed.time, generator.normal(600.0, 10.0, speed.values.shape))
+    flight = replace(broadband, series=dict(broadband.series) | {"rotor_speed": noise})
+    assert input_lag(flight, "rotor_speed", updated) is None
+
+
+def test_each_fitted_flight_has_its_own_lateness_and_a_held_out_one_the_mean(broadband, updated):
+    recordings = [
+        Recording(late_by(broadband, 0.015, name="a"), "rotor_speed", None),
+        Recording(late_by(broadband, -0.005, name="b"), "rotor_speed", None),
+        Recording(late_by(broadband, 0.02, name="c"), "rotor_speed", None, holdout=True),
+        Recording(late_by(broadband, 0.02, name="d"), "rotor_speed", 0.0),
+        Recording(replace(broadband, name="e"), "reference", None),
+    ]
+    late = [r.input_late for r in with_inputs_on_time(recordings, updated)]
+    assert late[0] == pytest.approx(0.015, abs=0.002)
+    assert late[1] == pytest.approx(-0.005, abs=0.002)
+    assert late[2] == pytest.approx((late[0] + late[1]) / 2)
+    assert late[3:] == [0.0, 0.0]
+
+
+def test_what_commands_are_late_by_together_is_the_vehicles_own_lag(broadband, updated):
+    command = broadband.series["command"]
+
+    def moved(seconds, name):
+        series = dict(broadband.series) | {
+            "command": Series(command.time + seconds, command.values)
+        }
+        return Recording(replace(broadband, series=series, name=name), "actuator", None)
+
+    first, second = with_inputs_on_time([moved(0.0, "a"), moved(0.012, "b")], updated)
+    assert first.input_late == pytest.approx(-second.input_late)
+    assert second.input_late - first.input_late == pytest.approx(0.012, abs=0.002)
+
+
+def test_the_order_of_measured_speeds_is_seen_in_how_they_turn_the_vehicle(broadband, updated):
+    speed, span = broadband.series["rotor_speed"], (0.0, broadband.duration)
+    assert order_findings("a", broadband.series, updated, span, "rotor_speed") == ()
+    swapped = Series(speed.time, speed.values[:, [0, 2, 1, 3]])
+    series = dict(broadband.series) | {"rotor_speed": swapped}
+    (finding,) = order_findings("a", series, updated, span, "rotor_speed")
+    assert (finding.code, finding.names) == (Code.MOTOR_ORDER, ("1", "3", "2", "4"))

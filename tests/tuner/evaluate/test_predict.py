@@ -1,0 +1,135 @@
+"""Open-loop predictions: the truth predicts, nothing of the flight ahead is looked at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tuner.evaluate.comparison import Comparison
+from tuner.evaluate.predict import UNITS, hold, predict, summary
+from tuner.objective.job_flights import Recording
+from tuner.recordings.flight import Series
+from tuner.recordings.states import AROUND
+from tuner.vehicle import ControllerFile, with_values
+
+
+@pytest.fixture(scope="module")
+def truth(full_flight, updated):
+    return predict(updated, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+
+
+def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
+    naive = hold(full_flight, truth.begins, truth.ahead)
+    for name in UNITS:
+        assert truth.mean(0.5)[name] < 0.05 * naive.mean(0.5)[name], name
+    assert truth.errors["position"].shape == (50, len(truth.begins))
+    assert truth.begins[-1] + 0.5 <= full_flight.duration
+    assert naive.mean(0.5)["position"] > naive.mean(0.1)["position"] > 0.0
+
+
+def test_the_distances_are_euclidean_and_the_angle_is_geodesic(truth, full_flight):
+    naive = hold(full_flight, truth.begins[:1], truth.ahead)
+    time, place = full_flight.time, full_flight.signals["position"]
+    begin = int(np.searchsorted(time, truth.begins[0]))
+    moved = np.linalg.norm(place[begin + 50] - place[begin])
+    assert naive.errors["position"][-1, 0] == pytest.approx(moved, abs=1e-3)
+    first, last = full_flight.signals["attitude"][[begin, begin + 50]]
+    angle = 2 * np.arccos(abs(first @ last))
+    assert naive.errors["attitude"][-1, 0] == pytest.approx(angle, abs=2e-3)
+    both = summary([truth, truth], 0.5)
+    assert both == pytest.approx(truth.mean(0.5))
+
+
+def test_a_wrong_vehicle_predicts_worse_and_a_late_input_is_put_right(truth, full_flight, updated):
+    heavy = with_values(updated, {"motor_constant": 0.9 * updated.aerodynamics.motor_constant})
+    worse = predict(heavy, ControllerFile(), full_flight, "rotor_speed", stride=0.2)
+    assert worse.mean(0.5)["velocity"] > 5 * truth.mean(0.5)["velocity"]
+    speed = full_flight.series["rotor_speed"]
+    late = replace(
+        full_flight,
+        series=dict(full_flight.series) | {"rotor_speed": Series(speed.time + 0.02, speed.values)},
+    )
+    off = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2)
+    right = predict(updated, ControllerFile(), late, "rotor_speed", stride=0.2, input_late=0.02)
+    assert off.mean(0.5)["body_rate"] > 2 * right.mean(0.5)["body_rate"]
+    assert right.mean(0.5) == pytest.approx(truth.mean(0.5), rel=0.02)
+
+
+def test_what_is_followed_is_not_called_predicted(full_flight, updated):
+    followed = predict(updated, ControllerFile(), full_flight, "attitude", stride=1.0)
+    assert set(followed.errors) == {"position", "velocity"}
+    means = followed.mean(0.5)
+    assert means["position"] < 0.05
+    assert np.isnan(means["attitude"])
+
+
+def test_what_lies_ahead_is_not_looked_at(truth, full_flight, updated):
+    position = full_flight.series["position"]
+    moved = position.values + np.where(position.time > truth.begins[5] + 0.1, 1.0, 0.0)[:, None]
+    changed = replace(
+        full_flight,
+        series=dict(full_flight.series) | {"position": Series(position.time, moved)},
+    )
+    elsewhere = predict(updated, ControllerFile(), changed, "rotor_speed", stride=0.2)
+    for name in ("velocity", "attitude", "body_rate"):
+        np.testing.assert_allclose(
+            elsewhere.errors[name][:, 5], truth.errors[name][:, 5], rtol=1e-9, err_msg=name
+        )
+    assert elsewhere.errors["position"][-1, 5] == pytest.approx(np.sqrt(3.0), rel=0.02)
+
+
+@pytest.mark.parametrize("inlet", ["body_rate", "actuator", "attitude"])
+def test_no_inlet_looks_at_the_path_ahead(full_flight, updated, inlet):
+    position = full_flight.series["position"]
+    ahead = (position.time > 3.0 + 1.1 * AROUND) & (position.time < 3.4)
+    away = 0.02  # m: as far as a start might have been from where it was recorded
+    shifted = Series(position.time, position.values + np.where(ahead, away, 0.0)[:, None])
+    elsewhere = replace(full_flight, series=dict(full_flight.series) | {"position": shifted})
+    wrong = with_values(updated, {"motor_constant": 0.98 * updated.aerodynamics.motor_constant})
+
+    def errors(flight):
+        comparison = Comparison([Recording(flight, inlet)], ControllerFile())
+        name, predicted = flight.name, predict(wrong, ControllerFile(), flight, inlet, stride=1.0)
+        return (
+            comparison.fly(wrong)[name],
+            comparison.fly_from_fitted_starts(wrong)[name],
+            predicted,
+        )
+
+    (windows, met, predicted), (windows_moved, met_moved, moved) = map(
+        errors, (full_flight, elsewhere)
+    )
+    there = (windows.position.time > 3.0 + 1.1 * AROUND) & (windows.position.time < 3.4)
+    only_recorded = np.where(there, -away, 0.0)[:, None].repeat(3, 1)
+    change = windows_moved.position.error - windows.position.error
+    np.testing.assert_allclose(change, only_recorded, atol=1e-9)
+    np.testing.assert_allclose(windows_moved.attitude.error, windows.attitude.error, atol=1e-9)
+    followed = met_moved.position.error - met.position.error - only_recorded
+    assert np.abs(followed).max() > 0.1 * away  # the test would see a start that is fitted
+    begun = np.flatnonzero(np.isclose(predicted.begins, 3.0))
+    behind = predicted.ahead > 0.4 + 2.0 * AROUND  # where the path is as recorded again
+    for name in set(predicted.errors) - {"position"}:
+        np.testing.assert_allclose(
+            moved.errors[name][:, begun], predicted.errors[name][:, begun], rtol=1e-9
+        )
+    change = moved.errors["position"][:, begun] - predicted.errors["position"][:, begun]
+    np.testing.assert_allclose(change[behind], 0.0, atol=1e-9)
+    assert np.abs(change[~behind]).max() > 0.5 * away
+
+
+def test_a_comparison_of_windows_predicts_and_names_what_is_fitted_otherwise(full_flight, updated):
+    wrong = with_values(updated, {"torque_trim_x": 0.02})
+    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    predicted = comparison.fly(wrong)[full_flight.name].rmse
+    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name].rmse
+    assert predicted.roll > 3 * met.roll  # a trim in each window hides what is wrong
+    assert comparison.fly(updated)[full_flight.name].rmse.roll < 0.1 * predicted.roll
+
+
+def test_fitted_starts_meet_a_flight_no_worse_than_recorded_ones(full_flight, updated):
+    # rotors that lift half as much: steps towards the likeliest start overshoot
+    wrong = with_values(updated, {"angular_drag_x": -0.2, "torque_trim_x": 0.3})
+    comparison = Comparison([Recording(full_flight, "rotor_speed")], ControllerFile())
+    predicted = comparison.fly(wrong)[full_flight.name]
+    met = comparison.fly_from_fitted_starts(wrong)[full_flight.name]
+    assert met.length("attitude") < predicted.length("attitude")

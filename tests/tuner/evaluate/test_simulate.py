@@ -1,0 +1,155 @@
+import math
+
+import numpy as np
+import pytest
+
+from tuner.config import TrajectorySettings
+from tuner.core.errors import InputError
+from tuner.core.shipped import configs_folder
+from tuner.evaluate import simulate as module
+from tuner.evaluate.simulate import simulate
+from tuner.objective.trajectory import at_speed, published
+from tuner.recordings.flight import SIGNALS
+from tuner.vehicle import ControllerFile, read_controller, with_values
+
+#: One duration for all, so that the loop is compiled once.
+SHORT = {"duration": 4.0}
+
+
+def fly(vehicle, name="circle", controller=None, **options):
+    settings = TrajectorySettings(name=name, **options.pop("settings", {}))
+    return list(simulate(vehicle, controller or ControllerFile(), settings, **SHORT | options))
+
+
+def test_signals_are_those_of_a_flight_on_a_uniform_clock(circle):
+    np.testing.assert_allclose(circle.time, np.arange(401) / 100)
+    for name, values in circle.signals.items():
+        assert values.shape == (401, SIGNALS[name][0]), name
+        assert np.isfinite(values).all(), name
+    assert circle.crash_time is None
+
+
+def test_it_starts_at_rest_at_the_first_point_and_follows_the_reference(circle):
+    np.testing.assert_allclose(circle.signals["position"][0], [2, 0, 1])
+    np.testing.assert_allclose(circle.signals["velocity"][0], 0)
+    error = circle.signals["position"] - circle.signals["reference_position"]
+    assert 0.01 < np.abs(error).max() < 0.5
+    assert circle.signals["position"][-1, 1] > 0.1
+
+
+def test_velocity_is_the_derivative_of_position(circle):
+    slope = np.gradient(circle.signals["position"], circle.time, axis=0)
+    np.testing.assert_allclose(slope[1:-1], circle.signals["velocity"][1:-1], atol=5e-3)
+
+
+def test_an_accelerometer_at_hover_shows_gravity_upwards(vehicle):
+    (hover,) = fly(vehicle, "hover")
+    np.testing.assert_allclose(hover.signals["acceleration"][-1], [0, 0, 9.81], atol=0.05)
+    thrust = 4 * 1.45e-5 * hover.signals["rotor_speed"][-1, 0] ** 2
+    assert thrust == pytest.approx(2.243 * 9.81, rel=2e-3)
+
+
+def test_a_yaw_spin_turns_at_its_rate(vehicle):
+    (spin,) = fly(vehicle, "yaw_spin", settings={"yaw_rate": 1.5})
+    assert spin.signals["body_rate"][-1, 2] == pytest.approx(1.5, abs=0.05)
+    np.testing.assert_allclose(spin.signals["rate_setpoint"][10:], [[0, 0, 1.5]] * 391)
+
+
+@pytest.mark.parametrize("name", ["straight", "diagonal", "lemniscate"])
+def test_the_other_shapes_fly(vehicle, name):
+    (flight,) = fly(vehicle, name)
+    assert flight.crash_time is None
+    assert np.ptp(flight.signals["reference_position"][:, 0]) > 1e-3
+
+
+def test_rates_that_do_not_divide_the_physics_rate_are_interpolated(vehicle):
+    sitl = read_controller(configs_folder() / "controllers" / "hovergames_sitl.yaml")
+    (at_100,) = fly(vehicle, controller=sitl, rate=100.0)
+    (at_250,) = fly(vehicle, controller=sitl, rate=250.0)
+    assert len(at_100.time) == 401
+    np.testing.assert_allclose(
+        at_100.signals["position"][::2], at_250.signals["position"][::5], atol=1e-6
+    )
+
+
+def test_a_grid_flies_each_vehicle_as_it_flies_alone(vehicle):
+    grid = {
+        "motor_constant": np.array([1.3e-5, 1.5e-5]),
+        "inertia_xx": np.array([0.025, 0.030]),
+    }
+    together = fly(vehicle, grid=grid)
+    assert [flight.coefficients for flight in together] == [
+        {"motor_constant": 1.3e-5, "inertia_xx": 0.025},
+        {"motor_constant": 1.5e-5, "inertia_xx": 0.030},
+    ]
+    for flight in together:
+        (alone,) = fly(with_values(vehicle, flight.coefficients))
+        for name, values in alone.signals.items():
+            np.testing.assert_allclose(flight.signals[name], values, atol=1e-4, err_msg=name)
+    assert not np.allclose(together[0].signals["position"], together[1].signals["position"])
+
+
+def test_a_large_grid_takes_turns(vehicle, monkeypatch):
+    monkeypatch.setattr(module, "CHUNK", 2)
+    constants = [1.3e-5, 1.4e-5, 1.5e-5]
+    grid = {"motor_constant": np.array(constants), "inertia_xx": np.array([0.025] * 3)}
+    in_turns = fly(vehicle, "hover", grid=grid)
+    assert [flight.coefficients["motor_constant"] for flight in in_turns] == constants
+    for flight in in_turns:
+        (alone,) = fly(with_values(vehicle, flight.coefficients), "hover")
+        np.testing.assert_allclose(flight.signals["position"], alone.signals["position"], atol=1e-6)
+
+
+def test_a_vehicle_that_cannot_fly_crashes_and_says_when(vehicle):
+    (flight,) = fly(with_values(vehicle, {"mass": 9.0}), "hover")
+    assert 0.2 < flight.crash_time < 4.0
+    assert np.isfinite(flight.signals["position"]).all()
+
+
+def test_laps_are_counted(vehicle):
+    fast = {"speed_scale": 20.0, "omega": 1.0, "radius": 0.01}
+    (flight,) = fly(vehicle, settings=fast)
+    assert flight.signals["lap"][0, 0] == 0
+    assert flight.signals["lap"][-1, 0] >= 2
+
+
+@pytest.mark.parametrize(
+    ("name", "peak"),
+    [("circle", 1.0), ("lemniscate", math.sqrt(2)), ("straight", 1.0), ("diagonal", math.sqrt(2))],
+)
+def test_a_speed_is_that_of_the_reference_at_its_fastest(name, peak):
+    settings = at_speed(TrajectorySettings(name=name, radius=1.0), 1.2)
+    assert settings.speed_scale == pytest.approx(1.2 / (0.7 * peak))
+    points = published(settings, duration=20.0, control_rate=100.0).inlet.points.position
+    moved = np.gradient(np.stack([points.x, points.y, points.z]), 0.01, axis=1)[:, 1100:-1]
+    assert np.linalg.norm(moved, axis=0).max() == pytest.approx(1.2, rel=1e-3)
+
+
+def test_what_stays_in_place_has_no_speed():
+    with pytest.raises(InputError, match="hover stays in one place"):
+        at_speed(TrajectorySettings(name="hover"), 3.0)
+    with pytest.raises(InputError, match="is no speed"):
+        at_speed(TrajectorySettings(name="circle"), -3.0)
+
+
+@pytest.mark.parametrize("name", ["lemniscate", "yaw_spin"])
+def test_single_precision_costs_less_than_a_twentieth_of_a_millimetre(vehicle, name):
+    whole = {"duration": 40.0}
+    (exact,) = fly(vehicle, name, **whole)
+    (quick,) = fly(vehicle, name, **whole, precision="float32")
+    apart = np.linalg.norm(exact.signals["position"] - quick.signals["position"], axis=1)
+    assert 0.0 < apart.max() < 5e-5
+    turned = np.abs(np.sum(exact.signals["attitude"] * quick.signals["attitude"], axis=1))
+    assert np.degrees(2 * np.arccos(np.minimum(turned, 1.0))).max() < 0.01
+
+
+def test_a_grid_in_single_precision_is_the_grid(vehicle):
+    grid = {"mass": np.linspace(2.0, 2.4, 3)}
+    exact, quick = (
+        fly(vehicle, grid=grid, precision=precision) for precision in ("float64", "float32")
+    )
+    for exact_flight, quick_flight in zip(exact, quick, strict=True):
+        assert exact_flight.coefficients == quick_flight.coefficients
+        np.testing.assert_allclose(
+            quick_flight.signals["position"], exact_flight.signals["position"], atol=1e-4
+        )

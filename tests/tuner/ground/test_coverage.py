@@ -1,0 +1,153 @@
+"""The truth lies in the 95 % intervals of simulated rigs as often as it should."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.tuner.ground import rigs
+from tuner.ground.bifilar import bifilar
+from tuner.ground.combine import combine
+from tuner.ground.hovers import hover_weights, yaw_spin
+from tuner.ground.propeller import propeller
+from tuner.ground.rpm_curve import rpm_curve
+from tuner.ground.scales import scaled_of
+from tuner.ground.stands import thrust_stand, torque_stand
+from tuner.ground.step_response import step_response
+
+TRUTH = rigs.TRUTH
+LEVER, ARM = 1.4231, 0.37
+
+
+def swing(random):
+    samples, ruler = rigs.swing(random)
+    errors = {"mass_error": 0.002, "wire_distance_error": 0.0005, "wire_length_error": 0.002}
+    return bifilar("bifilar x", "x.csv", samples, axis="x", **ruler, **errors)
+
+
+def thrust(random):
+    samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
+    lever = LEVER * (1 + random.normal(0, 0.005))
+    return thrust_stand(
+        "thrust", "t.csv", samples, rotors=4, lever_ratio=lever, lever_ratio_error=0.005
+    )
+
+
+def torque(random):
+    slope = 2 * TRUTH["moment_constant"] * TRUTH["motor_constant"]
+    samples = rigs.stand(random, slope=slope, lever=ARM, noise=0.02)
+    arm = ARM * (1 + random.normal(0, 0.005))
+    return torque_stand("torque", "t.csv", samples, rotors=2, lever_arm=arm, lever_arm_error=0.005)
+
+
+def curve(random):
+    return rpm_curve("rpm", "r.csv", rigs.steps_of_command(random), reference_voltage=16.4)
+
+
+def steps(random):
+    return step_response("steps", "s.csv", rigs.motor_steps(random))
+
+
+def hover(random):
+    points = rigs.hovers(random)
+    return hover_weights("hover", points, rotors=4, mass_error=0.001, rotor_speed_error=3.0)
+
+
+def spin(random):
+    return yaw_spin(
+        "spin",
+        rigs.spins(random),
+        mass=2.243,
+        radius=0.25,
+        motor_constant=TRUTH["motor_constant"],
+        rotor_speed_error=1.0,
+    )
+
+
+def table(random):
+    scatter = np.exp(random.normal(0, [0.4, 0.3]))
+    diameter, density = 0.2794, 1.225
+    force = TRUTH["motor_constant"] * (2 * math.pi) ** 2 / (density * diameter**4) * scatter[0]
+    power = TRUTH["moment_constant"] * 2 * math.pi * force / diameter * scatter[1]
+    rows = np.array([[3000.0, force, power], [5000.0, force, power]])
+    return propeller("propeller", rows, diameter=diameter, air_density=density)
+
+
+RIGS = (swing, thrust, torque, curve, steps, hover, spin, table)
+
+
+def deviations(measurement):
+    """Return by how many standard errors each number is off."""
+    expected = [
+        sum(factor * scaled_of(name, TRUTH[name]) for name, factor in row.items())
+        for row in measurement.rows
+    ]
+    return (measurement.value - expected) / np.sqrt(np.diag(measurement.covariance))
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_an_estimate_lies_near_the_truth(rig):
+    assert (np.abs(deviations(rig(np.random.default_rng(0)))) < 4).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", RIGS)
+@pytest.mark.parametrize(
+    ("repeats", "least"), [(40, 0.85), pytest.param(200, 0.9, marks=pytest.mark.long)]
+)
+def test_the_truth_lies_in_the_interval_as_often_as_it_says(rig, repeats, least):
+    off = [deviations(rig(np.random.default_rng(seed))) for seed in range(repeats)]
+    inside = np.mean(np.abs(np.concatenate(off)) < 1.959964)
+    assert least <= inside <= (0.995 if repeats == 200 else 1.0), inside
+
+
+def test_a_second_lag_is_named():
+    samples = rigs.motor_steps(np.random.default_rng(0), second=0.02)
+    codes = {remark.code for remark in step_response("steps", "s.csv", samples).remarks}
+    assert "not_first_order" in codes
+
+
+@pytest.mark.parametrize("samples_early", [0, 3, 10])
+def test_a_speed_that_reacts_before_its_commands_stamp_leaves_the_time_constants(samples_early):
+    off = []
+    for seed in range(6):
+        run = rigs.motor_steps(np.random.default_rng(seed), rate=400.0)
+        count = len(run["time"]) - samples_early
+        early = {name: run[name][:count] for name in ("time", "command")}
+        found = step_response(
+            "steps", "s.csv", early | {"rotor_speed": run["rotor_speed"][samples_early:]}
+        )
+        off.append(deviations(found))
+        told = {remark.code: remark.numbers for remark in found.remarks}
+        assert ("command_late" in told) is (samples_early > 2)
+        if samples_early > 2:
+            seconds = samples_early / 400.0 - TRUTH["actuator_latency"]
+            assert told["command_late"]["seconds"] == pytest.approx(seconds, abs=0.0025)
+    assert (np.abs(np.mean(off, axis=0)) < 1.5).all()
+    assert (np.abs(off) < 3.0).all()
+
+
+def test_a_wrong_lever_ratio_conflicts_with_the_hovers():
+    random = np.random.default_rng(3)
+    samples = rigs.stand(random, slope=4 * TRUTH["motor_constant"], lever=LEVER)
+    wrong = thrust_stand(
+        "thrust", "t.csv", samples, rotors=4, lever_ratio=1.0, lever_ratio_error=0.005
+    )
+    known = {name: scaled_of(name, value) for name, value in TRUTH.items() if name in KNOWN}
+    together = combine([wrong, hover(random)], known)
+    assert together.p_value < 1e-6
+    assert {conflict.experiment for conflict in together.conflicts} == {"thrust", "hover"}
+    right = combine([thrust(random), hover(random)], known)
+    assert right.conflicts == ()
+    assert right.p_value > 0.001
+
+
+KNOWN = {"motor_constant", "moment_constant", "rotor_drag_coefficient"}
+
+
+def test_what_was_not_measured_stays_near_the_vehicle_file():
+    known = {"motor_constant": math.log(1.4e-5), "moment_constant": math.log(0.04)}
+    alone = combine([torque(np.random.default_rng(5))], known)
+    assert not alone.determined.any()
+    product = math.exp(alone.scaled.sum())
+    assert product == pytest.approx(TRUTH["moment_constant"] * TRUTH["motor_constant"], rel=0.03)

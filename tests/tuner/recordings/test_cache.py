@@ -1,0 +1,120 @@
+"""The cache gives back what was read, and only that."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.tuner.recordings import making
+from tuner.recordings import Flight, load_flight
+from tuner.recordings import load as loading
+from tuner.recordings.cache import digest, own_folder
+
+
+@pytest.fixture
+def bag(short: Path, tmp_path: Path) -> Path:
+    path = tmp_path / "flight.bag"
+    path.write_bytes(short.read_bytes())
+    return path
+
+
+def assert_equal(a: Flight, b: Flight) -> None:
+    for name, values in a.signals.items():
+        assert np.array_equal(values, b.signals[name], equal_nan=True), name
+    for name, series in a.series.items():
+        assert np.array_equal(series.time, b.series[name].time), name
+        assert np.array_equal(series.values, b.series[name].values, equal_nan=True), name
+    for name, value in vars(a.initial).items():
+        assert np.array_equal(value, getattr(b.initial, name), equal_nan=True), name
+    assert np.array_equal(a.time, b.time)
+    assert a.notes == b.notes
+    assert a.damage == b.damage
+    assert (a.name, a.sha256, a.rate) == (b.name, b.sha256, b.rate)
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The recordings that were really read."""
+    seen: list[Path] = []
+    original = loading.read_content
+
+    def read(path: Path, *rest: object) -> object:
+        seen.append(path)
+        return original(path, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(loading, "read_content", read)
+    return seen
+
+
+def test_second_time_comes_from_the_cache_and_is_equal(bag: Path, reads: list[Path]) -> None:
+    first, second = load_flight(bag), load_flight(bag)
+    assert len(reads) == 1
+    assert_equal(first, second)
+    assert_equal(first, load_flight(bag, cache=False))
+    assert len(reads) == 2
+
+
+def test_content_settings_and_side_car_count(bag: Path, reads: list[Path], tmp_path: Path) -> None:
+    load_flight(bag)
+    assert len(load_flight(bag, rate=50.0).time) == pytest.approx(600, abs=2)
+    (tmp_path / "flight.yaml").write_text("end: 10")
+    assert load_flight(bag).duration < 10
+    (tmp_path / "own.yaml").write_text("name: own\nformat: ros\nextends: thesis_lab\nsignals: {}\n")
+    load_flight(bag, topics=tmp_path / "own.yaml")
+    (tmp_path / "own.yaml").write_text("name: own\nformat: ros\nextends: mavros\nsignals: {}\n")
+    assert not load_flight(bag, topics=tmp_path / "own.yaml").has("lap")
+    changed = bytearray(bag.read_bytes())
+    changed[-1] ^= 1
+    bag.write_bytes(changed)
+    load_flight(bag)
+    assert len(reads) == 6
+
+
+def test_same_content_elsewhere_is_known(bag: Path, reads: list[Path], tmp_path: Path) -> None:
+    load_flight(bag)
+    (tmp_path / "there").mkdir()
+    moved = bag.rename(tmp_path / "there" / bag.name)
+    assert load_flight(moved).path == str(moved)
+    assert len(reads) == 1
+
+
+def test_damaged_cache_is_read_anew(bag: Path, reads: list[Path]) -> None:
+    first = load_flight(bag)
+    (kept,) = (own_folder() / "flights").iterdir()
+    kept.write_bytes(kept.read_bytes()[:-100])
+    assert_equal(first, load_flight(bag))
+    assert len(reads) == 2
+
+
+def test_unwritable_cache_is_no_error(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TUNE_CACHE_DIR", str(bag))  # a file where a folder should be
+    assert load_flight(bag).has("position")
+
+
+def test_concurrent_runs_agree(bag: Path) -> None:
+    code = (
+        "import sys; from tuner.recordings import load_flight; "
+        "f = load_flight(sys.argv[1]); print(f.signals['position'].sum().hex(), len(f.time))"
+    )
+    runs = [
+        subprocess.Popen([sys.executable, "-c", code, str(bag)], stdout=subprocess.PIPE, text=True)
+        for _ in range(4)
+    ]
+    outputs = {run.communicate()[0] for run in runs}
+    assert [run.returncode for run in runs] == [0, 0, 0, 0]
+    assert len(outputs) == 1
+    names = [file.name for file in (own_folder() / "flights").iterdir()]
+    assert len(names) == 1
+    assert not names[0].startswith(".")
+
+
+def test_folder_digest_sees_names_and_contents(tmp_path: Path) -> None:
+    folder = making.to_ros2(making.CIRCLE, tmp_path / "a", making.StoragePlugin.MCAP, until=1.0)
+    before = digest(folder)
+    assert digest(folder) == before
+    (folder / "metadata.yaml").rename(folder / "other.yaml")
+    assert digest(folder) != before

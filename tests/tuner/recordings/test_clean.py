@@ -1,0 +1,162 @@
+"""Dirt goes and is counted; honest motion stays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner.recordings.clean import clean
+from tuner.recordings.notes import NoteCode
+
+
+def _cleaned(signal: str, time: np.ndarray, values: np.ndarray):
+    return clean(signal, "/topic", time, values)
+
+
+def test_tachometer_artefacts_go_and_steps_stay() -> None:
+    time = np.arange(2000) * 0.01
+    speed = 600 + 100 * np.sign(np.sin(2 * np.pi * time)) + 30 * np.sin(40 * time)
+    motor = np.empty_like(speed)
+    state = speed[0]
+    for k, target in enumerate(speed):  # a real motor: first-order, 15 ms
+        state += (target - state) * (1 - np.exp(-0.01 / 0.015))
+        motor[k] = state
+    motor += np.random.default_rng(0).normal(0, 2, len(motor))
+    dirty = motor.copy()
+    artefacts = np.array([50, 333, 700, 701, 1200, 1777])
+    dirty[artefacts] *= [0.5, 1.5, 0.5, 1.5, 0.5, 1.5]
+    values = np.full((2000, 4), np.nan)
+    values[:, 2] = dirty
+    kept, left, notes = _cleaned("rotor_speed", time, values)
+    assert set(np.flatnonzero(~np.isin(time, kept))) == set(artefacts)
+    assert notes[0].count == len(artefacts)
+    assert np.isnan(left[:, 0]).all()
+
+
+def test_fast_honest_flight_loses_no_sample() -> None:
+    time = np.arange(4000) * 0.01
+    angle = 6.0 * time  # 8 m/s on a 1.33 m circle, rolled and yawing fast
+    position = np.column_stack(
+        [1.33 * np.cos(angle), 1.33 * np.sin(angle), 1 + 0.5 * np.sin(9 * time)]
+    )
+    position += np.random.default_rng(0).normal(0, 5e-4, position.shape)
+    _, kept, notes = _cleaned("position", time, position)
+    assert len(kept) == 4000
+    assert notes == ()
+    yaw = 8.0 * time
+    attitude = np.column_stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)])
+    _, kept, notes = _cleaned("attitude", time, attitude)
+    assert len(kept) == 4000
+    assert notes == ()
+
+
+def test_slow_motion_capture_of_a_fast_flight_loses_no_sample() -> None:
+    time = np.arange(1000) / 30
+    position = np.column_stack([np.cos(4 * time), np.sin(4 * time), np.ones(1000)])
+    lost = (np.arange(1000) % 50) > 41  # a third of a second without markers, time and again
+    _, kept, notes = _cleaned("position", time[~lost], position[~lost])
+    assert len(kept) == (~lost).sum()
+    assert [note.count for note in notes] == [lost[:-8].sum()]  # reported as missing, none dropped
+
+
+def test_pose_jumps_are_dropped() -> None:
+    time = np.arange(500) * 0.01
+    position = np.column_stack([3 * time, np.zeros(500), np.ones(500)])
+    position[[100, 101, 300]] += [0.0, 0.4, 0.0]
+    kept, _, notes = _cleaned("position", time, position)
+    assert not np.isin(time[[100, 101, 300]], kept).any()
+    assert len(kept) == 497
+    assert notes[0].count == 3
+
+
+def test_order_duplicates_and_nan() -> None:
+    time = np.array([0.0, 0.02, 0.01, 0.03, 0.03, 0.04])
+    values = np.column_stack([time * 10] * 3)
+    values[5, 1] = np.nan
+    kept, left, notes = _cleaned("velocity", time, values)
+    assert kept.tolist() == [0.0, 0.01, 0.02, 0.03]
+    assert left[:, 0] == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    assert sorted(note.count for note in notes) == [1, 1, 1]
+
+
+def test_quaternion_signs_norms_and_zeros() -> None:
+    time = np.arange(100) * 0.01
+    angle = 2.0 * time
+    good = np.column_stack([np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle])
+    dirty = good * np.where(np.arange(100) % 3 == 0, -1.2, 1.0)[:, None]
+    dirty[50] = 0.0
+    kept, left, _ = _cleaned("attitude", time, dirty)
+    assert len(kept) == 99
+    assert np.allclose(left, np.delete(good, 50, axis=0))
+
+
+def test_impossible_commands_are_dropped() -> None:
+    values = np.full((10, 4), 0.5)
+    values[4, 2] = 1.7
+    values[5, 2] = 1.01
+    kept, left, notes = _cleaned("command", np.arange(10) * 0.02, values)
+    assert len(kept) == 9
+    assert left.max() == 1.0
+    assert notes[0].count == 1
+
+
+def test_rotors_stamped_together_share_a_row() -> None:
+    values = np.full((8, 4), np.nan)
+    for row in range(8):
+        values[row, row % 4] = 500.0 + row
+    kept, left, notes = _cleaned("rotor_speed", np.repeat([0.0, 0.1], 4), values)
+    assert kept.tolist() == [0.0, 0.1]
+    assert left.tolist() == [[500, 501, 502, 503], [504, 505, 506, 507]]
+    assert notes == ()
+
+
+def test_motion_capture_that_goes_on_sending_its_last_pose_is_dropped() -> None:
+    time = np.arange(500) * 0.01
+    position = np.column_stack([2 * time, np.sin(3 * time), np.ones(500)])
+    position += np.random.default_rng(0).normal(0, 3e-4, position.shape)
+    position[200:230] = position[199]
+    kept, _, notes = _cleaned("position", time, position)
+    assert not np.isin(time[200:230], kept).any()
+    assert len(kept) == 470
+    assert notes[0].count == 30
+
+
+def test_a_vehicle_at_rest_in_a_simulator_is_kept() -> None:
+    time = np.arange(400) * 0.01
+    height = np.where(time < 2, 0.1, 0.1 + 0.5 * (time - 2) ** 2)
+    position = np.column_stack([0 * time, 0 * time, height])
+    kept, _, notes = _cleaned("position", time, position)
+    assert len(kept) == 400
+    assert notes == ()
+
+
+def test_markers_swapped_for_a_while_are_dropped() -> None:
+    time = np.arange(600) * 0.01
+    position = np.column_stack([2 * np.cos(time), 2 * np.sin(time), np.ones(600)])
+    position += np.random.default_rng(0).normal(0, 3e-4, position.shape)
+    position[300:330] += [0.15, 0.0, 0.1]
+    kept, _, notes = _cleaned("position", time, position)
+    assert not np.isin(time[300:330], kept).any()
+    assert len(kept) == 570
+    assert notes[0].code is NoteCode.AWAY_AND_BACK
+
+
+def test_a_jump_that_stays_is_only_noted() -> None:
+    time = np.arange(600) * 0.01
+    position = np.column_stack([time, 0 * time, np.ones(600)])
+    position[300:] += [0.5, 0.0, 0.0]
+    kept, _, notes = _cleaned("position", time, position)
+    assert len(kept) == 600
+    assert notes[0].code is NoteCode.AWAY_FOR_GOOD
+    assert notes[0].kind == "warning"
+    assert notes[0].count == 1
+
+
+def test_a_battery_of_no_volts_was_not_read():
+    time = np.arange(50) * 0.1
+    volts = np.full((50, 1), 3.9)
+    volts[20:30] = 0.0
+    kept, values, (note, *_) = clean("battery_voltage", "power", time, volts)
+    assert (note.code, note.count) == (NoteCode.OUT_OF_RANGE, 10)
+    assert len(kept) == 40
+    assert values.min() == 3.9

@@ -1,0 +1,58 @@
+"""The uniform clock lies on the true ticks, whatever the delay of the stamps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tuner.recordings.clock import fit_grid
+
+
+def _late(count: int, rate: float, seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return 3.2 + np.arange(count) / rate + random.exponential(0.2e-3, count)
+
+
+@pytest.mark.parametrize("rate", [100.0, 50.0])
+def test_ticks_are_the_lower_envelope(rate: float) -> None:
+    grid = fit_grid(_late(3000, rate), 100.0)
+    assert grid is not None
+    assert grid.origin == pytest.approx(3.2, abs=2e-5)
+
+
+def test_snapped_stamps_are_one_tick_each() -> None:
+    stamps = _late(3000, 100.0)
+    grid = fit_grid(stamps, 100.0)
+    assert grid is not None
+    ticks = (grid.snap(stamps) - grid.origin) * 100
+    assert np.allclose(ticks, np.arange(3000), atol=1e-6)
+
+
+def test_lost_messages_leave_the_others_on_their_ticks() -> None:
+    random = np.random.default_rng(1)
+    kept = np.sort(random.choice(3000, 2700, replace=False))
+    stamps = _late(3000, 100.0)[kept]
+    grid = fit_grid(stamps, 100.0)
+    assert grid is not None
+    ticks = (grid.snap(stamps) - grid.tick_nearest(3.2)) * 100
+    assert np.allclose(ticks, kept, atol=1e-6)
+
+
+def test_drifting_publisher_keeps_its_ticks() -> None:
+    stamps = 3.2 + (_late(6000, 100.0) - 3.2) * (1 + 1e-4)
+    grid = fit_grid(stamps, 100.0)
+    assert grid is not None
+    assert grid.drift == pytest.approx(1e-4, rel=0.1)
+    assert np.allclose(np.diff(grid.snap(stamps)), 0.01)
+
+
+def test_free_running_signal_is_left_alone() -> None:
+    grid = fit_grid(_late(3000, 100.0), 100.0)
+    assert grid is not None
+    free = np.arange(0, 20, 0.0127)
+    assert np.array_equal(grid.snap(free), free)
+
+
+def test_irregular_stamps_have_no_grid() -> None:
+    random = np.random.default_rng(2)
+    assert fit_grid(np.cumsum(random.uniform(0.005, 0.02, 500)), 100.0) is None

@@ -1,0 +1,164 @@
+"""Recordings that deny themselves are named and left out; those that may fly are not."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader
+from rosbags.rosbag1 import Writer as BagWriter
+
+from tests.tuner.recordings import making
+from tuner.cli import main
+from tuner.config import Options, settle
+from tuner.core.errors import RecordingError
+from tuner.core.findings import Code
+from tuner.objective.job_flights import read_usable
+from tuner.recordings import inspect_recordings, load_flights
+from tuner.recordings.contradiction import contradiction, noted_contradiction
+from tuner.recordings.flight import Series
+from tuner.recordings.mission import Mission
+from tuner.recordings.notes import Note, NoteCode
+from tuner.wording.findings import one_line
+
+SHARED = Path(__file__).parents[4] / "shared"
+REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", SHARED / "flights"))
+RECORDINGS = [
+    *sorted(making.FLIGHTS.glob("*.bag")),
+    *sorted((REAL / "nanobench").glob("*.csv")),
+    *sorted((REAL / "crazyswarm").glob("log*")),
+    *sorted((SHARED / "lab_flights").glob("*/*.bag")),
+]
+TIME = np.arange(0.0, 20.0, 0.01)
+ALL = (Mission(0.0, 20.0, "the first command"),)
+
+
+def backwards(bag: Path, target: Path) -> Path:
+    """Write a bag again with all its times mirrored."""
+    store, writer = making.store_of(bag, ros2=False), BagWriter(target)
+    with Reader(bag) as reader, writer:
+        ends = reader.start_time + reader.end_time
+        connections = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
+            for c in reader.connections
+        }
+        for connection, time, raw in reversed(list(reader.messages())):
+            message = store.deserialize_ros1(raw, connection.msgtype)
+            if hasattr(message, "header"):
+                making.stamped(message, ends - making.stamp_of(message))
+            again = store.serialize_ros1(message, connection.msgtype)
+            writer.write(connections[connection.id], ends - time, again)
+    return target
+
+
+@pytest.fixture(scope="module")
+def reversed_circle(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return backwards(short, tmp_path_factory.mktemp("reversed") / "reversed.bag")
+
+
+def test_a_recording_that_runs_backwards_is_named_and_left_out(
+    short: Path, reversed_circle: Path
+) -> None:
+    usable, findings = read_usable(settle(Options([str(short), str(reversed_circle)])))
+    assert [recording.flight.name for recording in usable] == ["short"]
+    (left_out,) = (finding for finding in findings if finding.code is Code.LEFT_OUT)
+    assert (left_out.subject, left_out.level) == ("reversed", "warning")
+    assert "attitude and its body_rate contradict each other (agreement -0.9" in one_line(left_out)
+    assert "time that runs backwards" in one_line(left_out)
+
+
+def test_where_nothing_else_flew_the_run_ends_with_one_line(
+    reversed_circle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(RecordingError, match=r"reversed.bag: its attitude and its body_rate"):
+        read_usable(settle(Options([str(reversed_circle)])))
+    assert main(["--flights", str(reversed_circle), "--out", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len([line for line in said if "contradict each other" in line]) == 1
+
+
+def test_inspection_says_so_in_one_line(reversed_circle: Path) -> None:
+    ((inspection,), _) = inspect_recordings([reversed_circle], cache=False)
+    (doubt,) = (note for note in inspection.notes if note.kind == "warning")
+    assert doubt == noted_contradiction(inspection.notes)
+    assert all("attitude" in inlet.missing for inlet in inspection.inlets)
+    assert inspection.coefficients == ()
+
+
+@pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: f"{path.parent.name}-{path.name}")
+def test_no_flight_that_flew_is_left_out(path: Path) -> None:
+    for flight in load_flights(path, cache=False):
+        assert noted_contradiction(flight.notes) is None
+
+
+def circle(
+    turned: float = 0.0,
+    wind: float = 0.0,
+    *,
+    speed: float = 2.0,
+    noise: float = 0.0,
+    wander: float = 0.0,
+) -> dict[str, Series]:
+    """Return a circle of 2 m, its attitude turned by some rad about the world's vertical.
+
+    Wind in m/s^2, which tilts a vehicle that does not accelerate; of the position, white noise and
+    how far it wanders, in m.
+    """
+    random, angle = np.random.default_rng(4), speed / 2.0 * TIME
+    position = 2.0 * np.column_stack([np.cos(angle), np.sin(angle), 0.0 * TIME])
+    velocity = speed * np.column_stack([-np.sin(angle), np.cos(angle), 0.0 * TIME])
+    push = -(speed**2) / 2.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    push = push + wind * np.column_stack([np.sin(2.3 * TIME), np.cos(1.7 * TIME)])
+    c, s = np.cos(turned), np.sin(turned)
+    lean = push @ np.array([[c, s], [-s, c]]) / 9.81
+    up = np.column_stack([lean, np.ones(len(TIME))])
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    # the shortest turn that takes the vertical there
+    attitude = np.column_stack([1.0 + up[:, 2], -up[:, 1], up[:, 0], 0.0 * TIME])
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    position += noise * random.normal(size=position.shape)
+    position[:, 0] += wander * np.sin(5.0 * TIME)
+    signals = {"position": position, "attitude": attitude, "velocity": velocity}
+    return {name: Series(TIME, values) for name, values in signals.items()}
+
+
+@pytest.mark.parametrize("turned", [np.pi / 2, np.pi, -np.pi / 2])
+def test_an_attitude_of_another_convention_is_certain(turned: float) -> None:
+    note = contradiction(circle(turned), ALL)
+    assert note is not None
+    assert note.names == ("attitude", "position")
+    assert note.numbers["agreement"] == pytest.approx(np.cos(turned), abs=0.05)
+
+
+def test_a_velocity_that_runs_backwards_is_certain_without_a_gyro() -> None:
+    signals = circle()
+    signals["velocity"] = Series(TIME, -signals["velocity"].values)
+    note = contradiction(signals, ALL)
+    assert note is not None
+    assert note.names == ("position", "velocity")
+
+
+@pytest.mark.parametrize(
+    "signals",
+    [
+        pytest.param(circle, id="true"),
+        pytest.param(lambda: circle(0.5), id="a frame half turned"),
+        pytest.param(lambda: circle(np.pi / 2, speed=0.7), id="slow"),
+        pytest.param(lambda: circle(wind=3.0), id="storm"),
+        pytest.param(lambda: circle(speed=0.3, wind=3.0, noise=0.5), id="storm without a pose"),
+        pytest.param(lambda: circle(speed=0.3, wind=3.0, wander=1.0), id="storm, poor pose"),
+    ],
+)
+def test_what_may_be_true_is_no_certainty(signals: Callable[[], dict[str, Any]]) -> None:
+    assert contradiction(signals(), ALL) is None
+
+
+def test_a_moment_is_no_certainty() -> None:
+    assert contradiction(circle(np.pi), (Mission(0.0, 4.0, "the first command"),)) is None
+    assert contradiction(circle(np.pi), ()) is None
+    assert noted_contradiction(()) is None
+    assert noted_contradiction([Note(NoteCode.STALE)]) is None

@@ -1,0 +1,209 @@
+"""Files made to hurt: refused with one line, quickly and in little memory."""
+
+from __future__ import annotations
+
+import bz2
+import json
+import sqlite3
+import struct
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from time import process_time
+
+import lz4.frame
+import pytest
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+
+from tests.tuner.recordings import fuzz, making
+from tuner.core.errors import InputError, RecordingError
+from tuner.recordings import inspect_recordings, load_flight
+from tuner.recordings.damage import Cause
+from tuner.recordings.notes import NoteCode
+from tuner.recordings.ros.container import DamagedError, unpack, zstd
+from tuner.recordings.ros.definitions import Definitions
+from tuner.recordings.ros.wire import UnknownFieldError, plan
+
+
+@contextmanager
+def bounded(*, seconds: float = 5.0, megabytes: float = 200.0) -> Iterator[None]:
+    tracemalloc.start()
+    started = process_time()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1] / 2**20
+    finally:
+        tracemalloc.stop()
+    assert process_time() - started < seconds
+    assert peak < megabytes
+
+
+def refused(path: Path) -> str:
+    """Return the line with which a recording is refused."""
+    with bounded(), pytest.raises(InputError) as caught:
+        load_flight(path, cache=False)
+    assert "\n" not in str(caught.value)
+    inspections, errors = inspect_recordings([path], cache=False)
+    assert len(inspections) + len(errors) == 1
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("first", "cases"), [(0, 8), pytest.param(8, 92, marks=[pytest.mark.slow, pytest.mark.long])]
+)
+def test_broken_files_are_read_or_refused(first: int, cases: int) -> None:
+    asked = ["all", "--first", str(first), "--cases", str(cases)]
+    run = subprocess.run(
+        [sys.executable, "-m", "tests.tuner.recordings.fuzz", *asked],
+        capture_output=True,
+        text=True,
+        cwd=Path(__file__).parents[3],
+        check=False,
+        timeout=900,
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    results = [json.loads(line) for line in run.stdout.splitlines()]
+    assert [result["format"] for result in results] == list(fuzz.FORMATS)
+    for result in results:
+        assert result["read"] + result["refused"] == cases
+        assert min(result["read"], result["refused"]) > 0
+
+
+@pytest.mark.parametrize("compression", ["bz2", "lz4", "zstd"])
+def test_a_chunk_unpacks_to_what_it_claims_and_no_more(compression: str) -> None:
+    bomb = bytes(100 << 20)
+    packed = {
+        "bz2": bz2.compress,
+        "lz4": lz4.frame.compress,
+        "zstd": zstd().compress,
+    }[compression](bomb)
+    del bomb
+    with bounded(megabytes=20):
+        assert len(unpack(compression, packed, 1000)) <= 1000
+    with bounded(megabytes=20), pytest.raises(DamagedError, match="claims"):
+        unpack(compression, packed, 1 << 30)
+
+
+def _definitions(text: str) -> Definitions:
+    definition = MessageDefinition(MessageDefinitionFormat.MSG, text)
+    return Definitions(Path("x.bag"), {"a/msg/A": definition})
+
+
+def _section(name: str, text: str) -> str:
+    return f"{'=' * 80}\nMSG: {name}\n{text}\n"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a/A inner\n",
+        "a/B b\n" + _section("a/B", "a/A a"),
+        "a/B[256] b\n" + "".join(_section(f"a/{x}", f"a/{y}[256] y") for x, y in ["BC", "CB"]),
+        "a/B[4000000000] b\n" + _section("a/B", "uint8 c\nstring d"),
+        "a/A[] inner\n",
+    ],
+    ids=["itself", "in turn", "multiplied", "long", "sequence"],
+)
+def test_types_that_contain_themselves(text: str) -> None:
+    with bounded(), pytest.raises((UnknownFieldError, RecordingError)):
+        plan(_definitions(text), "a/msg/A", ("nothing",), aligned=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["float64 " + "[" * 100_000, "(" * 100_000, "string s " + '"' * 9999, "x" * 300_000]
+)
+def test_definitions_that_keep_a_parser_busy(text: str) -> None:
+    with bounded(), pytest.raises(InputError) as caught:
+        _definitions(text).fields("a/msg/A")
+    assert len(str(caught.value)) < 1000
+
+
+def test_database_that_answers_forever(tmp_path: Path) -> None:
+    path = tmp_path / "endless.db3"
+    with sqlite3.connect(path) as database:
+        database.executescript(
+            """
+            CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT);
+            INSERT INTO topics VALUES (1, '/pose', 'geometry_msgs/msg/PoseStamped', 'cdr');
+            CREATE VIEW messages AS
+              WITH RECURSIVE c(x) AS (VALUES(1) UNION ALL SELECT x + 1 FROM c)
+              SELECT x AS id, 1 AS topic_id, x AS timestamp, x'00' AS data FROM c;
+            """
+        )
+    database.close()
+    assert "is no ROS 2 recording" in refused(path)
+
+
+def test_log_whose_formats_multiply(tmp_path: Path) -> None:
+    def record(kind: str, content: bytes) -> bytes:
+        return struct.pack("<HB", len(content), ord(kind)) + content
+
+    formats = [f"f{i}:f{i + 1}[60000] x;".encode() for i in range(6)]
+    path = tmp_path / "bomb.ulg"
+    path.write_bytes(
+        b"ULog\x01\x12\x35\x01"
+        + bytes(8)
+        + b"".join(record("F", text) for text in formats)
+        + record("F", b"f6:uint8_t[60000] x;")
+        + record("A", struct.pack("<BH", 0, 0) + b"f0")
+    )
+    assert "is absurd" in refused(path)
+
+
+def test_metadata_that_multiplies(tmp_path: Path) -> None:
+    folder = making.to_ros2(making.CIRCLE, tmp_path / "b", making.StoragePlugin.MCAP, until=0.5)
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
+    lines += ["rosbag2_bagfile_information: {relative_file_paths: *a8}"]
+    (folder / "metadata.yaml").write_text("\n".join(lines))
+    with bounded():
+        inspections, errors = inspect_recordings([folder], cache=False)
+    assert len(inspections) + len(errors) == 1
+
+
+def test_message_longer_than_its_chunk_or_shorter_than_its_type(tmp_path: Path) -> None:
+    raw = bytearray(fuzz.FORMATS["bag"](tmp_path).read_bytes())
+    at = raw.index(b"map", len(raw) // 2) - 4  # the length before a header's frame_id
+    raw[at : at + 4] = b"\xff\xff\xff\xff"
+    path = tmp_path / "long.bag"
+    path.write_bytes(raw)
+    with bounded():
+        flight = load_flight(path, cache=False)
+    (damage,) = flight.damage
+    assert (damage.cause, damage.lost) == (Cause.MESSAGES_DAMAGED, 1)
+
+
+def test_message_stamped_later_than_any_clock(tmp_path: Path) -> None:
+    raw = bytearray(fuzz.FORMATS["mcap"](tmp_path).read_bytes())
+    at = raw.index(struct.pack("<Q", 1_664_800_004_500_000_000)[3:]) - 3
+    raw[at : at + 8] = b"\xff" * 8
+    path = tmp_path / "late.mcap"
+    path.write_bytes(raw[: 3 * len(raw) // 4])  # without the indexes, which hold the time as well
+    with bounded():
+        (inspection,), errors = inspect_recordings([path], cache=False)
+    assert not errors
+    assert Cause.END_MISSING in {damage.cause for damage in inspection.damage}
+
+
+def test_table_with_a_line_without_end(tmp_path: Path) -> None:
+    path = tmp_path / "long.csv"
+    with path.open("wb") as stream:
+        stream.write(b"time,x,y\n")
+        for _ in range(40):
+            stream.write(b"1," * (1 << 19))
+    assert "long.csv: " in refused(path)
+
+
+def test_table_whose_stamps_are_days_apart(tmp_path: Path) -> None:
+    lines = ["time,x,y,z,qw,qx,qy,qz"]
+    lines += [f"{t * 0.01},0,0,1,1,0,0,0" for t in range(500)]
+    lines += ["1e300,0,0,1,1,0,0,0", "-8e9,0,0,1,1,0,0,0", "nan,0,0,1,1,0,0,0"]
+    path = tmp_path / "days.csv"
+    path.write_text("\n".join(lines))
+    with bounded():
+        flight = load_flight(path, cache=False)
+    assert flight.duration == pytest.approx(5.0, abs=0.02)
+    assert [note for note in flight.notes if note.code is NoteCode.FAR_IN_TIME]

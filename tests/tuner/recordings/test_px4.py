@@ -1,0 +1,158 @@
+"""PX4 logs as a lab has them: their parameters, where they are fitted, and what to log more of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.tuner.recordings import making
+from tuner.config import Options, settle
+from tuner.core.findings import Code
+from tuner.job.recording_verdict import Verdict, in_words, verdict_of
+from tuner.objective.job_flights import as_logged, read_usable
+from tuner.recordings import inspect_recordings, load_flight
+from tuner.recordings.notes import NoteCode
+from tuner.recordings.px4_logging import advice_of, settings_in_words
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.motor_orders import motor_order_of
+from tuner.wording.findings import one_line
+
+PARAMETERS = {
+    "MC_ROLLRATE_P": 0.15,
+    "MC_ROLLRATE_I": 0.2,
+    "MC_PITCHRATE_D": 0.0036,
+    "MC_YAWRATE_FF": 0.05,
+    "MC_RR_INT_LIM": 0.3,
+    "IMU_GYRO_RATEMAX": 800,
+    "IMU_GYRO_CUTOFF": 80.0,
+    "IMU_DGYRO_CUTOFF": 0.0,
+    "THR_MDL_FAC": 0.3,
+    "MC_AIRMODE": 1,
+    "SDLOG_PROFILE": 1,
+}
+AS_BETAFLIGHT = {"CA_ROTOR_COUNT": 4} | {
+    f"CA_ROTOR{i}_P{axis}": float(value)
+    for i, place in enumerate([(-1, 1), (1, 1), (-1, -1), (1, -1)])
+    for axis, value in zip("XY", place, strict=True)
+}
+"""Rear right, front right, rear left, front left: x is forward, y right."""
+
+
+@pytest.fixture(scope="module")
+def messages() -> dict[str, making.Column]:
+    return making.px4_messages(making.CIRCLE)
+
+
+def log(
+    messages: dict[str, making.Column], path: Path, parameters: dict[str, float] | None = None
+) -> Path:
+    boot = int(next(iter(messages.values())).time[0]) - 5_000_000_000
+    return making.to_ulog(messages, path, boot=boot, parameters=parameters)
+
+
+def test_the_rate_loop_is_the_logs(messages, tmp_path: Path) -> None:
+    path = log(messages, tmp_path / "log.ulg", PARAMETERS)
+    settings, (finding,) = as_logged(settle(Options([str(path)])))
+    flew = settings.controller
+    assert (flew.rate.roll.p, flew.rate.roll.i, flew.rate.pitch.d) == (0.15, 0.2, 0.0036)
+    assert (flew.rate.yaw.ff, flew.rate.rate, flew.physics.rate) == (0.05, 800, 800)
+    assert (flew.filters.gyro_cutoff, flew.filters.dgyro_cutoff) == (80.0, None)
+    assert (flew.mixer.thrust_factor, flew.mixer.airmode) == (0.3, 1)
+    assert flew.position == ControllerFile().position
+    line = one_line(finding)
+    assert "rate.roll.p 0.15 (MC_ROLLRATE_P; the file has 0.18)" in line
+    assert "filters.dgyro_cutoff no filter (IMU_DGYRO_CUTOFF; the file has 20)" in line
+    assert "integrator_limit" not in line
+    assert finding.level == "info"
+    named, (finding,) = as_logged(settle(Options([str(path)], controller="hovergames")))
+    assert (named.controller, finding.level) == (flew, "warning")
+
+
+def test_logs_that_differ_are_named(messages, tmp_path: Path) -> None:
+    paths = [
+        log(messages, tmp_path / f"{name}.ulg", PARAMETERS | {"MC_ROLLRATE_P": gain})
+        for name, gain in (("a", 0.15), ("b", 0.18))
+    ]
+    _, findings = as_logged(settle(Options([str(path) for path in paths])))
+    (differ,) = [finding for finding in findings if finding.code is Code.LOGS_DIFFER]
+    assert differ.names == ("MC_ROLLRATE_P",)
+
+
+def test_parameters_that_no_controller_has_change_nothing(messages, tmp_path: Path) -> None:
+    path = log(messages, tmp_path / "log.ulg", {"IMU_GYRO_CUTOFF": 1e9, "MC_ROLLRATE_P": np.nan})
+    settings = settle(Options([str(path)]))
+    assert as_logged(settings) == (settings, ())
+
+
+def test_flights_of_px4s_own_loops_enter_below_them(messages, tmp_path: Path) -> None:
+    path = log(messages, tmp_path / "log.ulg")
+    (recording,), (finding,) = read_usable(settle(Options([str(path)])))
+    assert (recording.inlet, finding.code) == ("body_rate", Code.PX4_LOOPS)
+    (tmp_path / "job.yaml").write_text("inlet: reference\n")
+    asked = settle(Options([str(path)], config=str(tmp_path / "job.yaml")))
+    ((recording,), _) = read_usable(asked)
+    assert recording.inlet == "reference"
+
+
+def test_motors_are_in_the_order_of_the_logs_geometry(messages, tmp_path: Path) -> None:
+    assert motor_order_of(AS_BETAFLIGHT) == (2, 3, 4, 1)
+    assert motor_order_of(AS_BETAFLIGHT | {"SYS_CTRL_ALLOC": 0.0}) is None
+    assert motor_order_of({}) is None
+    usual = load_flight(log(messages, tmp_path / "usual.ulg"))
+    other = load_flight(log(messages, tmp_path / "other.ulg", AS_BETAFLIGHT))
+    command = other.series["command"].values
+    assert np.array_equal(command, usual.series["command"].values[:, [1, 2, 3, 0]])
+    (note,) = [note for note in other.notes if note.code is NoteCode.MOTOR_ORDER_GIVEN]
+    assert note.names == ("betaflight",)
+
+
+def verdict(path: Path) -> Verdict:
+    (inspection,), _ = inspect_recordings([path])
+    return verdict_of(inspection)
+
+
+def test_inspect_answers_first(messages, tmp_path: Path) -> None:
+    seen = verdict(log(messages, tmp_path / "log.ulg", PARAMETERS))
+    assert (seen.fits, seen.inlets) == (True, ("body_rate",))
+    assert seen.not_shown == ("estimate_latency",)
+    assert [advice.message for advice in seen.logging] == [
+        "vehicle_angular_velocity",
+        "actuator_motors",
+        "vehicle_acceleration",
+    ]
+    assert seen.settings == "SDLOG_PROFILE 25 instead of 1"
+    lines = in_words(seen)
+    assert lines[0] == "can be fitted, through the inlet body_rate"
+    assert any("actuator_motors: 50 Hz, 200 Hz would show what the motors" in x for x in lines)
+    assert any("rate.roll.p 0.15 (MC_ROLLRATE_P; the file has 0.18)" in line for line in lines)
+
+
+def test_inspect_says_what_tune_says_of_a_log_that_cannot_be_fitted(
+    messages, tmp_path: Path
+) -> None:
+    pose = {n: messages[n] for n in ("vehicle_local_position", "vehicle_attitude")}
+    path = log(pose, tmp_path / "log.ulg")
+    line, *more = in_words(verdict(path))
+    assert line.startswith("cannot be fitted: holds a pose alone, and neither a reference")
+    assert "  actuator_motors: not logged, 200 Hz would show what the motors" in "\n".join(more)
+    slow = {n: messages[n] for n in messages if n.startswith(("vehicle_a", "actuator"))}
+    del slow["vehicle_attitude"]
+    line, *_ = in_words(verdict(log(slow, tmp_path / "slow.ulg")))
+    assert "is too slow to be fitted without one: body_rate at 100 Hz" in line
+
+
+def test_what_to_log_more_of() -> None:
+    everything = dict.fromkeys(
+        ("vehicle_angular_velocity", "actuator_motors", "vehicle_acceleration", "esc_status",
+         "vehicle_rates_setpoint", "vehicle_attitude", "vehicle_local_position"), 250.0,
+    )  # fmt: skip
+    assert advice_of(everything) == ()
+    assert settings_in_words((), {}) == ""
+    (advice,) = advice_of(everything | {"vehicle_local_position": 10.0})
+    assert settings_in_words((advice,), {"SDLOG_PROFILE": 25.0}) == (
+        "lines 'vehicle_local_position 20' in etc/logging/logger_topics.txt on the SD card"
+    )
+    (advice,) = advice_of(everything | {"vehicle_attitude": 20.0})
+    assert settings_in_words((advice,), {}) == "SDLOG_PROFILE 17 instead of 1"

@@ -1,0 +1,58 @@
+"""Recorded states follow fast motion, take noise off, and come from what was recorded."""
+
+import numpy as np
+import pytest
+
+from tuner.recordings.flight import Series
+from tuner.recordings.states import AROUND, filtered, half_width, states_at
+
+TIME = np.arange(0.0, 3.0, 0.01)
+
+
+def wave(time, frequency=2.0):
+    return np.sin(2 * np.pi * frequency * time)
+
+
+def test_fast_motion_is_kept_and_noise_is_not():
+    generator = np.random.default_rng(2)
+    noise = generator.normal(0.0, 0.02, len(TIME))
+    at = np.linspace(0.1, 2.8, 400)
+    clean = filtered(Series(TIME, wave(TIME)[:, None]), at)[:, 0]
+    assert np.abs(clean - wave(at)).max() < 0.003
+    noisy = filtered(Series(TIME, (wave(TIME) + noise)[:, None]), at)[:, 0]
+    assert np.std(noisy - clean) < 0.7 * 0.02
+    slope = filtered(Series(TIME, wave(TIME)[:, None]), at, derivative=1)[:, 0]
+    np.testing.assert_allclose(slope, 4 * np.pi * np.cos(4 * np.pi * at), atol=0.25)
+
+
+def test_slow_samples_are_filtered_over_more_time_and_gaps_are_bridged():
+    slow = Series(TIME[::5], wave(TIME[::5], 0.5)[:, None])
+    assert half_width(Series(TIME, TIME[:, None])) == pytest.approx(0.035, abs=0.006)
+    assert half_width(slow) == pytest.approx(0.175)
+    assert half_width(slow) > AROUND
+    gap = (TIME < 1.0) | (TIME > 1.2)
+    series = Series(TIME[gap], (3.0 * TIME[gap])[:, None])
+    assert filtered(series, np.array([1.1]))[0, 0] == pytest.approx(3.3)
+    assert np.isnan(filtered(series, np.array([9.0]))).all()
+    column = np.where(TIME < 1.0, np.nan, 1.0)
+    both = filtered(Series(TIME, np.column_stack([column, np.ones(len(TIME))])), np.array([0.2]))
+    assert np.isnan(both[0, 0])
+    assert both[0, 1] == pytest.approx(1.0)
+
+
+def test_velocity_and_body_rate_follow_from_the_pose_where_they_were_not_recorded():
+    angle = 0.4 * wave(TIME, 0.7)
+    attitude = np.column_stack([np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle])
+    position = np.column_stack([wave(TIME, 0.5), TIME, 0 * TIME])
+    series = {"position": Series(TIME, position), "attitude": Series(TIME, attitude)}
+    at = np.linspace(0.5, 2.5, 50)
+    states = states_at(series, at)
+    turning = 0.4 * 2 * np.pi * 0.7 * np.cos(2 * np.pi * 0.7 * at)
+    np.testing.assert_allclose(states.body_rate[:, 0], turning, atol=0.02)
+    np.testing.assert_allclose(states.body_rate[:, 1:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(states.velocity[:, 1], 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(states.attitude, axis=1), 1.0)
+    recorded = series | {"velocity": Series(TIME, np.full((len(TIME), 3), 7.0))}
+    np.testing.assert_allclose(states_at(recorded, at).velocity, 7.0)
+    assert states.at(3).position == pytest.approx(states.position[3])
+    assert np.isnan(states.at(3).rotor_speed).all()

@@ -1,0 +1,394 @@
+"""What becomes of one flight in each of the ways in which people write it."""
+
+from __future__ import annotations
+
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy import signal
+from scipy.io import savemat
+
+from tests.tuner.recordings import ways
+from tuner.config import Options, settle
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.objective.explained import levers
+from tuner.objective.job_flights import read_recordings
+from tuner.objective.motor_order import order_findings
+from tuner.recordings import Flight, load_flight
+from tuner.recordings.flight import Series
+from tuner.recordings.inertial import read_inertial
+from tuner.recordings.matlab import MAGIC
+from tuner.recordings.notes import NoteCode
+from tuner.recordings.suggest import suggested_map
+from tuner.vehicle import read_vehicle, with_values
+from tuner.wording.findings import one_line
+from tuner.wording.notes import note_in_words
+
+COLUMNS = {
+    "position": ("x", "y", "z"),
+    "attitude": ("qw", "qx", "qy", "qz"),
+    "velocity": ("vx", "vy", "vz"),
+    "body_rate": ("wx", "wy", "wz"),
+    "acceleration": ("ax", "ay", "az"),
+    "rotor_speed": tuple(f"rotor_speed_{i}" for i in range(1, 5)),
+    "command": tuple(f"command_{i}" for i in range(1, 5)),
+}
+
+
+def assert_same(
+    flight: Flight, signals: tuple[str, ...] = tuple(COLUMNS), share: float = 2e-3
+) -> None:
+    """Check that a flight holds what was flown, to the digits that were written."""
+    truth = ways.flown()
+    assert flight.duration == pytest.approx(14.0, abs=0.05)
+    for name in signals:
+        expected = np.column_stack([truth[column] for column in COLUMNS[name]])
+        got = flight.series[name]
+        again = np.column_stack(
+            [np.interp(truth["time"], got.time, column) for column in got.values.T]
+        )
+        size = np.abs(expected).max()
+        inside = slice(5, -5)
+        assert np.abs(again - expected)[inside].max() < share * size, name
+
+
+def read(folder: Path, content: str) -> Flight:
+    path = folder / "flight.csv"
+    path.write_text(content)
+    return load_flight(path)
+
+
+@pytest.mark.parametrize("way", ways.TIMES)
+def test_time_in(way: str, tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.with_time(ways.TIMES[way]))
+    assert_same(flight)
+    said = [note_in_words(n) for n in flight.notes if n.code is NoteCode.UNIT_READ]
+    unit = way.split(" ", maxsplit=1)[0]
+    told = unit in ("milliseconds", "microseconds", "nanoseconds")
+    assert said == ([f"time is in {unit}, which the topic map does not say: read so"] * told)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: [f"{(v + ways.EPOCH) * 1e-9:.6e}" for v in t], "has too few digits"),
+        (lambda t: [f"{(v + ways.EPOCH) * 1e-9:.0f}" for v in t], "has too few digits"),
+        (lambda t: [f"day {v}" for v in t], "neither a number nor a date"),
+        (lambda t: t * 1e3, "no step of a flight"),
+    ],
+)
+def test_time_that_cannot_be_told_is_named(change, message: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=message) as caught:
+        read(tmp_path, ways.with_time(change))
+    assert "\n" not in str(caught.value)
+
+
+def test_quick_microseconds_are_no_slow_milliseconds(tmp_path: Path) -> None:
+    """At 4 kHz their step is that of milliseconds at 4 Hz; gravity knows better."""
+    truth = ways.flown()
+    fine = np.arange(0.0, 14.0, 1 / 4000)
+    names = (*COLUMNS["position"], *COLUMNS["attitude"])
+    columns = {name: np.interp(fine, truth["time"], truth[name]) for name in names}
+    table = {"time": np.rint(1e6 * fine), **columns}
+    flight = read(tmp_path, ways.text(table, digits=6))
+    assert_same(flight, ("position", "attitude"))
+    assert NoteCode.TIME_READ in {note.code for note in flight.notes}
+
+
+def as_fitted(path: Path, **values: float) -> Flight:
+    """Return a recording as a fit takes it, of a vehicle with some other coefficients."""
+    vehicle = with_values(read_vehicle(ways.VEHICLE), values)
+    (recording,) = read_recordings(settle(Options([str(path)], vehicle=vehicle)))
+    return recording.flight
+
+
+@pytest.mark.parametrize("commands", [True, False], ids=["commands", "no commands"])
+@pytest.mark.parametrize(
+    ("factor", "name"), [(1.0, None), (30 / np.pi, "a minute"), (0.5 / np.pi, "a second")]
+)
+def test_rotor_speeds_in(factor: float, name: str | None, commands: bool, tmp_path: Path) -> None:
+    """Also from a vehicle file whose motor constant is twice and a half times too small."""
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.with_speeds(factor, commands=commands))
+    for values in ({}, {"motor_constant": 0.4 * 1.386e-5}):
+        flight = as_fitted(path, **values)
+        assert_same(flight, ("rotor_speed",))
+        assert flight.initial.rotor_speed == pytest.approx(
+            [ways.flown()[f"rotor_speed_{i}"][0] for i in range(1, 5)], rel=0.1
+        )
+        said = [note_in_words(n) for n in flight.notes if n.code is NoteCode.UNIT_READ]
+        assert said == [
+            f"rotor_speed is in revolutions {name}, which the topic map does not say: read so"
+        ] * (name is not None)
+
+
+def test_rotor_speeds_that_carry_the_vehicle_in_no_unit_are_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.with_speeds(3.0, commands=False))
+    with pytest.raises(
+        RecordingError, match=r"9\.\d times the weight in rad/s.*unit \(si, rpm"
+    ) as e:
+        as_fitted(path)
+    assert "\n" not in str(e.value)
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\nextends: table\nsignals:\n  rotor_speed: {fields: "
+        "[rotor_speed_1, rotor_speed_2, rotor_speed_3, rotor_speed_4], unit: si}\n"
+    )
+    path.with_suffix(".yaml").write_text("topics: own.yaml\n")
+    assert as_fitted(path).has("rotor_speed")
+
+
+@pytest.mark.parametrize("way", ways.VALUES)
+def test_values_of(way: str, tmp_path: Path) -> None:
+    content, signal, unit = ways.VALUES[way]
+    flight = read(tmp_path, content())
+    assert_same(flight)
+    codes = (NoteCode.UNIT_READ, NoteCode.FRAME_TURNED)
+    said = [n.names[1] for n in flight.notes if n.code in codes and n.names[0] == signal]
+    assert said == [unit] * (unit is not None)
+    if signal == "battery_voltage":
+        assert flight.series[signal].values[0] == pytest.approx(16.4)
+
+
+@pytest.mark.parametrize("change", [lambda u: 47 + 1500 * u, lambda u: 10 * u, lambda u: 1e4 * u])
+def test_commands_in_no_certain_unit_are_dropped_with_a_warning(change, tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.changed({"command": change}))
+    assert not flight.has("command")
+    (note,) = [n for n in flight.notes if n.code is NoteCode.UNIT_UNKNOWN]
+    assert note.kind == "warning"
+    assert note_in_words(note).endswith("give command its 'unit' in the topic map")
+
+
+@pytest.mark.parametrize("unit", ["deg", "si"])
+@pytest.mark.parametrize("slow", [1.0, 0.05])
+def test_angles(unit: str, slow: float, tmp_path: Path) -> None:
+    """Slow flights tilt by a degree, or a radian: gravity knows which."""
+    path, truth = tmp_path / "flight.csv", ways.flown()
+    table = {name: truth[name] for name in ("time", "x", "y", "z")}
+    table |= ways.angles(1.0 if unit == "si" else np.degrees(1.0))
+    if slow < 1:
+        table = ways.gentle(slow, np.degrees(1.0) if unit == "deg" else 1.0)
+    path.write_text(ways.text(table))
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\ntime: time\nsignals:\n  position: [x, y, z]\n"
+        "  attitude: {fields: [roll, pitch, yaw], quaternion: rpy}\n"
+    )
+    flight = load_flight(path, topics=tmp_path / "own.yaml")
+    tilt = np.abs(flight.series["attitude"].values[:, 1:3]).max()
+    assert tilt == pytest.approx(0.49 if slow == 1.0 else slow / 4, rel=0.2)
+    said = [n.names[1] for n in flight.notes if n.code is NoteCode.UNIT_READ]
+    assert said == ["in degrees"] * (unit == "deg")
+
+
+@pytest.mark.parametrize("way", ways.TABLES)
+def test_table_with(way: str, tmp_path: Path) -> None:
+    content, path = ways.TABLES[way](), tmp_path / "flight.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    flight = load_flight(path)
+    assert_same(flight, ("position", "attitude"))
+    if way == "PlotJuggler":
+        assert_same(flight, ("body_rate", "acceleration", "command"))
+    assert not [n for n in flight.notes if n.code in ("outliers", "not_a_number")]
+    assert not flight.damage
+
+
+@pytest.mark.parametrize("way", ways.NOT_READ)
+def test_what_stands_in_the_way_is_named(way: str, tmp_path: Path) -> None:
+    content, message = ways.NOT_READ[way]
+    with pytest.raises(RecordingError) as caught:
+        read(tmp_path, content())
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("way", ["PlotJuggler", "posX,quatW", "a row of other units"])
+def test_a_suggested_map_reads_the_table_alike(way: str, tmp_path: Path) -> None:
+    content, path = ways.TABLES[way](), tmp_path / "flight one.csv"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    suggestion = suggested_map(path)
+    (tmp_path / "own.yaml").write_text(suggestion)
+    assert_same(load_flight(path, topics=tmp_path / "own.yaml"), ("position", "attitude"))
+    assert "# rotor_speed: {fields: [..., ..., ..., ...], unit: si}" in suggestion
+
+
+def test_a_suggestion_says_units_by_numbers_and_what_is_not_used(tmp_path: Path) -> None:
+    path = tmp_path / "flight.csv"
+    path.write_text(
+        ways.changed(
+            {"x": lambda p: 1e3 * p, "y": lambda p: 1e3 * p, "z": lambda p: 1e3 * p}
+        ).replace("wz", 'odd""#', 1)
+    )
+    suggestion = suggested_map(path)
+    assert "by the numbers in millimetres" in suggestion
+    assert "# not used: " in suggestion
+
+
+MATRIX = ("time", *COLUMNS["position"], *COLUMNS["attitude"])
+
+
+def test_matlab_structures_each_with_a_time_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mat"
+    savemat(path, ways.structures(), do_compression=True)
+    assert_same(load_flight(path), ("position", "attitude", "body_rate", "command"), 0.03)
+
+
+def test_matlab_structure_of_simulink(tmp_path: Path) -> None:
+    table = ways.flown()
+    signals = [{"values": table[name], "label": name} for name in MATRIX[1:]]
+    savemat(tmp_path / "flight.mat", {"out": {"time": table["time"], "signals": signals}})
+    assert_same(load_flight(tmp_path / "flight.mat"), ("position", "attitude"))
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_matlab_matrix_needs_names(transposed: bool, tmp_path: Path) -> None:
+    matrix, path = np.column_stack([ways.flown()[n] for n in MATRIX]), tmp_path / "flight.mat"
+    savemat(path, {"data": matrix.T if transposed else matrix})
+    with pytest.raises(RecordingError, match="bare matrix 'data' of 8 columns") as caught:
+        load_flight(path)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "own.yaml").write_text(
+        "name: own\nformat: table\ntime: 'data[0]'\nsignals:\n"
+        "  position: ['data[1]', 'data[2]', 'data[3]']\n"
+        "  attitude: ['data[4]', 'data[5]', 'data[6]', 'data[7]']\n"
+    )
+    assert_same(load_flight(path, topics=tmp_path / "own.yaml"), ("position", "attitude"))
+
+
+def test_matlab_arrays_beside_each_other(tmp_path: Path) -> None:
+    savemat(tmp_path / "flight.mat", {name: ways.flown()[name] for name in MATRIX})
+    assert_same(load_flight(tmp_path / "flight.mat"), ("position", "attitude"))
+
+
+def _hdf5(h5py: object, path: Path) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:  # type: ignore[attr-defined]
+        for name, fields in ways.structures().items():
+            group = file.create_group(name)
+            for field, values in fields.items():
+                group[field] = np.atleast_2d(np.asarray(values).T)
+        group["else"] = h5py.ExternalLink("/etc/passwd", "x")  # type: ignore[attr-defined]
+    with path.open("r+b") as stream:
+        stream.write(b"MATLAB 7.3 MAT-file".ljust(512, b" "))
+
+
+def test_matlab_of_version_7_3(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    _hdf5(h5py, tmp_path / "flight.mat")
+    flight = load_flight(tmp_path / "flight.mat")
+    assert_same(flight, ("position", "attitude", "body_rate", "command"), 0.03)
+
+
+def test_matlab_of_version_7_3_without_h5py(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "flight.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(512, b" "))
+    with pytest.raises(RecordingError, match=r"install multirotor-tune\[matlab\], or save"):
+        load_flight(tmp_path / "flight.mat")
+
+
+def _nested(depth: int) -> bytes:
+    """Return a MATLAB file of cells inside cells."""
+    header = struct.pack("<IIIIIIiiII", 6, 8, 1, 0, 5, 8, 1, 1, 1, 0)
+    size, parts = 0, []
+    for _ in range(depth):
+        size += len(header)
+        parts.append(struct.pack("<II", 14, size) + header)
+        size += 8
+    return MAGIC.ljust(124) + b"\0\1IM" + b"".join(reversed(parts))
+
+
+@pytest.mark.parametrize("content", [
+    _nested(30_000),
+    MAGIC.ljust(124) + b"\0\1IM" + struct.pack("<II", 15, 40) + b"x" * 40,
+    MAGIC.ljust(124) + b"\0\1IM",
+    MAGIC,
+])  # fmt: skip
+def test_hostile_matlab_files_are_refused_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "flight.mat").write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        load_flight(tmp_path / "flight.mat")
+    assert "\n" not in str(caught.value)
+
+
+ORDERS = {"betaflight": (4, 1, 2, 3), "crazyflie": (1, 4, 2, 3), "[3, 1, 4, 2]": (2, 4, 1, 3)}
+"""How a motor order is written -> the rotor, in PX4's order, that each recorded motor drives."""
+
+
+def in_order(folder: Path, rotors: tuple[int, ...]) -> Path:
+    table = dict(ways.flown())
+    for name in ("command", "rotor_speed"):
+        held = [ways.flown()[f"{name}_{rotor}"] for rotor in rotors]
+        table |= {f"{name}_{i + 1}": column for i, column in enumerate(held)}
+    path = folder / "flight.csv"
+    path.write_text(ways.text(table))
+    return path
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_motor_order(order: str, tmp_path: Path) -> None:
+    path, vehicle = in_order(tmp_path, ORDERS[order]), read_vehicle(ways.VEHICLE)
+    (tmp_path / "own.yaml").write_text(
+        f"name: own\nformat: table\nextends: table\nmotor_order: {order}\nsignals: {{}}\n"
+    )
+    read_so = load_flight(path, topics=tmp_path / "own.yaml")
+    assert_same(read_so)
+    ordered = vehicle.replace(motor_order=yaml.safe_load(order))
+    (recording,) = read_recordings(settle(Options([str(path)], vehicle=ordered)))
+    assert_same(recording.flight)
+    path.with_suffix(".yaml").write_text(f"motor_order: {order}\n")
+    assert_same(load_flight(path))
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_line_on_a_wrong_motor_order_says_which_fits(order: str) -> None:
+    vehicle, step = read_vehicle(ways.VEHICLE), 1 / 200
+    time = np.arange(0.0, 14.0, step)
+    noise = np.random.default_rng(4).normal(0.0, 0.6, (len(time), 4))
+    command = 0.6 + signal.lfilter([step / 0.1], [1, step / 0.1 - 1], noise, axis=0)
+    turning = np.square(100 + 950 * command) @ levers(vehicle) * [4e-4, 4e-4, 2e-3]
+    rate = np.cumsum(turning - turning.mean(axis=0), axis=0) * step
+    rate -= signal.lfilter([step], [1, step - 1], rate, axis=0)
+    recorded = command[:, [rotor - 1 for rotor in ORDERS[order]]]
+    series = {"body_rate": Series(time, rate), "command": Series(time, recorded)}
+    (wrong,) = order_findings("flight", series, vehicle, (0.0, 14.0))
+    assert f"Write motor_order: {order} into the topic map" in one_line(wrong)
+
+
+def test_a_motor_order_that_is_none_is_refused(tmp_path: Path) -> None:
+    path = in_order(tmp_path, (1, 2, 3, 4))
+    for order in ("[1, 1, 2, 3]", "betaflite"):
+        path.with_suffix(".yaml").write_text(f"motor_order: {order}\n")
+        with pytest.raises(ConfigError, match="motor_order") as caught:
+            load_flight(path)
+        assert "\n" not in str(caught.value)
+
+
+def test_a_pose_alone_is_said_to_be_that(tmp_path: Path) -> None:
+    flight = read(tmp_path, ways.pose(*ways.POSE))
+    (note,) = [n for n in flight.notes if n.code is NoteCode.POSE_ALONE]
+    assert note.kind == "warning"
+    with pytest.raises(RecordingError, match="holds a pose alone, and neither a reference"):
+        as_fitted(tmp_path / "flight.csv")
+
+
+@pytest.mark.parametrize(("factor", "outcome"), [(1.0, "si"), (20.0, "ask"), (500.0, "deg/s")])
+def test_the_unit_of_a_gyro_without_a_pose(factor: float, outcome: str, tmp_path: Path) -> None:
+    time = np.arange(0.0, 10.0, 1 / 200)
+    turning = {f"w{a}": factor * 0.3 * np.sin(3 * time + i) for i, a in enumerate(ways.XYZ)}
+    force = {f"a{a}": 9.81 * (a == "z") + 0.0 * time for a in ways.XYZ}
+    table = {"time": time, **turning, **force, **dict.fromkeys(ways.COMMANDS, 0.5 + 0.0 * time)}
+    path = tmp_path / "flight.csv"
+    path.write_text(ways.text(table))
+    if outcome == "ask":
+        with pytest.raises(RecordingError, match=r"may be in rad/s or deg/s.*si or deg/s"):
+            read_inertial(path)
+        return
+    flight = read_inertial(path)
+    assert flight is not None
+    scale = 1.0 if outcome == "si" else np.radians(1.0)
+    expected = scale * factor * 0.3
+    assert np.abs(flight.series["body_rate"].values).max() == pytest.approx(expected, rel=0.01)

@@ -1,0 +1,131 @@
+"""What a search starts from, and when it asks for a second opinion."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import fitted_of, problem, truth
+from tuner.config import JobFile
+from tuner.config.job import Search
+from tuner.core.findings import Code
+from tuner.job.findings import end_findings, finer_than_steps, unmatched, voltage_taken
+from tuner.search import estimation as module
+from tuner.search.estimation import starting_vectors
+from tuner.search.fitted import Outcome
+from tuner.search.loop import USUAL
+from tuner.search.stages import left, plan
+from tuner.vehicle import ControllerFile
+from tuner.vehicle.space import space_of
+from tuner.wording.findings import sentence
+
+FREE = ("inertia_xx", "motor_constant", "estimate_latency")
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    fit = problem(FREE)
+    return fitted_of(fit, truth(fit))
+
+
+def job_with(updated, **search):
+    settings = SimpleNamespace(job=JobFile(free=FREE, search=Search(**search)))
+    return SimpleNamespace(
+        settings=settings,
+        space=space_of(updated, ControllerFile(), settings.job),
+        inlets=("reference", "reference"),
+        fitted=("a", "b"),
+    )
+
+
+def test_random_starts_lie_in_the_box_and_the_first_is_the_vehicles(updated):
+    job = job_with(updated, starts=50, spread=3.0)
+    vectors = starting_vectors(job)
+    assert vectors.shape == (50, 3)
+    np.testing.assert_allclose(vectors[0], job.space.initial)
+    values = [job.space.values(vector) for vector in vectors]
+    drawn = np.array([float(drawn_values["motor_constant"]) for drawn_values in values])
+    initial = job.space.parameters[job.space.names.index("motor_constant")].initial
+    ratio = drawn / initial
+    assert 1 / 3.01 < ratio.min() < 0.5
+    assert 2.0 < ratio.max() < 3.01
+    np.testing.assert_array_equal(vectors, starting_vectors(job))
+    reseeded = job_with(updated, starts=50, spread=3.0, seed=1)
+    assert not np.array_equal(vectors[1:], starting_vectors(reseeded)[1:])
+
+
+def test_starts_that_agree_are_believed(fitted, updated):
+    job = job_with(updated, starts=4)
+    agree = replace(fitted, outcomes=ends(1.0, 1.001, 7.0, 9.0))
+    assert module._doubt(job, agree) is None
+    differ = replace(fitted, outcomes=ends(1.0, 1.3, 7.0, 9.0))
+    doubt = module._doubt(job, differ)
+    assert (doubt.code, doubt.numbers) == (Code.STARTS_DISAGREE, {"starts": 4})
+
+
+def test_flights_that_stay_far_off_ask_for_a_second_opinion(fitted, updated):
+    job = job_with(updated)
+    lost = {"a": {"position": 50.0, "body_rate": 30.0}, "b": {"position": 40.0, "body_rate": 3.0}}
+    assert module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0))) is None
+    lost["b"]["body_rate"] = 12.0
+    doubt = module._doubt(job, replace(fitted, scales=lost, outcomes=ends(1.0)))
+    assert (doubt.code, doubt.numbers) == (Code.FLIGHTS_FAR_OFF, {"far_off": 2, "flights": 2})
+
+
+def ends(*losses):
+    nowhere = np.zeros(len(FREE))
+    return tuple(Outcome(nowhere, nowhere, loss, "random") for loss in losses)
+
+
+def test_the_odd_flight_is_named_and_what_all_lack_is_the_models():
+    job = SimpleNamespace(
+        settings=SimpleNamespace(
+            controller=SimpleNamespace(
+                mixer=SimpleNamespace(saturation_feedback=True),
+                sensing=SimpleNamespace(sees_markers=False),
+            )
+        )
+    )
+    one_stray = {"a": {"position": 1.0}, "b": {"position": 1.2}, "c": {"position": 90.0}}
+    assert set(unmatched(one_stray)) == {"c"}
+    (finding,) = end_findings(job, USUAL, one_stray)
+    assert (finding.code, finding.subject) == (Code.FLIGHT_UNMATCHED, "c")
+    all_far = {"a": {"position": 30.0}, "b": {"position": 40.0}, "c": {"position": 35.0}}
+    (finding,) = end_findings(job, USUAL, all_far)
+    assert finding.code is Code.MODEL_UNMATCHED
+    assert finding.numbers == {"unmatched": 3, "flights": 3, "noise_multiple": 35.0}
+
+
+def test_a_lag_known_more_finely_than_physics_steps_is_warned_of():
+    estimates = {
+        name: SimpleNamespace(std_error=error)
+        for name, error in {
+            "time_constant_up": 2e-5,
+            "time_constant_down": 5e-4,
+            "motor_constant": 1e-9,
+        }.items()
+    }
+    (finding,) = finer_than_steps(SimpleNamespace(estimates=estimates))
+    assert finding.subject == "time_constant_up"
+    assert finding.numbers == {"seconds": 1e-4}
+    estimates["time_constant_up"] = SimpleNamespace(std_error=2e-4)
+    assert finer_than_steps(SimpleNamespace(estimates=estimates)) == ()
+
+
+def test_a_curve_of_motors_says_at_which_voltage_it_holds(updated):
+    best = updated.replace(
+        effects={"battery_exponent": 1.0}, battery=updated.battery.replace(reference_voltage=16.36)
+    )
+    (finding,) = voltage_taken(updated, best)
+    assert "16.36 V" in sentence(finding)
+    assert voltage_taken(best, best) == ()  # given
+    assert voltage_taken(updated, best.replace(effects={})) == ()
+
+
+def test_time_left_falls_to_nothing():
+    stages = plan("gradient", 4000, 400.0, windows=False, robust=True, steps=50)
+    remaining = [left(stages, stage, 0, 10.0) for stage in range(1, len(stages) + 1)]
+    assert remaining == sorted(remaining, reverse=True)
+    assert remaining[-1] == 0.0
+    assert np.isnan(left(stages, 0, 0, 0.0))

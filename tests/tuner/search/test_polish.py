@@ -1,0 +1,53 @@
+"""What a search that is done again forgets, and what it keeps."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty.making import FLIGHTS, NOISE, fitted_of, problem, truth
+from tuner.config import JobFile
+from tuner.search import polish
+from tuner.search.loop import Loop, loop_of, with_loop
+from tuner.search.optimiser import Free
+from tuner.search.progress import beginning
+
+PLAIN = ("motor_constant", "inertia_xx", "inertia_yy")
+
+
+@pytest.mark.parametrize("choice", Loop._fields)
+@pytest.mark.parametrize("own", [0.0, 1.0])
+def test_a_search_from_anew_decides_again_from_the_set_ups_own_loop(monkeypatch, own, choice):
+    """A model that lacked terms may have chosen the wrong one."""
+    own = Loop()._replace(**{choice: own})
+    objective = with_loop(problem(PLAIN), own)
+    fitted = fitted_of(with_loop(objective, own.switched(choice)), truth(objective))
+    job = SimpleNamespace(
+        objective=objective,
+        settings=SimpleNamespace(job=JobFile()),
+        fitted=[SimpleNamespace(name=name) for name in FLIGHTS],
+        undecided=lambda _: (choice,),
+    )
+    asked = {}
+
+    def grown(_, __, progress, *, undecided, **___):
+        asked.update(undecided=undecided, loop=progress.loop)
+        scales = {name: np.ones(len(FLIGHTS)) for name in NOISE}
+        loop = own.switched(choice)
+        return replace(progress, loop=loop, scales=scales, losses=np.ones(1))
+
+    monkeypatch.setattr(polish, "grow", grown)
+    free = Free(np.ones(3, bool), np.zeros(fitted.point.offsets.shape, bool))
+    said = {"free": free, "title": "again", "on_progress": lambda _: None}
+    again = polish.searched_again(job, fitted, objective.space.initial, **said)
+    assert asked == {"undecided": (choice,), "loop": own}
+    assert loop_of(again.objective) == own.switched(choice)
+    polish.polished(job, again, **said)
+    assert asked == {"undecided": (), "loop": own.switched(choice)}
+
+
+@pytest.mark.parametrize("own", [Loop(0.0, 1.0), Loop(1.0, 0.0)])
+def test_a_search_begins_with_the_set_ups_own_loop(own):
+    objective = with_loop(problem(PLAIN), own)
+    assert beginning(objective, np.asarray(objective.space.initial)[None]).loop == own

@@ -1,0 +1,160 @@
+"""Sensitivities against simulations with the coefficient changed by hand."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty import making
+from tuner.objective.flight_batches import portions
+from tuner.objective.normal import Objective
+from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.knowledge import knowledge_of, shortest_half
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.tables import write_files
+
+FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
+UNIT = {"position": 1.0, "attitude": 180.0 / np.pi, "body_rate": 1.0, "rotor_speed": 1.0}
+
+
+@pytest.fixture(scope="module")
+def objective() -> Objective:
+    exact = making.problem(FREE)
+    return making.with_data(exact, making.truth(exact), noise=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def examination(objective: Objective) -> Examination:
+    return examine(making.fitted_of(objective, making.truth(objective)))
+
+
+@pytest.fixture(scope="module")
+def knowledge(objective: Objective, examination: Examination) -> Knowledge:
+    return knowledge_of(examination, objective.space, making.truth(objective))
+
+
+def test_flights_that_do_not_fit_the_memory_take_turns(
+    objective: Objective, examination: Examination
+) -> None:
+    small = replace(objective, memory=1)
+    fitted = making.fitted_of(small, making.truth(small))
+    assert [list(p) for p in portions(small, fitted.point, fitted.criterion)] == [[0], [1]]
+    turns = examine(fitted)
+    assert turns.residuals[0].flight != turns.residuals[-1].flight
+    assert [r.flight for r in turns.residuals] == [r.flight for r in examination.residuals]
+    for in_turns, at_once in (
+        (turns.information, examination.information),
+        (turns.sensitivity, examination.sensitivity),
+    ):
+        for name, value in vars(at_once).items():
+            if isinstance(value, np.ndarray):
+                size = np.abs(np.nan_to_num(value)).max()
+                np.testing.assert_allclose(getattr(in_turns, name), value, atol=1e-9 * size)
+            elif name != "outputs":
+                assert getattr(in_turns, name) == value
+    assert [o.rmse for o in turns.sensitivity.outputs] == pytest.approx(
+        [o.rmse for o in examination.sensitivity.outputs]
+    )
+
+
+def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:
+    """Return channel -> (n, k, F) residuals in its unit with one coefficient changed."""
+    space = objective.space
+    values = {n: float(v) for n, v in space.values(jnp.asarray(space.initial)).items()}
+    values[name] *= factor
+    point = objective.start(space.vector_of(values))
+    jacobian = objective.jacobian(point, making.criterion_of(objective))
+    return {c: np.asarray(r) * making.NOISE[c] * UNIT[c] for c, r in jacobian.residuals.items()}
+
+
+@pytest.mark.parametrize("name", ["inertia_xx", "moment_constant"])
+def test_the_change_for_one_percent_is_the_simulations_own(
+    objective: Objective, knowledge: Knowledge, name: str
+) -> None:
+    up, down = flown(objective, name, 1.0005), flown(objective, name, 0.9995)
+    for output in knowledge.outputs:
+        segment = making.FLIGHTS.index(output.flight)
+        axis = "1234".find(output.axis) if output.channel == "rotor_speed" else None
+        row = ["x", "y", "z"].index(output.axis) if output.axis in "xyz" else axis
+        if row is None:
+            row = ["roll", "pitch", "yaw"].index(output.axis)
+        change = (up[output.channel] - down[output.channel])[:, row, segment] * 10.0
+        expected = np.sqrt(np.mean(change**2))
+        tiny = 1e-6 * making.NOISE[output.channel] * UNIT[output.channel]
+        assert output.change[name] == pytest.approx(expected, rel=1e-3, abs=tiny)
+
+
+def test_rmse_for_ten_percent_is_the_simulations_own(
+    objective: Objective, knowledge: Knowledge
+) -> None:
+    up = flown(objective, "motor_constant", 1.1)
+    for output in knowledge.outputs:
+        if output.channel == "position":
+            segment, row = making.FLIGHTS.index(output.flight), "xyz".index(output.axis)
+            expected = np.sqrt(np.mean(up["position"][:, row, segment] ** 2))
+            assert output.rmse_up["motor_constant"] == pytest.approx(expected, rel=1e-3)
+            assert output.rmse < expected or output.flight == "spin"
+
+
+def test_fixed_coefficients_are_examined_as_if_they_were_free(knowledge: Knowledge) -> None:
+    mass = knowledge.coefficients["mass"]
+    assert not mass.fitted
+    assert mass.bias["motor_constant"] > 0.2
+    assert set(knowledge.coefficients) > set(FREE)
+
+
+def test_an_increase_of_the_fixed_one_moves_the_fitted_as_a_refit_would(
+    objective: Objective, examination: Examination
+) -> None:
+    information = examination.information
+    count = len(objective.space)
+    place = count + list(examination.freed).index("mass")
+    step = -np.linalg.solve(information.total[:count, :count], information.data[:count, place])
+    names = list(objective.space.names)
+    row = examination.bias[list(examination.freed).index("mass")]
+    motor = names.index("motor_constant")
+    assert row[motor] == pytest.approx(step[motor])
+
+
+def test_white_residuals_are_called_white(examination: Examination) -> None:
+    assert len(examination.residuals) == 8
+    assert sum(residual.white for residual in examination.residuals) >= 7
+    for residual in examination.residuals:
+        assert residual.rms == pytest.approx(1.0, abs=0.15)
+
+
+def test_residuals_of_a_wrong_model_are_not_white(objective: Objective) -> None:
+    wrong = objective.start(objective.space.initial + 0.1)
+    coloured = examine(making.fitted_of(objective, wrong)).residuals
+    assert not any(residual.white for residual in coloured if residual.channel == "position")
+
+
+def test_half_of_an_effect_is_where_it_is() -> None:
+    effect = np.zeros(40)
+    effect[20:24] = 1.0
+    assert shortest_half(np.arange(40) + 0.5, effect) == (20.0, 22.0)
+    assert shortest_half(np.arange(40) + 0.5, np.zeros(40)) == (0.0, 40.0)
+
+
+def test_files_hold_the_knowledge(knowledge: Knowledge, tmp_path: Path) -> None:
+    write_files(knowledge, tmp_path)
+    assert Knowledge.read(tmp_path) == knowledge
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "sensitivity.csv").read_text())))
+    assert {row["coefficient"] for row in rows} == set(knowledge.coefficients)
+    assert len(rows) == len(knowledge.coefficients) * 26
+    assert {row["unit"] for row in rows if row["channel"] == "attitude"} == {"deg"}
+    lines = (tmp_path / "covariance.csv").read_text().splitlines()
+    assert lines[0] == "coefficient," + ",".join(FREE)
+    matrix = np.array([[float(v) for v in line.split(",")[1:]] for line in lines[1:]])
+    errors = [knowledge.coefficients[name].std_error for name in FREE]
+    assert np.sqrt(np.diag(matrix)) == pytest.approx(errors)
+    shares = list(csv.DictReader(io.StringIO((tmp_path / "information_shares.csv").read_text())))
+    for name in knowledge.coefficients:
+        total_share = sum(float(row["share"]) for row in shares if row["coefficient"] == name)
+        assert total_share == pytest.approx(1.0)

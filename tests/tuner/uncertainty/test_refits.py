@@ -1,0 +1,71 @@
+"""Refits to other flights: what counts how often, and the errors that follow."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from tests.tuner.uncertainty import making
+from tuner.core.errors import ConfigError
+from tuner.evaluate.cross_validation import Fold, jackknife_errors
+from tuner.report.sections.tables import refits
+from tuner.uncertainty.bootstrap import check_bootstrap
+from tuner.uncertainty.refits import _counted
+from tuner.wording.result import refits_in_words
+
+FREE = ("inertia_xx", "motor_constant", "estimate_latency")
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error():
+    drawn = np.random.default_rng(1).normal(size=7)
+    left_out = [np.delete(drawn, i).mean() for i in range(7)]
+    folds = [Fold(str(i), {"mass": mean}, None) for i, mean in enumerate(left_out)]
+    assert jackknife_errors(folds) == {"mass": pytest.approx(np.std(drawn, ddof=1) / np.sqrt(7))}
+
+
+def test_a_flight_counts_as_often_as_it_was_drawn():
+    objective = making.problem(FREE)
+    fitted = making.fitted_of(objective, making.truth(objective))
+    point, criterion = fitted.point, fitted.criterion
+    once = objective.sums(point, criterion)
+    counts = np.zeros(objective.flights)
+    counts[0] = 3.0
+    often = _counted(objective, counts).sums(point, criterion)
+    of_first = np.asarray(objective.segments.flight) == 0
+    for name in ("loss", "gradient", "hessian"):
+        np.testing.assert_allclose(
+            getattr(often, name), 3.0 * np.asarray(getattr(once, name)) * of_first, rtol=1e-12
+        )
+    # how well a flight is met, from which its weights follow, is no matter of how often it counts
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(a, b * of_first), often.squares, once.squares
+    )
+
+
+def test_a_single_refit_is_refused():
+    with pytest.raises(ConfigError, match=r"--bootstrap: is 1; give two refits or more"):
+        check_bootstrap(1)
+
+
+def result_with(**errors):
+    found = [
+        SimpleNamespace(std_error=1.0, jackknife_error=error, bootstrap_error=None, best=2.0)
+        for error in errors.values()
+    ]
+    flights = [SimpleNamespace(split=split) for split in ("fit", "fit", "fit", "holdout")]
+    return SimpleNamespace(coefficients=dict(zip(errors, found, strict=True)), flights=flights)
+
+
+def test_what_the_flights_disagree_about_is_named():
+    precision, disagree = refits_in_words(result_with(inertia_xx=1.2, moment_constant=2.5))
+    assert precision.endswith("known to about ±50 %.")
+    assert disagree.startswith("The flights disagree about moment_constant by more than twice")
+    assert "disagree about no coefficient" in refits_in_words(result_with(inertia_xx=1.2))[1]
+
+
+def test_a_fit_without_refits_says_nothing_of_them():
+    assert refits_in_words(result_with(inertia_xx=None)) == ()
+    run = SimpleNamespace(result=result_with(inertia_xx=None))
+    assert refits(SimpleNamespace(run=run)) is None
+    assert refits(SimpleNamespace(run=None)) is None

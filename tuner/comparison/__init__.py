@@ -1,1 +1,0 @@
-"""Simulated compared with recorded for given coefficients: nothing is fitted here."""

@@ -1,0 +1,1 @@
+"""What every room needs: errors, files, YAML, findings, numerics, the time that stages take."""

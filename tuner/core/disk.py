@@ -1,0 +1,231 @@
+"""The file system: what is written appears whole, and a refusal becomes one line for the user.
+
+Standard library only, so that a recording seen before is answered before anything heavy is loaded.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from tuner.core.errors import InputError, OutputError, RecordingError
+
+LONGEST_NAME = 100
+"""Letters of a file's name that is made of another name, its suffix included."""
+_PLAIN = re.compile(r"\w(?:[\w.-]*[\w-])?", re.ASCII)
+
+
+def file_name(name: str, suffix: str = "") -> str:
+    """Return a file's name for what a recording, a file or a request calls something.
+
+    It has ASCII letters, digits, ``_``, ``-`` and dots inside it, and begins with no dot or dash. A
+    plain name is kept. Another is made plain and gets some digits of its digest, so that two names
+    do not come to one file.
+    """
+    most = LONGEST_NAME - len(suffix)
+    if len(name) <= most and _PLAIN.fullmatch(name):
+        return name + suffix
+    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+    plain = re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).lstrip(".-")[: most - 1 - len(digest)]
+    return f"{plain or 'unnamed'}-{digest}{suffix}"
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Return the path of a name below a folder, once it is sure that it lies there.
+
+    Raises
+    ------
+    OutputError
+        The name, or a link that stands there, leads elsewhere.
+    """
+    path = folder / name
+    with _refusals(path):
+        if "\0" not in name and "\\" not in name:
+            place, whole = path.resolve(), folder.resolve()
+            if whole in place.parents:
+                return path
+    raise OutputError(repr(name), f"leads out of {folder}", "name a file inside it")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8 that appears whole or not at all.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written.
+    """
+    with whole_file(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8", newline="")
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """Give the path of an unfinished file beside ``path`` that takes its place in the end.
+
+    If anything fails before, what stood at ``path`` stays as it was and nothing is left beside it.
+
+    Raises
+    ------
+    OutputError
+        The system refuses to write there.
+    """
+    with _refusals(path):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix)
+        os.close(handle)
+        unfinished = Path(name)
+        try:
+            yield unfinished
+            unfinished.chmod(0o644)
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, where they do not exist yet.
+
+    Raises
+    ------
+    OutputError
+        A file is in the way, or the system refuses.
+    """
+    with _refusals(path):
+        path.mkdir(parents=True, exist_ok=True)
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder that could not be made or written to, without making it.
+
+    Raises
+    ------
+    OutputError
+        A file is in the way, or the system refuses.
+    """
+    with _refusals(path):
+        if _stands(path) and not path.is_dir():
+            raise OSError(errno.EEXIST, "")
+        _check_writable(path)
+
+
+def check_file(path: Path, *, folder_is_made: bool = False) -> None:
+    """Refuse a file that could not be written, without touching it.
+
+    Raises
+    ------
+    OutputError
+        It is a folder, its folder does not exist and is not ``folder_is_made`` before writing, or
+        the system refuses.
+    """
+    with _refusals(path):
+        if _stands(path) and path.is_dir():
+            raise OSError(errno.EISDIR, "")
+        if not folder_is_made and not _stands(path.parent):
+            raise OSError(errno.ENOENT, "")
+        _check_writable(path.parent)
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise what the system would say to something new in a folder that may not exist yet."""
+    whole = folder.absolute()
+    nearest = next(above for above in (whole, *whole.parents) if _stands(above))
+    if not nearest.is_dir():
+        raise OSError(errno.ENOTDIR, "")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise OSError(errno.EACCES, "")
+
+
+def _stands(path: Path) -> bool:
+    """Return whether something has this path; a refusal to look is raised as it is."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # ValueError: a null byte
+        return False
+    return True
+
+
+#: The operating system's refusals to write: why, and what to do.
+_REFUSALS = {
+    errno.EACCES: ("this user may not write there", "name a place that you may write to"),
+    errno.EPERM: ("this user may not write there", "name a place that you may write to"),
+    errno.EROFS: ("the file system is read-only", "name a place that can be written to"),
+    errno.ENOSPC: ("the disk is full", "free some space and try again"),
+    errno.EDQUOT: ("the disk quota is used up", "free some space and try again"),
+    errno.ENAMETOOLONG: ("the path is too long", "give a shorter one"),
+    errno.ENOTDIR: ("it lies inside a file", "name a place in a folder"),
+    errno.EEXIST: ("it is a file", "name a folder"),
+    errno.EISDIR: ("it is a folder", "name a file"),
+    errno.ENOENT: ("its folder does not exist", "make the folder first"),
+}
+
+
+@contextmanager
+def _refusals(path: Path) -> Iterator[None]:
+    """Turn a refusal of the operating system into one line that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        why, remedy = _REFUSALS.get(error.errno or 0, (str(error), "name another place"))
+        raise OutputError(path, f"cannot be written: {why}", remedy) from None
+
+
+def exists(path: Path) -> bool:
+    """Return whether there is a file or folder of this path.
+
+    Raises
+    ------
+    InputError
+        The system refuses to look: the path is too long, or a folder above may not be read.
+    """
+    try:
+        return _stands(path)
+    except OSError as error:
+        raise InputError(
+            path, f"cannot be read ({error.strerror})", "check the path and its rights"
+        ) from None
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn the system's refusal to read a recording, at its start or midway, into one line.
+
+    Midway it comes of a disk that fails or of a network drive that goes away.
+
+    Raises
+    ------
+    RecordingError
+        The system refused.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise RecordingError(path, "no such file", "check the path") from None
+    except OSError as error:
+        what = f"cannot be read ({error.strerror or error})"
+        raise RecordingError(path, what, "check its rights and the disk") from None
+
+
+def cache_folder() -> Path:
+    """Return the folder in which this program may keep what it can make again."""
+    if chosen := os.environ.get("XDG_CACHE_HOME"):
+        base = Path(chosen)
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    elif sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    else:
+        base = Path.home() / ".cache"
+    return base / "multirotor-tune"
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,142 @@
+"""JSON, CSV and arrays of a result folder: JSON is read with a limit and a schema version."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self
+from zipfile import BadZipFile
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import from_json
+
+from tuner.core.disk import write_text
+from tuner.core.errors import ConfigError, InputError
+from tuner.core.validation import config_error
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MAX_BYTES = 50_000_000
+"""Of a JSON file of a result folder."""
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Return CSV text, numbers in full precision and nothing for None."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(["" if v is None else repr(v) if isinstance(v, float) else v for v in row])
+    return text.getvalue()
+
+
+def read_bytes(path: Path, *, most: int, remedy: str) -> bytes:
+    """Return the content of a file, if it holds no more than so many bytes.
+
+    Raises
+    ------
+    ConfigError
+        The file does not exist, cannot be read or is larger; ``remedy`` says what to do.
+    """
+    try:
+        with path.open("rb") as file:
+            raw = file.read(most + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ConfigError(path, "does not exist", remedy) from None
+    except OSError as error:
+        raise ConfigError(path, f"cannot be read ({error.strerror})", remedy) from None
+    if len(raw) > most:
+        raise ConfigError(path, f"is larger than {most // 1_000_000} MB", remedy)
+    return raw
+
+
+def read_arrays(path: Path, *, remedy: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an ``.npz`` file by their names.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is damaged; ``remedy`` says what to do.
+    """
+    import numpy as np  # noqa: PLC0415 (`tune --help` answers without it)
+
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except (OSError, EOFError, BadZipFile, ValueError, TypeError, AttributeError) as error:
+        raise InputError(path, f"is damaged ({error})", remedy) from None
+
+
+class Part(BaseModel):
+    """A part of a JSON file of a result folder; unknown keys are ignored."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore")
+
+
+FiniteOrNone = Annotated[
+    float | None, AfterValidator(lambda v: v if v is not None and math.isfinite(v) else None)
+]
+"""A number for a JSON file, which has none for infinity and not-a-number: those are None."""
+
+
+class ResultFile(Part):
+    """The whole of a JSON file of a result folder.
+
+    The default of ``schema_version`` is the version that this program writes, and the only one that
+    it reads.
+    """
+
+    FILE: ClassVar[str]
+    INDENT: ClassVar[int | None] = 1
+
+    schema_version: int = 1
+
+    def write(self, folder: Path) -> None:
+        """Write the file, which appears whole, into a result folder.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written there.
+        """
+        write_text(folder / self.FILE, self.model_dump_json(indent=self.INDENT) + "\n")
+
+    @classmethod
+    def read_if_any(cls, folder: Path) -> Self | None:
+        """Read the file of a result folder as `read` does; None where there is none."""
+        return cls.read(folder) if (folder / cls.FILE).exists() else None
+
+    @classmethod
+    def read(
+        cls,
+        folder: Path,
+        remedy: str = "run tune again, or use the tune that wrote this folder",
+    ) -> Self:
+        """Read the file of a result folder.
+
+        Raises
+        ------
+        InputError
+            The file is missing, cannot be read, is too large, is of another schema version or of
+            none, or lacks a key; ``remedy`` says what to do.
+        """
+        path = folder / cls.FILE
+        raw = read_bytes(path, most=MAX_BYTES, remedy=remedy)
+        try:
+            content = from_json(raw)
+        except ValueError as error:
+            raise InputError(path, f"is not JSON ({error})", remedy) from None
+        version = cls.model_fields["schema_version"].default
+        of_file = content.get("schema_version") if isinstance(content, dict) else None
+        if of_file != version:
+            what = "has no schema version" if of_file is None else f"has schema version {of_file}"
+            raise InputError(path, f"{what}, and this tune reads version {version}", remedy)
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            wrong = config_error(error, path)
+            raise InputError(path, wrong.what, wrong.remedy) from None

@@ -1,0 +1,107 @@
+"""How jax is set up for this program: threads, precision, compiled code.
+
+A job's flights run as kernels of `lanes`, which have threads of their own. What XLA computes in a
+job is small, and its thread pool makes it slower: it is turned off. Flights that do run through XLA
+(reverse mode, one's own programs with `sim_jax`) want two things of it: loops compiled as one
+function, ten times faster for one vehicle, and fusions of several outputs prepared, without which
+each number of a step is computed anew, 3.7 times as many operations.
+
+Whatever the user has set in the environment stays.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+from importlib.metadata import version
+
+from tuner.core.disk import cache_folder
+
+logger = logging.getLogger(__name__)
+
+COMPILED = "/jax/core/compile/backend_compile_duration"
+"""What `jax.monitoring` calls the end of compiling, or of reading compiled code from the cache."""
+
+#: Releases of jaxlib (major.minor) known to accept the flags below: an unknown one is fatal.
+_RELEASES_KNOWN = ("0.10",)
+_LARGER_THAN_ANY_LOOP = 10**15
+"""bytes"""
+_FLAGS = {
+    "--xla_disable_hlo_passes": "cpu_multi_output_fusion",
+    "--xla_backend_extra_options": "xla_cpu_use_multi_output_fusion,"
+    f"xla_cpu_small_while_loop_byte_threshold={_LARGER_THAN_ANY_LOOP}",
+}
+_COLLECT_AFTER = (100_000, 20, 100)
+"""New objects, and collections of younger ones, after which Python looks for garbage. A program
+that jax traces is hundreds of thousands of objects that stay, which Python's own 700 look through
+again and again."""
+
+
+def cores() -> int:
+    """Return how many processor cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on Linux
+        return os.cpu_count() or 1
+
+
+def set_environment() -> None:
+    """Set what jax reads from the environment when it makes its devices."""
+    os.environ.setdefault("NPROC", "1")
+    # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    if version("jaxlib").rpartition(".")[0] not in _RELEASES_KNOWN:
+        return
+    given = os.environ.get("XLA_FLAGS", "")
+    names = {flag.partition("=")[0] for flag in given.split()}
+    added = [f"{name}={value}" for name, value in _FLAGS.items() if name not in names]
+    os.environ["XLA_FLAGS"] = " ".join([given, *added]).strip()
+
+
+def collect_rarely() -> None:
+    """Have Python look for garbage less often than it does by itself, unless it does already."""
+    if gc.get_threshold()[0] < _COLLECT_AFTER[0]:
+        gc.set_threshold(*_COLLECT_AFTER)
+
+
+def configure(*, keep_compiled: bool = True) -> None:
+    """Set jax up for simulation; call it once, before the first computation.
+
+    It computes in double precision unless ``JAX_ENABLE_X64`` says otherwise.
+    The environment variables ``NPROC`` and ``XLA_FLAGS`` are read when jax makes its devices: a
+    program that has already computed with jax keeps what it has, at the price of speed alone.
+
+    Parameters
+    ----------
+    keep_compiled
+        Keep compiled code in the user's cache folder, so that the same job starts at once the next
+        time, unless ``JAX_COMPILATION_CACHE_DIR`` names another folder.
+    """
+    set_environment()
+    collect_rarely()
+    import jax  # noqa: PLC0415 (must come after the environment, and is slow)
+
+    if keep_compiled:
+        from lanes import keep_code_in  # noqa: PLC0415 (imports jax)
+
+        keep_code_in(cache_folder() / "kernels")
+    if "JAX_ENABLE_X64" not in os.environ:
+        jax.config.update("jax_enable_x64", True)
+    if keep_compiled and jax.config.jax_compilation_cache_dir is None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "compiled"))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+        jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    logger.debug("%s", describe())
+
+
+def describe() -> str:
+    """Return one line on the settings in force, to stand beside every measured figure."""
+    import jax  # noqa: PLC0415 (slow to import)
+
+    devices = jax.devices()
+    precision = jax.dtypes.canonicalize_dtype(float)
+    return (
+        f"jax {jax.__version__}, {len(devices)} {devices[0].platform} device(s), {precision}, "
+        f"NPROC={os.environ.get('NPROC', '')}, XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}"
+    )

@@ -1,0 +1,49 @@
+"""The configuration that ships: found in a checkout and in an installed package alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from tuner.core.disk import exists
+from tuner.core.errors import ConfigError, did_you_mean
+
+Kind = Literal["vehicles", "controllers", "topics"]
+
+
+def configs_folder() -> Path:
+    """Return ``tuner/configs`` of an installed package, or ``configs`` of a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "configs"
+    return installed if installed.is_dir() else package.parent / "configs"
+
+
+def find_config(kind: Kind, reference: str, base: Path) -> Path:
+    """Return the file that a user means.
+
+    Parameters
+    ----------
+    kind
+        The folder of ``configs/`` in which shipped files are looked up.
+    reference
+        A path, relative to ``base``, or the bare name of a shipped file such as ``hovergames``.
+    base
+        Folder from which relative paths count.
+
+    Raises
+    ------
+    ConfigError
+        A bare name is no shipped file's. Whether a path can be read is checked by its reader.
+    """
+    path = base / Path(reference).expanduser()
+    if path.suffix in {".yaml", ".yml"} or len(Path(reference).parts) != 1 or exists(path):
+        return path
+    folder = configs_folder() / kind
+    known = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    if reference not in known:
+        raise ConfigError(
+            reference,
+            f"is neither a file nor one of the shipped {kind}",
+            did_you_mean(reference, known),
+        )
+    return known[reference]

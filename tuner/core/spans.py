@@ -1,0 +1,240 @@
+"""Where a run's seconds go: stages as spans of time, with what jax does in them.
+
+A stage is a block ``with span("search"):``. Unless a run is recorded it costs a look at a variable.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+
+from tuner.core.runtime import COMPILED, set_environment
+
+TRACING = "tracing"
+LOWERING = "lowering"
+COMPILING = "compiling"
+LOADING = "loading compiled code"
+BUILDING = "building kernels"
+OF_JAX = {
+    "/jax/core/compile/jaxpr_trace_duration": TRACING,
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": LOWERING,
+    COMPILED: COMPILING,
+    "/jax/compilation_cache/cache_retrieval_time_sec": LOADING,
+    "/lanes/build_duration": BUILDING,
+}
+"""Event of `jax.monitoring` -> what it is called here."""
+START = "start of Python"
+ELSEWHERE = "elsewhere"
+"""What the main thread does outside every stage."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of time.
+
+    Attributes
+    ----------
+    name
+        Of the stage, or one of `OF_JAX`.
+    begin, end
+        s since the process began.
+    detail
+        What was traced or compiled.
+    beside
+        Whether another process or thread did it, while this one went on.
+    processor
+        Processor seconds of this process, all threads together; known of stages alone.
+    """
+
+    name: str
+    begin: float
+    end: float
+    detail: str = ""
+    beside: bool = False
+    processor: float = 0.0
+
+    @property
+    def is_stage(self) -> bool:
+        """Whether it is a stage of this process, rather than what jax does in one."""
+        return self.name not in OF_JAX.values() and not self.beside
+
+
+@dataclass
+class Recorder:
+    """Collects the spans of one run, as they end."""
+
+    spans: list[Span] = field(default_factory=list)
+    thread: int = field(default_factory=threading.get_ident)
+    """Whose stages they are."""
+    began: float = field(default_factory=lambda: time.perf_counter() - time.process_time())
+    """The process's begin on `time.perf_counter`: until now it has done nothing but compute."""
+
+    def now(self) -> float:
+        """Return the s since the process began."""
+        return time.perf_counter() - self.began
+
+    def add_duration(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        """Add what jax reports at its end, if it is one of `OF_JAX`."""
+        if event in OF_JAX:
+            end, detail = self.now(), str(kwargs.get("fun_name", ""))
+            beside = threading.get_ident() != self.thread
+            self.spans.append(Span(OF_JAX[event], end - duration_secs, end, detail, beside))
+
+
+_RECORDER: ContextVar[Recorder | None] = ContextVar("_RECORDER", default=None)
+_WATCHER: ContextVar[Callable[[str], None] | None] = ContextVar("_WATCHER", default=None)
+_STAGE: ContextVar[str] = ContextVar("_STAGE", default="")
+
+
+@contextmanager
+def span(name: str) -> Iterator[None]:
+    """Count the time of a block as the stage ``name``'s, where a run is recorded.
+
+    Whoever watches the run is told the stage, and at its end the one that it was in.
+    """
+    watcher = _WATCHER.get()
+    if watcher is None:
+        with _counted(name):
+            yield
+        return
+    outer = _STAGE.set(name)
+    watcher(name)
+    try:
+        with _counted(name):
+            yield
+    finally:
+        _STAGE.reset(outer)
+        watcher(_STAGE.get())
+
+
+@contextmanager
+def watching(on_stage: Callable[[str], None]) -> Iterator[None]:
+    """Have each stage of a block named as it begins; an empty name is none."""
+    token = _WATCHER.set(on_stage)
+    try:
+        yield
+    finally:
+        _WATCHER.reset(token)
+
+
+@contextmanager
+def _counted(name: str) -> Iterator[None]:
+    recorder = _RECORDER.get()
+    if recorder is None:
+        yield
+        return
+    begin, used = recorder.now(), time.process_time()
+    try:
+        yield
+    finally:
+        spent = time.process_time() - used
+        recorder.spans.append(Span(name, begin, recorder.now(), processor=spent))
+
+
+def add_beside(name: str, began: float, ended: float) -> None:
+    """Add what another process did between two readings of `time.time`."""
+    recorder = _RECORDER.get()
+    if recorder is not None:
+        shift = recorder.now() - time.time()
+        recorder.spans.append(Span(name, began + shift, ended + shift, beside=True))
+
+
+@contextmanager
+def recording() -> Iterator[Recorder]:
+    """Record the spans of a block, jax's own included."""
+    recorder = Recorder()
+    recorder.spans.append(Span(START, 0.0, recorder.now(), processor=time.process_time()))
+    token = _RECORDER.set(recorder)
+    with span("import"):
+        set_environment()
+        from jax import monitoring  # noqa: PLC0415 (takes most of a second)
+
+    monitoring.register_event_duration_secs_listener(recorder.add_duration)
+    try:
+        yield recorder
+    finally:
+        monitoring.unregister_event_duration_listener(recorder.add_duration)
+        _RECORDER.reset(token)
+
+
+@dataclass
+class Row:
+    """A stage's seconds, those of stages inside it left out.
+
+    Attributes
+    ----------
+    stage
+        Its name.
+    seconds
+        From its begins to its ends.
+    processor
+        Processor seconds of all threads.
+    jax
+        One of `OF_JAX` -> how many of the seconds it took.
+    programs
+        How many compiled programs were asked for.
+    """
+
+    stage: str
+    seconds: float = 0.0
+    processor: float = 0.0
+    jax: dict[str, float] = field(default_factory=lambda: dict.fromkeys(OF_JAX.values(), 0.0))
+    programs: int = 0
+
+    @property
+    def rest(self) -> float:
+        """Seconds in which jax neither traced nor compiled: computed, read, drew, wrote."""
+        return self.seconds - sum(self.jax.values())
+
+
+def table_of(spans: Sequence[Span], seconds: float, processor: float) -> tuple[Row, ...]:
+    """Return a row for every stage in the order of their begins.
+
+    Every instant counts for the innermost span that holds it, so that the rows' seconds, and
+    processor seconds, sum up to those of the process, ``seconds`` and ``processor``.
+    """
+    own = sorted((s for s in spans if not s.beside), key=lambda s: (s.begin, -s.end))
+    rows = {ELSEWHERE: Row(ELSEWHERE, processor=processor)}
+    open_: list[Span] = [Span(ELSEWHERE, 0.0, seconds)]
+    clock = 0.0
+
+    def stage() -> Row:
+        name = next(s.name for s in reversed(open_) if s.is_stage)
+        return rows.setdefault(name, Row(name))
+
+    def count_until(moment: float) -> None:
+        nonlocal clock
+        row = stage()
+        passed = max(0.0, moment - clock)
+        row.seconds += passed
+        if not open_[-1].is_stage:
+            row.jax[open_[-1].name] += passed
+        clock = max(clock, moment)
+
+    for current in own:
+        while len(open_) > 1 and open_[-1].end <= current.begin:
+            count_until(open_[-1].end)
+            open_.pop()
+        count_until(current.begin)
+        stage().processor -= current.processor
+        open_.append(current)
+        stage().processor += current.processor
+        stage().programs += current.name == COMPILING
+    while open_:
+        count_until(min(open_[-1].end, seconds))
+        open_.pop()
+    elsewhere = rows.pop(ELSEWHERE)
+    return (*rows.values(), elsewhere)
+
+
+def beside_of(spans: Sequence[Span]) -> dict[str, float]:
+    """Return name -> s that other threads and processes spent on it, all its spans together."""
+    seconds: dict[str, float] = {}
+    for each in spans:
+        if each.beside:
+            seconds[each.name] = seconds.get(each.name, 0.0) + each.end - each.begin
+    return seconds

@@ -1,0 +1,222 @@
+"""The coefficients once more with what pushed the flights, where something did."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from tuner.core.findings import Code, Finding
+from tuner.disturbances.information import hidden
+from tuner.disturbances.predictor import Predictor
+from tuner.disturbances.recorded import FLIGHT_CONTROLLER
+from tuner.disturbances.refit import STEPS, with_least_innovations
+from tuner.disturbances.term_selection import Innovations
+from tuner.job.explanation import Explanation
+from tuner.objective.alternatives import alternatives_of
+from tuner.objective.criterion import Point
+from tuner.search.estimation import free_offsets
+from tuner.search.fitted import Fitted
+from tuner.search.optimiser import Free
+from tuner.search.polish import polished
+from tuner.search.problem import Job
+from tuner.search.progress import Progress
+from tuner.terms.candidates import is_stand_in
+from tuner.terms.search_with_terms import candidates_of
+from tuner.terms.selection_state import Selected
+from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.full_problem import full_problem_of
+from tuner.uncertainty.holding import with_undetermined_held
+from tuner.wording.phrases import listed
+
+CONTRADICTS = 4.0
+"""Standard errors by which no coefficient may move. Those of least squares are known from some ten
+stretches that do not depend on each other: with ten degrees of freedom chance alone takes one of a
+dozen coefficients beyond three in every sixth fit, and beyond four in every thirtieth."""
+
+SELECTIONS = 3
+"""How often innovations may call for other terms, each time beside those of the last."""
+ROUGHLY = 2
+"""Steps before they do so first: what is missing would in time be taken for disturbances."""
+
+
+Examined = tuple[Selected, Fitted, Examination | None]
+"""A job's fit, and how well it is known; None where the examination failed."""
+
+
+def examined(
+    selected: Selected,
+    on_progress: Callable[[Job, Progress], None],
+    on_message: Callable[[str], None],
+    explanation: Explanation,
+) -> Examined:
+    """Return the fit with estimated disturbances, or with what the flights leave open held.
+
+    And how well each coefficient is known; first the terms, of which innovations may call for
+    others.
+    """
+    followed = explanation.part(
+        "disturbances", partial(with_disturbances, selected, on_progress, on_message), None
+    )
+    on_message("Examining how well each coefficient is known.")
+    if followed is not None:
+        return followed
+    job, fitted = selected.job, selected.fitted
+    hold = partial(
+        with_undetermined_held, job, fitted, on_progress, on_message, in_doubt=selected.in_doubt
+    )
+    not_known: tuple[Fitted, Examination | None] = fitted, None
+    return selected, *explanation.part("examination", hold, not_known)
+
+
+def with_disturbances(
+    selected: Selected,
+    on_progress: Callable[[Job, Progress], None],
+    on_message: Callable[[str], None],
+) -> tuple[Selected, Fitted, Examination] | None:
+    """Return the fit in which what pushed the flights is estimated too, and its examination.
+
+    None where the job does not ask for it, where the residuals hold no more than noise, where
+    set-points were not recorded, where flights are too many or too long, where a filter loses them,
+    where nothing would be known better, and where the two fits contradict each other.
+    """
+    job, fitted = selected.job, selected.fitted
+    asked = job.settings.job.disturbances
+    follows = asked == "follow" or (asked == "auto" and candidates_of(job))
+    if fitted.leaves_noise_alone or not fitted.polished or not follows:
+        return None
+    full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
+    predictor = Predictor.of(full.objective, full.point, job.fitted)
+    if predictor is None:
+        return None
+    if predictor.memory > full.objective.memory // 2:
+        on_message("What pushed the flights is not followed: there are too many of them for that.")
+        return None
+    clock = time.perf_counter()
+    on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
+    there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
+    seen = Innovations.of(selected, there, predictor)
+    had = _kept(selected)
+    for number in range(SELECTIONS):
+        chosen = seen.selection(had, first=number == 0)
+        if chosen is None and number > 0:
+            break
+        if chosen is not None:
+            on_message(_said(seen.selected, chosen))
+            selected, there = chosen, chosen.fitted
+        there, predictor = _descended(selected, there, predictor)
+        seen = Innovations.of(selected, there, predictor)
+    if not predictor.keeps_track:
+        on_message("What pushed them cannot be followed: the model lacks something else.")
+        return None
+    job = seen.selected.job
+    offsets = free_offsets(job)
+    again = polished(
+        job,
+        there,
+        free=Free(np.zeros(len(job.space), bool), offsets),
+        title="clocks",
+        on_progress=partial(on_progress, job),
+        stages=1,
+    )
+    again = replace(
+        again,
+        wall_time=fitted.wall_time + time.perf_counter() - clock,
+        findings=(*again.findings, _finding(predictor)),
+    )
+    otherwise = alternatives_of(again.objective, again.point)
+    examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt())
+    if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
+        # what stood in for other terms made another model of it, which says nothing of this one
+        fitted = polished(
+            job,
+            again,
+            free=Free(np.ones(len(job.space), bool), offsets),
+            title="simulated",
+            on_progress=partial(on_progress, job),
+        )
+    otherwise = alternatives_of(fitted.objective, fitted.point)
+    before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
+    if not _agree(examination.uncertainty, before.uncertainty):
+        on_message("It contradicts the fit of the simulated flights, which is kept.")
+        return None
+    sharper = _is_sharper(examination.uncertainty, before.uncertainty)
+    return (seen.selected, again, examination) if sharper else None
+
+
+def _kept(selected: Selected) -> list[str]:
+    """Return the groups of terms in a fit."""
+    return [row.group for row in selected.rows if row.kept]
+
+
+def _descended(
+    selected: Selected, fitted: Fitted, predictor: Predictor, *, steps: int = STEPS
+) -> tuple[Fitted, Predictor]:
+    """Return the fit to least innovations from a fit on, and what predicts there.
+
+    The filter goes on from its own strengths and clocks.
+    """
+    job, own = selected.job, predictor.feed.offsets
+    full = full_problem_of(fitted.objective, fitted.point)
+    point = Point(full.point.coefficients, own)
+    predictor = predictor.laid(full.objective, point, job.fitted)
+    names, count = full.objective.space.names, len(full.fitted)
+    moves = np.isin(names, full.fitted) & ~np.isin(names, list(fitted.held.values()))
+    offsets = free_offsets(job)
+    enter = offsets & (np.arange(len(offsets)) != FLIGHT_CONTROLLER)[:, None]
+    free = np.concatenate([moves & ~hidden(names), enter.ravel()])
+    problem = full.objective, point, fitted.criterion
+    predictor, point = with_least_innovations(predictor, job.fitted, problem, free, steps)
+    return replace(fitted, point=Point(point.coefficients[:count], fitted.point.offsets)), predictor
+
+
+def _agree(new: Uncertainty, old: Uncertainty) -> bool:
+    """Return whether no coefficient moved by more than the errors of both fits allow.
+
+    A filter knows more where its noise model holds, and something else where it does not. Of the
+    two estimates least squares' is the one that stays right then (Hausman 1978, who needs its
+    error alone: his other estimate is never the less sure one, ours is of what set-points tell).
+    """
+    return all(
+        abs(there.value - estimate.value)
+        <= CONTRADICTS * np.hypot(estimate.std_error, there.std_error)
+        for name, estimate in old.estimates.items()
+        if (there := new.estimates.get(name)) is not None
+    )
+
+
+def _is_sharper(new: Uncertainty, old: Uncertainty) -> bool:
+    """Return whether coefficients are known better, in the mean of their errors' logarithms."""
+    ratios = [
+        there.std_error / estimate.std_error
+        for name, estimate in old.estimates.items()
+        if (there := new.estimates.get(name)) is not None
+    ]
+    return bool(np.mean(np.log(ratios)) < 0.0)
+
+
+def _said(before: Selected, after: Selected) -> str:
+    """Return which terms innovations call for, and which they can do without."""
+    changes = [row for row in after.rows if row not in before.rows]
+    groups = [row.group for row in changes if row.kept]
+    gone = [row.group for row in changes if not row.kept]
+    changed = [
+        f"{word} {listed(names)}" for word, names in (("with", groups), ("without", gone)) if names
+    ]
+    return f"Samples are predicted better so: fitting again {' and '.join(changed)}."
+
+
+def _finding(predictor: Predictor) -> Finding:
+    """Return what is said of the disturbances."""
+    gust, _, _, thrust, gust_seconds, thrust_seconds, _ = np.exp(predictor.strengths).tolist()
+    numbers = {
+        "gust": gust,
+        "gust_seconds": gust_seconds,
+        "thrust": thrust,
+        "thrust_seconds": thrust_seconds,
+    }
+    return Finding(Code.DISTURBANCES_FOLLOWED, "info", "flights", numbers)

@@ -1,0 +1,408 @@
+"""A simulation that recorded samples correct, as a Kalman filter does.
+
+At each tick the samples since the one before correct motion, rotor speeds, the controller's memory
+and the disturbances. `filtered` linearises the loop about the corrected simulation and propagates
+its covariance (extended Kalman filter); `innovations` flies with gains that are given, so that its
+derivative is that of a simulation: a predictor of fixed structure (Ljung 1999, 7.2).
+
+Innovations are whitened: with S = L Lᵀ their covariance (Cholesky), L⁻¹ times them is white and of
+unit variance if the model holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from lanes import Argument, Program, Run, joined
+from sim_jax.state import State
+from sim_jax.trees import row_of
+from tuner.disturbances.covariance import at, propagated, row, rows_of, updated, weighted
+from tuner.disturbances.disturbances import COUNT
+from tuner.disturbances.observer import (
+    Expected,
+    Feed,
+    Observer,
+    commands_in_flight,
+    first_errors,
+)
+from tuner.objective.criterion import Either
+from tuner.objective.flown import flown_part, laid_out
+from tuner.objective.simulator import Simulator
+from tuner.vehicle.model import with_coefficients
+
+GATE = 4.0
+"""Standard deviations beyond which an innovation corrects no further: an outlier."""
+WIDER = 4.0
+"""Times, each innovation in a row that lies beyond."""
+WIDEST = 5
+"""In a row beyond which the gate grows no further."""
+
+
+def gated(white: Array, beyond: Array) -> tuple[Array, Array]:
+    """Return what whitened innovations correct by, and how many in a row lie beyond the gate.
+
+    One is an outlier; the next ones say that the filter has lost the flight, which at its gate it
+    would never find again: each in a row widens it, so after a few they correct as they are.
+
+    Parameters
+    ----------
+    white
+        (m, F); zero where nothing was sampled.
+    beyond
+        (m, F) how many in a row before these.
+    """
+    gate = GATE * WIDER ** jnp.minimum(beyond, WIDEST)
+    outside = jnp.where(jnp.abs(white) > GATE, beyond + 1, 0)
+    return jnp.clip(white, -gate, gate), jnp.where(white != 0.0, outside, beyond)
+
+
+def deviance(white: Array) -> Array:
+    """Return twice the negative log-likelihood of whitened innovations, but for a constant.
+
+    Beyond the gate it grows linearly (Huber): an outlier is no strong disturbance.
+    """
+    size = jnp.abs(white)
+    return jnp.where(size <= GATE, white**2, 2.0 * GATE * size - GATE**2)
+
+
+class Gains(eqx.Module):
+    """Of an observer, on T ticks; n numbers of the state are corrected by m samples.
+
+    Attributes
+    ----------
+    gain
+        (T, m, n, F) correction for one standard deviation of each whitened innovation.
+    factors
+        (T, m, m, F) L, lower triangular.
+    """
+
+    gain: Float[Either, "T m n F"]
+    factors: Float[Either, "T m m F"]
+
+
+class Filtered(eqx.Module):
+    """What a filter makes of recordings.
+
+    Attributes
+    ----------
+    white
+        (T, m, F) whitened innovations.
+    loss
+        (T, F) negative log-likelihood of each tick's samples, but for a constant.
+    factors, gain
+        See `Gains`; gains are None where they were not asked for.
+    """
+
+    white: Float[Either, "T m F"]
+    loss: Float[Either, "T F"]
+    factors: Float[Either, "T m m F"]
+    gain: Float[Either, "T m n F"] | None
+
+    @property
+    def gains(self) -> Gains:
+        """Of the observer that the filter is."""
+        assert self.gain is not None
+        return Gains(self.gain, self.factors)
+
+
+def _undelayed(simulator: Simulator) -> Simulator:
+    """Return a simulator without the delay line of estimates, which rate control does not see."""
+    schedule = replace(simulator.schedule, longest_estimate_latency=0.0, pose_rate=None)
+    return replace(simulator, schedule=schedule)
+
+
+def _shortly_delayed(simulator: Simulator, expected: Expected) -> tuple[Simulator, int]:
+    """Return a simulator whose delay line of commands is no longer than needed.
+
+    And how many commands are on their way to the motors when a step begins: to correct each of them
+    costs as much as a rotor's speed.
+    """
+    schedule = simulator.schedule
+    if schedule.longest_actuator_latency == 0.0:
+        return simulator, 0
+    latency = float(expected.tunable.at(expected.coefficients).vehicle.setup.actuator_latency)
+    count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
+    short = replace(schedule, longest_actuator_latency=count * schedule.step)
+    return replace(simulator, schedule=short), count
+
+
+def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) -> Gains:
+    """Return the gains of a simulator for the same in so many times finer steps of physics.
+
+    Then so many times as many commands are on their way to the motors.
+    """
+    in_flight = _shortly_delayed(simulator, expected)[1]
+    size, rotors = gains.gain.shape[2], len(expected.tunable.model.vehicle.rotors)
+    first = size - COUNT - in_flight * rotors
+    commands = np.arange(first, size - COUNT).reshape(in_flight, rotors).repeat(times, axis=0)
+    rows = np.concatenate([np.arange(first), commands.ravel(), np.arange(size - COUNT, size)])
+    return replace(gains, gain=gains.gain[:, :, rows])
+
+
+def filtered(
+    simulator: Simulator, feed: Feed, expected: Expected, *, gains: bool = True
+) -> Filtered:
+    """Return the Kalman gains, the innovations, and how likely they are.
+
+    Parameters
+    ----------
+    simulator, feed, expected
+        What flies, the recordings, and what is taken for true.
+    gains
+        Whether gains are kept, which take most of the memory.
+    """
+    short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
+    given = _given(feed, expected)
+    white, loss, factors, gain = _run(given, _Static("filter", short, in_flight, gains)).values
+    return Filtered(
+        white=np.moveaxis(white, 0, -1),
+        loss=np.moveaxis(loss, 0, -1),
+        factors=np.moveaxis(factors, 0, -1),
+        gain=np.moveaxis(gain, 0, -1) if gains else None,
+    )
+
+
+def innovations(
+    simulator: Simulator, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return whitened innovations (T, m, F) with given gains, and derivatives (N, T, m, F).
+
+    Parameters
+    ----------
+    simulator, feed, expected
+        As of `filtered`.
+    gains
+        Of the observer.
+    directions
+        (N, K + offsets): along which is differentiated.
+    """
+    along = np.asarray(directions, float)
+    still = np.zeros((1, along.shape[1]))  # one program serves innovations alone, too
+    static = _Static("innovations", _undelayed(simulator), 0, False)
+    moved = _tangents(expected, along if len(along) else still)
+    run = _run(_given(feed, expected, gains), static, moved)
+    columns = joined(run.columns, len(along), axis=2)
+    return np.moveaxis(run.values, 0, -1), np.moveaxis(columns, (-1, 0), (0, -1))
+
+
+class _Given(NamedTuple):
+    """What a program is given of a model, and of each segment."""
+
+    model: Any
+    coefficients: dict[str, Any]
+    offsets: Any
+    segments: Any
+    samples: Any
+    strengths: Any
+    noise: Any
+    sampled: Any
+    gains: Gains | None
+
+
+@dataclass(frozen=True)
+class _Static:
+    """What a program belongs to, besides the structure of what it is given."""
+
+    kind: Literal["filter", "innovations"]
+    simulator: Simulator
+    in_flight: int
+    gains: bool
+
+
+def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
+    """Return the arguments of a program; a row is sampled where any segment has a sample."""
+    weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
+    given: _Given = jax.tree.map(
+        np.asarray,
+        _Given(
+            model=expected.tunable.model,
+            coefficients=expected.tunable.values(np.asarray(expected.coefficients)),
+            offsets=feed.offsets,
+            segments=flown_part(feed.segments),
+            samples=feed.samples,
+            strengths=expected.strengths,
+            noise=expected.noise,
+            sampled=np.concatenate([(w > 0).any(axis=-1) for w in weights], axis=1),
+            gains=gains,
+        ),
+    )
+    return given
+
+
+def _tangents(expected: Expected, directions: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return how coefficients, in the order of their names, and offsets move."""
+    count = len(np.asarray(expected.coefficients))
+    slopes = expected.tunable.slopes(np.asarray(expected.coefficients))
+    names = sorted(expected.tunable.names)
+    still = np.zeros(count)
+    moved = [directions[:, :count] @ slopes.get(name, still) for name in names]
+    return [*moved, directions[:, count:]]
+
+
+def _run(given: _Given, static: _Static, tangents: list[NDArray[np.float64]] | None = None) -> Run:
+    moves = tangents is not None
+
+    def table(leaf: Any) -> Argument:
+        shape = np.shape(leaf)[1:-1]
+        return Argument(("ticks", *shape), np.result_type(leaf), lanes=True)
+
+    def single(leaf: Any) -> Argument:
+        return Argument(np.shape(leaf)[:-1], np.result_type(leaf), lanes=True)
+
+    def shared(leaf: Any) -> Argument:
+        return Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
+
+    arguments = _Given(
+        model=jax.tree.map(shared, given.model),
+        coefficients={
+            name: Argument((), float, lanes=False, moves=moves) for name in given.coefficients
+        },
+        offsets=replace(single(given.offsets), moves=moves),
+        segments=laid_out(given.segments),
+        samples=jax.tree.map(table, given.samples),
+        strengths=single(given.strengths),
+        noise=single(given.noise),
+        sampled=Argument(("ticks", *given.sampled.shape[1:]), bool, lanes=False),
+        gains=jax.tree.map(table, given.gains),
+    )
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    program = _program(tuple(leaves), structure, static)
+    count, ticks = given.offsets.shape[-1], len(given.sampled)
+    return program(given, tangents, lanes=count, turns=ticks)
+
+
+@lru_cache(maxsize=16)
+def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> Program:
+    flown = _filter if static.kind == "filter" else _innovations
+
+    def function(given: _Given, lengths: Mapping[str, int]) -> Any:
+        return flown(given, static, lengths["turns"])
+
+    return Program(function, jax.tree.unflatten(structure, leaves), name=static.kind, at_once=6)
+
+
+def _observer(given: _Given, static: _Static) -> tuple[Observer, State]:
+    model = with_coefficients(given.model, given.coefficients)
+    feed = Feed(given.segments, given.offsets, given.samples)
+    return Observer.of(static.simulator, feed, model, given.strengths)
+
+
+def _filter(given: _Given, static: _Static, ticks: int) -> Any:
+    """Filter one segment: whitened innovations, losses, triangular factors and gains, by ticks."""
+    observer, first = _observer(given, static)
+    in_flight, processes = static.in_flight, observer.processes
+    first_sd = jnp.asarray(first_errors(first, in_flight))
+    size, wide = len(first_sd) + COUNT, len(given.noise)
+    shown = len(first_errors(first, 0))  # to samples: commands on their way are not, nor pushes
+    unrest = jnp.concatenate([jnp.zeros(size - COUNT), processes.added])
+
+    def tick(carried: Any, number: Array) -> Any:
+        state, pushed, matrices, before, beyond = carried
+        covariance, gain, scratch = matrices
+        samples = row_of(given.samples, number)
+
+        def compare(change: Array) -> Array:
+            now = observer.seen(observer.corrected(state, change, number, 0), number)
+            # a sample between two ticks tells of the state, however near the first it was taken
+            along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
+            return observer.errors(now, along, samples)
+
+        error, changes = jax.linearize(compare, jnp.zeros(shown))
+        seen = rows_of(lambda i: changes(jnp.where(jnp.arange(shown) == i, 1.0, 0.0)), shown)
+        variance = jnp.where(observer.sampled(samples), given.noise**2, 1.0)
+        sampled = row_of(given.sampled, number)
+        (covariance, gain), (white, factors) = updated(
+            (covariance, gain), (error, seen, variance), sampled
+        )
+        scatter = sum(jnp.log(factors[i, i]) for i in range(wide))
+        loss = 0.5 * jnp.sum(deviance(white)) + scatter
+        corrects, beyond = gated(white, beyond)
+        change = -weighted(gain, corrects)
+        state = observer.corrected(state, change[:-COUNT], number, in_flight)
+        pushed = pushed + change[-COUNT:]
+        before = observer.seen(state, number)
+
+        def advance(change: Array) -> tuple[Array, State]:
+            moved = observer.corrected(state, change[:-COUNT], number, in_flight)
+            after = observer.next(moved, pushed + change[-COUNT:], number)
+            numbers = observer.numbers(after, number + 1, in_flight)
+            return jnp.concatenate([numbers, processes.keeps * change[-COUNT:]]), after
+
+        _, follow, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
+        covariance, scratch = propagated(covariance, scratch, follow, unrest)
+        single = None
+        if static.gains:
+            single = rows_of(lambda i: row(gain, i, size).astype(jnp.float32), wide)
+        carried = after, pushed * processes.keeps, (covariance, gain, scratch), before, beyond
+        return carried, (white, loss, factors.astype(jnp.float32), single)
+
+    sd = jnp.concatenate([first_sd, processes.sd])
+    diagonal = jnp.arange(size)[:, None] == jnp.arange(size)
+    begin = (
+        first,
+        jnp.zeros(COUNT),
+        (jnp.where(diagonal, sd**2, 0.0), jnp.zeros((wide, size)), jnp.zeros((size, size))),
+        observer.seen(first, jnp.asarray(0)),
+        jnp.zeros(wide, int),
+    )
+    return lax.scan(tick, begin, jnp.arange(ticks))[1]
+
+
+def _innovations(given: _Given, static: _Static, ticks: int) -> Array:
+    """Fly one segment with gains that are given: its whitened innovations (ticks, m)."""
+    assert given.gains is not None
+    observer, first = _observer(given, static)
+    gains, factors = given.gains.gain, given.gains.factors
+    wide, size = gains.shape[1:]
+    in_flight = commands_in_flight(first, size - COUNT)
+
+    def tick(carried: Any, number: Array) -> tuple[Any, Array]:
+        state, pushed, before, beyond = carried
+        error = observer.errors(observer.seen(state, number), before, row_of(given.samples, number))
+
+        def row_of_tick(table: Array, i: Array, count: int) -> Array:
+            found = lax.dynamic_slice(table, (number, i, 0), (1, 1, count))[0, 0]
+            return found.astype(error.dtype)
+
+        def whitened(i: Array, white: Array) -> Array:
+            factor = row_of_tick(factors, i, wide)
+            alone = (at(error, i) - factor @ white) / at(factor, i)
+            after: Array = lax.dynamic_update_index_in_dim(white, alone, i, 0)
+            return after
+
+        def corrected(i: Array, change: Array) -> Array:
+            return change - at(corrects, i) * row_of_tick(gains, i, size)
+
+        def of_sampled(step: Callable[[Array, Array], Array], start: Array) -> Array:
+            def turn(i: Array, so_far: Array) -> Array:
+                some = lax.dynamic_slice(given.sampled, (number, i), (1, 1))[0, 0]
+                after: Array = lax.cond(some, step, lambda _, same: same, i, so_far)
+                return after
+
+            total: Array = lax.fori_loop(0, wide, turn, start)
+            return total
+
+        white = of_sampled(whitened, jnp.zeros(wide))
+        corrects, beyond = gated(white, beyond)
+        change = of_sampled(corrected, jnp.zeros(size))
+        state = observer.corrected(state, change[:-COUNT], number, in_flight)
+        pushed = pushed + change[-COUNT:]
+        before = observer.seen(state, number)
+        after = observer.next(state, pushed, number)
+        return (after, pushed * observer.processes.keeps, before, beyond), white
+
+    begin = first, jnp.zeros(COUNT), observer.seen(first, jnp.asarray(0)), jnp.zeros(wide, int)
+    white_rows: Array = lax.scan(tick, begin, jnp.arange(ticks))[1]
+    return white_rows

@@ -1,0 +1,267 @@
+"""The closed loop of rate control, a tick at a time: what pushes it, what is recorded of it.
+
+Fed with recorded set-points; what a filter corrects of its state, and what samples say of that.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jaxtyping import Float
+
+from sim_jax.crash import AIRBORNE
+from sim_jax.markers import markers_of
+from sim_jax.plant import Plant
+from sim_jax.rigid_body import Motion
+from sim_jax.rollout import begun
+from sim_jax.rotation import Quaternion
+from sim_jax.sensing import GyroMemory
+from sim_jax.state import State
+from sim_jax.trees import replaced, row_of
+from sim_jax.vector import Vec3
+from tuner.disturbances.disturbances import (
+    Processes,
+    disturbance_of,
+    processes_of,
+)
+from tuner.disturbances.recorded import Sampled
+from tuner.objective.criterion import OFFSET_UNIT, units_of
+from tuner.objective.flight import beginning_of
+from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
+from tuner.objective.simulator import Simulator
+from tuner.objective.tunable import Tunable
+from tuner.vehicle.model import Model
+
+CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command")
+"""What corrects, in this order: a dictionary's own order is lost where jax takes it apart."""
+
+
+class Feed(eqx.Module):
+    """What an observer needs of its segments, F of which lie along the last axis.
+
+    Attributes
+    ----------
+    segments
+        Their inlet takes set-points.
+    offsets
+        (offsets, F) of the point.
+    samples
+        Channel -> its samples on ticks.
+    """
+
+    segments: Segments
+    offsets: Float[Array, "O F"]
+    samples: dict[str, Sampled]
+
+    @property
+    def widths(self) -> dict[str, int]:
+        """Channel -> how many columns it has, in the order of `CHANNELS`."""
+        return {
+            name: int(self.samples[name].weight.shape[1])
+            for name in CHANNELS
+            if name in self.samples
+        }
+
+
+class Expected(eqx.Module):
+    """What an observer takes for true.
+
+    Attributes
+    ----------
+    tunable, coefficients
+        The model, and its search vector (K,).
+    strengths
+        (7, F) of the disturbances, each segment's own.
+    noise
+        (m, F) factors on the standard deviations of the samples.
+    """
+
+    tunable: Tunable
+    coefficients: Float[Array, " K"]
+    strengths: Float[Array, "7 F"]
+    noise: Float[Array, "m F"]
+
+
+class Observer(eqx.Module):
+    """The stepped loop with its disturbances and its samples."""
+
+    plant: Plant
+    processes: Processes
+    late: Float[Array, "O F"]
+    channels: tuple[str, ...] = eqx.field(static=True)
+    rate: float = eqx.field(static=True)
+
+    @staticmethod
+    def of(
+        simulator: Simulator, feed: Feed, model: Model, strengths: Float[Array, "7 *F"]
+    ) -> tuple[Observer, State]:
+        """Return the observer of a model, and the state in which the segments begin.
+
+        ``strengths`` of the disturbances, each segment's own.
+        """
+        schedule, units = simulator.schedule, units_of(simulator.conditions)
+        conditions = {
+            name: feed.offsets[len(OFFSETS) + row] * units[row]
+            for row, name in enumerate(simulator.conditions)
+        }
+        start, inlet, environment = beginning_of(
+            model, feed.segments, schedule, conditions=conditions
+        )
+        plant, state = begun(
+            model.vehicle,
+            model.controller,
+            schedule,
+            inlet,
+            start,
+            environment=environment,
+            limits=AIRBORNE,  # a height that no sample corrects drifts, and ends no flight
+        )
+        rate = float(schedule.log_rate)
+        processes = processes_of(model.vehicle, strengths, rate)
+        late = feed.offsets[: len(OFFSETS)] * OFFSET_UNIT
+        return Observer(plant, processes, late, tuple(feed.widths), rate), state
+
+    def numbers(self, state: State, tick: Array, in_flight: int) -> Array:
+        """Return what is corrected of a state, (n, F): so many commands in flight at its end."""
+        rows = jnp.stack(jax.tree.leaves(_parts(state)))
+        line = state.reference_history
+        if line is None or not in_flight:
+            return rows
+        slots = self._slots(len(line), tick, in_flight)
+        return jnp.concatenate([rows, *(row_of(line, slot) for slot in slots)])
+
+    def corrected(self, state: State, change: Array, tick: Array, in_flight: int) -> State:
+        """Return a state moved by a change (n, F); its attitude stays a rotation."""
+        leaves, structure = jax.tree.flatten(_parts(state))
+        moved = [leaf + row for leaf, row in zip(leaves, change[: len(leaves)], strict=True)]
+        motion, rotor_speed, integral, gyro = jax.tree.unflatten(structure, moved)
+        motion = Motion(
+            motion.position, motion.velocity, motion.attitude.normalized(), motion.body_rate
+        )
+        line = state.reference_history
+        if line is not None and in_flight:
+            rotors = len(rotor_speed)
+            for number, slot in enumerate(self._slots(len(line), tick, in_flight)):
+                first = len(leaves) + number * rotors
+                row = row_of(line, slot) + change[first : first + rotors]
+                line = lax.dynamic_update_index_in_dim(line, row, slot, 0)
+        return replaced(
+            state,
+            motion=motion,
+            rotor_speed=rotor_speed,
+            integral=integral,
+            gyro=gyro,
+            reference_history=line,
+        )
+
+    def _slots(self, length: int, tick: Array, in_flight: int) -> list[Array]:
+        """Return the places of the last commands in a delay line, the newest first."""
+        step = self._step(tick)
+        return [jnp.mod(step - 1 - number, length) for number in range(in_flight)]
+
+    def _step(self, tick: Array) -> Array:
+        """Return the step of physics that begins at a tick."""
+        schedule = self.plant.schedule
+        return tick * round(schedule.physics_rate / schedule.log_rate)
+
+    def next(self, state: State, pushed: Array, tick: Array) -> State:
+        """Return the state a tick later, pushed by the processes' values (D, *F)."""
+        acting = disturbance_of((self.processes.acts * pushed.T).T)
+        environment = eqx.tree_at(
+            lambda e: (e.disturbance, e.draught),
+            self.plant.environment,
+            (acting, self.processes.draught),
+            is_leaf=lambda leaf: leaf is None,
+        )
+        plant = eqx.tree_at(lambda p: p.environment, self.plant, environment)
+        after: State = plant.sample(state, tick)[0]
+        return after
+
+    def seen(self, state: State, tick: Array) -> dict[str, Array]:
+        """Return channel -> (c, F), what a recording would hold."""
+        motion, markers = state.motion, markers_of(self.plant.vehicle)
+        position, attitude = motion.position, motion.attitude
+        if markers is not None:
+            position, attitude = markers.recorded(motion)
+        command = state.command
+        if "command" in self.channels:
+            command = self.plant.inlet.next_command(self.plant, state, self._step(tick)).command
+        rate = motion.body_rate
+        signals = {
+            "position": (position.x, position.y, position.z),
+            "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
+            "body_rate": (rate.x, rate.y, rate.z),
+            "rotor_speed": state.rotor_speed,
+            "command": command,
+        }
+        shape = self.late.shape[1:]
+        return {
+            name: jnp.stack([jnp.broadcast_to(leaf, shape) for leaf in signals[name]])
+            for name in self.channels
+        }
+
+    def sampled(self, samples: dict[str, Sampled]) -> Array:
+        """Return which rows of `errors` (m, F) there are samples of."""
+        return jnp.concatenate([samples[name].weight > 0 for name in self.channels])
+
+    def errors(
+        self, now: dict[str, Array], before: dict[str, Array], samples: dict[str, Sampled]
+    ) -> Array:
+        """Return what is seen minus what was sampled (m, F), in standard deviations."""
+        rows = []
+        for name in self.channels:
+            sample = samples[name]
+            place = sample.place - self.late[CLOCK_OF[name]] * self.rate
+            there = before[name] + place * (now[name] - before[name])
+            if name == "attitude":
+                seen = Quaternion.of(there).normalized()
+                error = Quaternion.of(sample.values).rotation_vector_to(seen).stacked()
+            elif name == "command":
+                error = now[name] - sample.values
+            elif name == "body_rate":
+                error = there + self.late[len(CLOCKS) :] - sample.values
+            else:
+                error = there - sample.values
+            rows.append(jnp.where(sample.weight > 0, error * sample.weight, 0.0))
+        return jnp.concatenate(rows)
+
+
+def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory]:
+    """Return what is corrected of a state: 32 numbers with both gyro filters."""
+    return state.motion, state.rotor_speed, state.integral, state.gyro
+
+
+def commands_in_flight(state: State, count: int) -> int:
+    """Return how many commands on their way to the motors are among so many corrected numbers."""
+    return (count - len(jax.tree.leaves(_parts(state)))) // len(state.rotor_speed)
+
+
+def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
+    """Return the standard deviations (n,) of the state in which a flight begins."""
+
+    def filled(tree: Any, sd: float) -> Any:
+        return jax.tree.map(lambda _: sd, tree)
+
+    motion, rotor_speed, integral, gyro = _parts(state)
+    errors = (
+        Motion(
+            filled(motion.position, 1e-3),
+            filled(motion.velocity, 0.02),
+            filled(motion.attitude, 0.0025),
+            filled(motion.body_rate, 0.03),
+        ),
+        filled(rotor_speed, 3.0),
+        filled(integral, 0.01),
+        GyroMemory(
+            filled(gyro.newer, 0.03),
+            filled(gyro.older, 0.03),
+            filled(gyro.rate, 0.03),
+            filled(gyro.acceleration, 0.3),
+        ),
+    )
+    return np.asarray([*jax.tree.leaves(errors), *[3.0] * (in_flight * len(rotor_speed))])

@@ -1,0 +1,334 @@
+"""The one-step predictor of a fit: its innovations and what they say of the coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.inlet import ReferenceInlet
+from tuner.core.numerics import robust_sd
+from tuner.disturbances.disturbances import COMMAND_NOISE, STRENGTHS, USUAL
+from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations, stepped
+from tuner.disturbances.information import hidden
+from tuner.disturbances.observer import CHANNELS, Expected, Feed
+from tuner.disturbances.recorded import (
+    FLIGHT_CONTROLLER,
+    each_reading,
+    gathered,
+    sampled,
+    setpoints_on_ticks,
+)
+from tuner.disturbances.strengths import Likelihood, Slopes, slopes_of, steps_from
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
+from tuner.objective.normal import Objective
+from tuner.objective.segments import CLOCKS
+from tuner.objective.simulator import Simulator
+from tuner.recordings.flight import Flight
+from tuner.uncertainty.information import FisherInformation, information_from_jacobian
+
+Array = NDArray[np.float64]
+
+AT_ONCE = 24
+"""Parameters by which is differentiated at a time."""
+LOST = 0.05
+"""Share of a channel's innovations beyond the gate from which the filter has lost a flight."""
+LEARNT_FROM = 18.0
+"""s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
+SEGMENTS = 8
+"""That are filtered side by side while strengths are differentiated by."""
+NUMBERS = 57
+"""Of a state and its disturbances that samples correct, with four commands on their way."""
+NOISIER = 1.05
+"""Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Predicts each sample of some flights from those before it.
+
+    Attributes
+    ----------
+    simulator
+        Flies.
+    feed
+        The recordings, and the offsets at which they are met best.
+    rows
+        Channel -> (n, F) the tick of each sample, -1 for one that is not used.
+    strengths
+        (7,) of the disturbances, and of the noise of commands.
+    noise
+        Channel -> factor on the samples' standard deviations.
+    found
+        What the filter makes of the recordings: None before it has run.
+    """
+
+    simulator: Simulator
+    feed: Feed
+    rows: Mapping[str, NDArray[np.intp]]
+    strengths: Array
+    noise: Mapping[str, float]
+    found: Filtered | None = None
+
+    @staticmethod
+    def of(objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor | None:
+        """Return the predictor of some flights before anything is learnt.
+
+        None where their set-points were not all recorded, or not all in closed loop. The flight
+        controller's clock, by which set-points come in, is the simulation's own.
+
+        Parameters
+        ----------
+        objective, point
+            Whole flights, and where their clocks stand.
+        flights
+            F flights in the order of the segments.
+        """
+        segments, schedule = objective.segments, objective.schedule
+        offsets = np.array(point.offsets)
+        offsets[FLIGHT_CONTROLLER] = 0.0
+        late = offsets[: len(CLOCKS)] * OFFSET_UNIT
+        if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
+            return None
+        inlet = setpoints_on_ticks(flights, schedule, objective.samples)
+        channels = [name for name in CHANNELS if name in segments.measured]
+        if inlet is None or not {"position", "attitude", "body_rate"} <= set(channels):
+            return None
+        read = dict(segments.measured)
+        if "command" in read:
+            read["command"] = each_reading(read["command"])
+        laid = {
+            name: sampled(name, read[name], late, objective.samples, float(schedule.log_rate))
+            for name in channels
+        }
+        return Predictor(
+            simulator=objective.simulator,
+            feed=Feed(
+                segments=replace(segments, inlet=inlet, measured={}),
+                offsets=jnp.asarray(offsets),
+                samples={name: samples for name, (samples, _) in laid.items()},
+            ),
+            rows={name: rows for name, (_, rows) in laid.items()},
+            strengths=USUAL,
+            noise=dict.fromkeys(channels, 1.0),
+        )
+
+    def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
+        """Return the same with samples at the ticks where a point's clocks have them.
+
+        Before it has run.
+        """
+        laid = Predictor.of(objective, point, flights)
+        assert laid is not None
+        return replace(laid, strengths=self.strengths, noise=self.noise)
+
+    def slopes(self, objective: Objective, point: Point) -> Slopes:
+        """Return how the likelihood changes with the strengths; innovations lie on ticks.
+
+        All are that of the first `LEARNT_FROM` of each flight, times as much as there is.
+        """
+        assert self.found is not None
+        some = min(round(LEARNT_FROM * float(objective.schedule.log_rate)), self.ticks)
+        whole = np.asarray(self.found.white)
+        share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
+        steps = steps_from(self.strengths)
+        here = likelihood_of(self.found, some)
+        beside = self._beside(objective, point, steps, some)
+        slope, information, moved = slopes_of(here, beside, steps)
+        ticks = np.zeros((len(moved), *whole.shape))
+        on_ticks = moved.reshape(len(moved), some, whole.shape[-1], -1)
+        ticks[:, :some] = np.moveaxis(on_ticks, -1, 2)
+        return Slopes(slope / share, information / share, ticks / share)
+
+    def _beside(
+        self, objective: Objective, point: Point, steps: Array, ticks: int
+    ) -> Iterator[Likelihood]:
+        """Return how likely the first ticks are with each of the strengths a step away, in turn.
+
+        As many are filtered side by side as fill a kernel's block of segments.
+        """
+        count = self.feed.offsets.shape[-1]
+        feed = self._fed(point)
+        samples = jax.tree.map(lambda rows: rows[:ticks], feed.samples)
+        strengths = self.strengths[:, None] + np.diag(steps)
+        together = max(SEGMENTS // count, 1)
+        for first in range(0, len(steps), together):
+            some = strengths[:, first : first + together]
+            tiled = jax.tree.map(
+                lambda rows, times=some.shape[1]: np.tile(rows, times),
+                replace(feed, samples=samples),
+            )
+            expected = self._expected(objective, point, np.repeat(some, count, axis=-1))
+            found = filtered(self.simulator, tiled, expected, gains=False)
+            for number in range(some.shape[1]):
+                segments = slice(number * count, (number + 1) * count)
+                yield likelihood_of(found, ticks, segments)
+
+    def as_noisy(self, objective: Objective, point: Point) -> Predictor:
+        """Return the predictor whose samples are as noisy as the innovations, or itself."""
+        noise = dict(self.noise)
+        for name, white in self._sizes():
+            if name == "command":
+                continue  # how noisy it is is learnt
+            spread = noise[name] * float(robust_sd(white)) if len(white) else 1.0
+            noise[name] = spread if spread > NOISIER else 1.0
+        return self if noise == self.noise else replace(self, noise=noise).at(objective, point)
+
+    @property
+    def keeps_track(self) -> bool:
+        """Whether few innovations of any channel are outliers, and all are finite.
+
+        Outliers are rare; many are samples of what the model does not do.
+        """
+        return all(
+            np.mean(~(white <= GATE)) <= LOST for _, white in self._sizes() if len(white) > 0
+        )
+
+    def _sizes(self) -> Iterator[tuple[str, Array]]:
+        """Return each channel with the sizes (n,) of its whitened innovations."""
+        assert self.found is not None
+        white = np.asarray(self.found.white, float)
+        for name, rows in gathered(white, self.feed.widths, self.rows).items():
+            yield name, np.abs(rows[rows != 0.0])
+
+    @property
+    def loss(self) -> float:
+        """Half the sum of squares of the whitened innovations, those beyond the gate as at it."""
+        return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
+
+    def at(self, objective: Objective, point: Point) -> Predictor:
+        """Return the predictor once its filter has run at a point."""
+        feed = self._fed(point)
+        found = filtered(self.simulator, feed, self._expected(objective, point))
+        return replace(self, feed=feed, found=found)
+
+    @property
+    def ticks(self) -> int:
+        """How many there are."""
+        return int(next(iter(self.feed.samples.values())).values.shape[0])
+
+    @property
+    def memory(self) -> int:
+        """Bytes that gains take."""
+        flights, wide = self.feed.offsets.shape[-1], sum(self.feed.widths.values())
+        return self.ticks * flights * wide * (NUMBERS + wide) * np.dtype(np.float32).itemsize
+
+    def _fed(self, point: Point) -> Feed:
+        return replace(self.feed, offsets=jnp.asarray(point.offsets))
+
+    def _expected(
+        self, objective: Objective, point: Point, strengths: Array | None = None
+    ) -> Expected:
+        """Return what is expected with strengths (7, segments), or the flights' own."""
+        if strengths is None:
+            strengths = np.tile(self.strengths[:, None], self.feed.offsets.shape[-1])
+        widths, shape = self.feed.widths, strengths.shape[1:]
+        factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
+        noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
+        noise = noise.repeat(list(widths.values()), axis=0)
+        return Expected(
+            objective.tunable, *map(jnp.asarray, (point.coefficients, strengths, noise))
+        )
+
+    def among(self, flights: NDArray[np.intp]) -> Predictor:
+        """Return the predictor of some flights alone."""
+        feed, found = jax.tree.map(
+            lambda leaf: np.asarray(leaf)[..., flights], (self.feed, self.found)
+        )
+        rows = {name: tick[:, flights] for name, tick in self.rows.items()}
+        return replace(self, feed=feed, found=found, rows=rows)
+
+    def information(
+        self,
+        objective: Objective,
+        point: Point,
+        criterion: Criterion,
+        otherwise: Mapping[str, Objective] = MappingProxyType({}),
+        by_strengths: Array | None = None,
+    ) -> FisherInformation:
+        """Return what the innovations of these flights say at a point, see `with_hidden`.
+
+        Its criterion gives no scales: innovations are whitened. ``otherwise``: what might be
+        simulated differently -> the problem so simulated; gains stay. With derivatives by the
+        strengths (`Slopes.moved`) those are changes, too: see `with_strengths`.
+        """
+        moved = np.flatnonzero(~hidden(objective.space.names))
+        offsets = np.arange(len(point.offsets)) + len(objective.space)
+        own = Point(point.coefficients, self.feed.offsets)
+        jacobian = self.jacobian(objective, own, [*moved, *offsets])
+        changed = {
+            name: dict[str, Any](self._stepped(other, own).jacobian(other, own, []).residuals)
+            for name, other in otherwise.items()
+        }
+        if by_strengths is not None:
+            moves = gathered(by_strengths, self.feed.widths, self.rows)
+            for number, name in enumerate(STRENGTHS):
+                changed[name] = {
+                    channel: residuals + moves[channel][number]
+                    for channel, residuals in jacobian.residuals.items()
+                }
+        return information_from_jacobian(
+            objective, own, unscaled(criterion), jacobian, otherwise=changed
+        )
+
+    def _stepped(self, other: Objective, point: Point) -> Predictor:
+        """Return the predictor whose physics runs in the finer steps of another problem."""
+        assert self.found is not None
+        times = other.schedule.physics_rate // self.simulator.schedule.physics_rate
+        segments, found = self.feed.segments, self.found
+        inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
+        gains = stepped(found.gains, self.simulator, self._expected(other, point), times)
+        return replace(
+            self,
+            simulator=other.simulator,
+            feed=replace(self.feed, segments=replace(segments, inlet=inlet)),
+            found=replace(found, gain=gains.gain),
+        )
+
+    def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
+        """Return whitened innovations at a point, and derivatives by some of its P parameters.
+
+        The columns of the others are zero.
+        """
+        assert self.found is not None
+        count = len(point.coefficients)
+        size = count + len(point.offsets)
+        feed, expected = self._fed(point), self._expected(objective, point)
+        columns: dict[str, Any] = {}
+        residuals: dict[str, Any] = {}
+        for first in range(0, max(len(moved), 1), AT_ONCE):
+            some = list(moved[first : first + AT_ONCE])
+            directions = np.zeros((AT_ONCE if some else 0, size))
+            directions[np.arange(len(some)), some] = 1.0
+            errors, derivatives = innovations(
+                self.simulator, feed, self.found.gains, expected, directions
+            )
+            residuals = gathered(errors, feed.widths, self.rows)
+            for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():
+                columns.setdefault(name, np.zeros((size, *part.shape[1:])))[some] = part
+        return Jacobian(residuals, columns, jnp.full(self.feed.segments.count, jnp.inf))
+
+
+def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:
+    """Return what a filter makes of some segments' first ticks, row by row in each tick."""
+    loss, white, factors = (
+        np.asarray(rows[:ticks, ..., segments]) for rows in (found.loss, found.white, found.factors)
+    )
+    wide = white.shape[1]
+    return Likelihood(
+        float(np.sum(loss)),
+        np.moveaxis(white, -1, 1).reshape(-1, wide),
+        np.moveaxis(factors, -1, 1).reshape(-1, wide, wide),
+    )
+
+
+def unscaled(criterion: Criterion) -> Criterion:
+    """Return a criterion for residuals that are whitened already, a filter knowing the start."""
+    ones = {name: jnp.ones_like(scale) for name, scale in criterion.scale.items()}
+    return replace(criterion, scale=ones, states=None)

@@ -1,0 +1,172 @@
+"""Recordings laid out on the simulation's ticks: set-points that go in, samples that correct it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float
+from numpy.typing import NDArray
+
+from sim_jax.inlet import BodyRateInlet
+from sim_jax.schedule import Schedule
+from sim_jax.vector import Vec3
+from tuner.objective.noise import repeats
+from tuner.objective.segments import CLOCK_OF, CLOCKS, Measured
+from tuner.recordings.flight import Flight
+
+SETPOINTS = ("rate_setpoint", "thrust_setpoint")
+MISSING = 0.1
+"""Share of the set-points that may be missing: they are interpolated."""
+OFF_TICK = 0.25
+"""Share of a period of position control by which set-points may be stamped beside its ticks."""
+FLIGHT_CONTROLLER = CLOCKS.index("flight_controller")
+
+
+class Sampled(eqx.Module):
+    """One channel on T ticks: the sample between a tick and the one before, if there is one.
+
+    Attributes
+    ----------
+    values
+        (T, c, F).
+    weight
+        (T, k, F) one over the standard deviation; zero where nothing was measured.
+    place
+        (T, F) where between both ticks it was taken, 0..1, were its clock right.
+    """
+
+    values: Float[Array, "T c F"]
+    weight: Float[Array, "T k F"]
+    place: Float[Array, "T F"]
+
+
+def sampled(
+    channel: str, measured: Measured, late: NDArray[np.float64], ticks: int, rate: float
+) -> tuple[Sampled, NDArray[np.intp]]:
+    """Lay a channel's samples out on ticks.
+
+    Parameters
+    ----------
+    channel
+        A command holds: it is that of the tick before its stamp, others lie between two ticks.
+    measured
+        The n samples of F segments.
+    late
+        (clocks, F) s by which stamps are late.
+    ticks, rate
+        How many there are, and how many a second.
+
+    Returns
+    -------
+    tuple
+        The channel, and each sample's tick (n, F); -1 for one without: of several between two ticks
+        the last counts.
+    """
+    time, weight = np.asarray(measured.time), np.asarray(measured.weight)
+    values = np.asarray(measured.values)
+    at = (time - late[CLOCK_OF[channel]]) * rate
+    tick = (np.floor(at + 1e-6) if channel == "command" else np.ceil(at - 1e-6)).astype(int)
+    counts = (weight > 0).any(axis=1) & (tick >= 0) & (tick < ticks)
+    laid = np.zeros((ticks, *values.shape[1:])), np.zeros((ticks, *weight.shape[1:]))
+    if channel == "attitude":
+        laid[0][:, 0] = 1.0
+    place, rows = np.ones((ticks, time.shape[1])), np.full(time.shape, -1)
+    for segment in range(time.shape[1]):
+        taken = np.full(ticks, -1)
+        known = np.flatnonzero(counts[:, segment])
+        taken[tick[known, segment]] = known
+        filled = np.flatnonzero(taken >= 0)
+        sample = taken[filled]
+        laid[0][filled, :, segment] = values[sample, :, segment]
+        laid[1][filled, :, segment] = weight[sample, :, segment]
+        place[filled, segment] = 1.0 - filled + time[sample, segment] * rate
+        rows[sample, segment] = filled
+    return Sampled(*(jnp.asarray(part) for part in (*laid, place))), rows
+
+
+def each_reading(commands: Measured) -> Measured:
+    """Return commands each of which weighs as one reading, however long it rests.
+
+    Simulated flights take a value that rests for one reading (`repeats`). Whether it will rest
+    depends on what comes after it, and innovations that are weighed by that are no longer chance:
+    a filter takes all alike, and learns how noisy they are.
+    """
+    values = np.asarray(commands.values)
+    rests = np.stack([repeats(table) for table in np.moveaxis(values, -1, 0)], axis=-1)
+    return replace(commands, weight=commands.weight * jnp.asarray(np.sqrt(rests)))
+
+
+def setpoints_on_ticks(
+    flights: Sequence[Flight], schedule: Schedule, samples: int
+) -> BodyRateInlet | None:
+    """Return rate and thrust set-points at the ticks of position control at which they were made.
+
+    None where they were not all recorded, or are stamped beside the ticks. They are published
+    after they were made: each is taken to be that of the nearest tick, where a zero-order hold
+    would make it a step late.
+
+    Parameters
+    ----------
+    flights
+        F flights.
+    schedule
+        Whose ticks.
+    samples
+        Of the simulation's log, for which they have to last.
+    """
+    rate = float(schedule.position_control_rate)
+    ticks = np.arange(int(np.ceil(samples / schedule.log_rate * rate)) + 2)
+    laid = []
+    for flight in flights:
+        rows = []
+        for name in SETPOINTS:
+            series = flight.series.get(name)
+            if series is None or not np.isfinite(series.values).all():
+                return None
+            at = series.time * rate
+            tick = np.round(at)
+            flown = (tick >= 0) & (tick <= flight.duration * rate)
+            expected = flight.duration * rate
+            if (
+                np.count_nonzero(flown) < (1.0 - MISSING) * expected
+                or np.median(np.abs(at - tick)[flown]) > OFF_TICK
+            ):
+                return None
+            rows += [np.interp(ticks, tick, column) for column in series.values.T]
+        laid.append(np.stack(rows))
+    table = np.stack(laid, axis=-1)
+    steps = np.arange(int(np.ceil(samples / schedule.log_rate * schedule.physics_rate)) + 2)
+    tick_of = steps * schedule.position_control_rate // schedule.physics_rate
+    x, y, z, thrust = (jnp.asarray(row[tick_of]) for row in table)
+    return BodyRateInlet(Vec3(x, y, z), thrust)
+
+
+def gathered(
+    table: NDArray[np.float64], widths: Mapping[str, int], rows: Mapping[str, NDArray[np.intp]]
+) -> dict[str, NDArray[np.float64]]:
+    """Return channel -> (\\*leading, n, k, F) of a table (\\*leading, T, m, F) on ticks.
+
+    Parameters
+    ----------
+    table
+        The channels' columns, one channel after the other.
+    widths
+        Channel -> how many columns it has.
+    rows
+        Channel -> (n, F) each sample's tick; zero stands where there is none.
+    """
+    channels, first = {}, 0
+    for name, width in widths.items():
+        tick = rows[name]
+        columns = table[..., first : first + width, :]
+        taken = np.take_along_axis(
+            columns, np.maximum(tick, 0).reshape((1,) * (table.ndim - 3) + (len(tick), 1, -1)), -3
+        )
+        channels[name] = np.where((tick >= 0)[:, None], taken, 0.0)
+        first += width
+    return channels

@@ -1,0 +1,211 @@
+"""The coefficients and disturbances that make the recordings likeliest.
+
+Gauss and Newton's steps on the innovations' likelihood, of coefficients, clocks and the strengths
+of the disturbances together: what least squares leaves of the disturbances in its coefficients
+makes them look stronger and slower than they are, and where they are taken for that the
+coefficients are biased in turn. Learnt one after the other they approach each other slowly.
+
+Innovations are differentiated with gains that stay: at the likeliest point the gains' own
+derivatives are met by innovations that nothing of the past explains. How likely a step's end is,
+the filter says with gains of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.numerics import scaled_solve
+from tuner.disturbances.disturbances import LEAST, MOST, within
+from tuner.disturbances.predictor import Predictor, unscaled
+from tuner.disturbances.recorded import gathered
+from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.loss import gauss_newton, robust
+from tuner.objective.normal import Objective
+from tuner.recordings.flight import Flight
+from tuner.search.normal_equations import normal_equations
+from tuner.vehicle.space import Space
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STEPS = 16
+"""At most, by default."""
+DAMPED = (0.0, 0.1, 1.0, 10.0, 100.0)
+"""Shares of the Hessian's diagonal that are added to it until a step leads down (Levenberg)."""
+FURTHEST = float(np.log(4.0))
+"""That a strength moves at a time: beyond, the likelihood is no parabola."""
+ENOUGH = 0.1
+"""Gain that a step promises, in half a unit of χ², below which it is not worth taking."""
+
+
+def with_least_innovations(
+    predictor: Predictor,
+    flights: Sequence[Flight],
+    problem: tuple[Objective, Point, Criterion],
+    free: Mask,
+    steps: int = STEPS,
+) -> tuple[Predictor, Point]:
+    """Return the predictor to which the recordings are likeliest, and the point where they are.
+
+    Parameters
+    ----------
+    predictor, flights
+        The predictor of N flights, with the strengths to begin from.
+    problem
+        With the point where the descent begins, and its criterion.
+    free
+        (K + offsets·N,) what may move.
+    steps
+        At most.
+    """
+    objective, point, criterion = problem
+    criterion = unscaled(criterion)
+    point = Point(point.coefficients, predictor.feed.offsets)
+    predictor = predictor.at(objective, point)
+    for _ in range(steps):
+        lower = _lower(predictor, objective, point, criterion, free)
+        if lower is None:
+            break
+        predictor, point = lower
+        settled = predictor.laid(objective, point, flights)
+        if any((settled.rows[name] != predictor.rows[name]).any() for name in predictor.rows):
+            predictor = settled.at(objective, point)
+        predictor = predictor.as_noisy(objective, point)
+    return predictor, point
+
+
+def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: Criterion) -> float:
+    """Return the negative log-likelihood of the recordings, with that of the priors."""
+    assert predictor.found is not None
+    count, segments = len(objective.space) + len(point.offsets), objective.segments.flight
+    nothing = SegmentSums(
+        loss=jnp.zeros(len(segments)),
+        gradient=jnp.zeros((count, len(segments))),
+        hessian=jnp.zeros((count, count, len(segments))),
+        squares={},
+        counts={},
+        crash_time=jnp.full(len(segments), jnp.inf),
+        states=None,
+    )
+    priors = normal_equations(objective.space, segments, point, criterion, nothing)[0]
+    return float(np.sum(predictor.found.loss) + priors)
+
+
+class _Equations(NamedTuple):
+    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths."""
+
+    gradient: Array
+    hessian: Array
+
+
+def _equations(
+    predictor: Predictor,
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    moved: Sequence[int],
+) -> _Equations:
+    """Return gradient and Hessian at a point; ``moved`` of its coefficients and offsets enter."""
+    space, flight = objective.space, np.asarray(objective.segments.flight)
+    (kinds, flights), count = point.offsets.shape, len(space)
+    size = count + kinds
+    jacobian = predictor.jacobian(objective, point, moved)
+    slopes = predictor.slopes(objective, point)
+    by_strengths = gathered(slopes.moved, predictor.feed.widths, predictor.rows)
+    segments, total = jacobian.crash_time.shape[0], size + len(slopes.slope)
+    gradient, hessian = np.zeros((segments, total)), np.zeros((segments, total, total))
+    loss, huber = np.zeros(segments), float(criterion.huber)
+    for name, more in by_strengths.items():
+        columns = np.concatenate([jacobian.columns[name], more])
+        errors = np.moveaxis(np.asarray(jacobian.residuals[name]), -1, 0)
+        scale = np.asarray(criterion.scale[name])
+        along, bend = gauss_newton(np.moveaxis(columns, (0, -1), (-1, 0)), errors, scale, huber)
+        gradient += along
+        hessian += bend
+        loss += 0.5 * robust(errors, huber).sum(axis=(1, 2))
+    gradient, hessian = np.moveaxis(gradient, 0, -1), np.moveaxis(hessian, 0, -1)
+    sums = SegmentSums(
+        loss=loss,
+        gradient=gradient[:size],
+        hessian=hessian[:size, :size],
+        squares={},
+        counts={},
+        crash_time=jacobian.crash_time,
+        states=None,
+    )
+    _, own, among = map(np.asarray, normal_equations(space, flight, point, criterion, sums))
+    across = np.asarray(hessian[:size, size:])
+    owner = flight[:, None] == np.arange(flights)
+    of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
+    across = np.concatenate([across[:count].sum(axis=-1), of_flights])
+    bend = slopes.information + 1e-9 * np.eye(len(slopes.slope))
+    return _Equations(
+        np.concatenate([own, slopes.slope]), np.block([[among, across], [across.T, bend]])
+    )
+
+
+def _lower(
+    predictor: Predictor,
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    free: Mask,
+) -> tuple[Predictor, Point] | None:
+    """Return what predicts at the end of a step, and where that is; None if nothing is gained."""
+    kinds, flights = np.shape(point.offsets)
+    count, parameters, strengths = len(objective.space), len(free), predictor.strengths
+    by_kind = free[count:].reshape(kinds, flights).any(axis=1)
+    moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
+    gradient, hessian = _equations(predictor, objective, point, criterion, moved)
+    slope = gradient[parameters:]
+    held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
+    free = np.concatenate([free, ~held])
+    here = _loss(predictor, objective, point, criterion)
+    for damping in DAMPED:
+        damped = hessian + damping * np.diag(np.diag(hessian))
+        change = _step(objective.space, point, gradient, damped, free)
+        if -0.5 * (gradient @ change) < ENOUGH:
+            return None
+        by_strengths = np.clip(change[parameters:], -FURTHEST, FURTHEST)
+        to = _moved(objective.space, point, change[:parameters])
+        tried = replace(predictor, strengths=within(strengths + by_strengths)).at(objective, to)
+        if _loss(tried, objective, to, criterion) < here:
+            return tried, to
+    return None
+
+
+def _step(space: Space, point: Point, gradient: Array, hessian: Array, free: Mask) -> Array:
+    """Return the Gauss-Newton step in which what would leave its bounds stays where it is."""
+    free = free.copy()
+    while True:
+        moves = np.flatnonzero(free)
+        change = np.zeros(len(gradient))
+        change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], gradient[moves])
+        share = _share_after(space, point, change)
+        leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
+        if not len(leaves):
+            return change
+        free[leaves] = False
+
+
+def _share_after(space: Space, point: Point, change: Array) -> Array:
+    """Return where between their bounds the coefficients lie after a step, linear in scaled ones.
+
+    The search's own coordinate is logistic: next to a bound a step in it goes nowhere.
+    """
+    vector = np.asarray(point.coefficients)
+    moved = space.slope(vector) * change[: len(vector)] / space.width
+    return np.asarray(space.share(vector) + moved)
+
+
+def _moved(space: Space, point: Point, change: Array) -> Point:
+    vector, moved = np.asarray(point.coefficients), change[: len(point.coefficients)] != 0.0
+    after = np.where(moved, space.at_share(_share_after(space, point, change)), vector)
+    offsets = change[len(vector) :].reshape(point.offsets.shape)
+    return Point(jnp.asarray(after), point.offsets + jnp.asarray(offsets))

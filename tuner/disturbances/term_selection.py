@@ -1,0 +1,211 @@
+"""Which terms the flights call for once what pushed them is followed, and how far others matter.
+
+Least squares sees a term through gusts that the loop has turned into a slow wander of all signals,
+and hardly tells it from chance. Innovations are white: they tell the same term up to ten times as
+surely. So all candidates are judged once more, in one linear approximation of the innovations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.disturbances.information import hidden
+from tuner.disturbances.predictor import Predictor
+from tuner.job.findings import findings_at
+from tuner.search.extension import extended, with_groups
+from tuner.search.fitted import Fitted
+from tuner.search.problem import Job
+from tuner.terms.candidates import (
+    Groups,
+    is_stand_in,
+    names_in,
+    presence_of,
+    start_of,
+)
+from tuner.terms.doubt import SMALLEST, in_doubt
+from tuner.terms.held_out_score import vector_after
+from tuner.terms.linear import Columns, Linear, linear_of
+from tuner.terms.score import EARNING, surviving
+from tuner.terms.selection_state import Selected
+from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle import conditions
+from tuner.vehicle.space import Space
+
+Array = NDArray[np.float64]
+
+REFUSED = (
+    SelectionCode.NOT_SIGNIFICANT,
+    SelectionCode.IMMATERIAL,
+    SelectionCode.NOT_PREDICTED,
+    SelectionCode.WORSE_AFTER_REFIT,
+)
+"""Why least squares may have left out what innovations call for."""
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """What innovations say of a fit's coefficients and of those of the terms that it lacks.
+
+    Attributes
+    ----------
+    selected
+        The terms of the fit, and those that it lacks.
+    fitted
+        The fit to the innovations, in the space of ``selected``.
+    space, vector
+        Of all P coefficients, and where they are.
+    linear
+        The innovations about it.
+    """
+
+    selected: Selected
+    fitted: Fitted
+    space: Space
+    vector: Array
+    linear: Linear
+
+    @staticmethod
+    def of(selected: Selected, fitted: Fitted, predictor: Predictor) -> Innovations:
+        """Return what the innovations of a predictor say at a fit, gains as they are."""
+        names = [name for group in _outside(selected).values() for name in group]
+        _, wide = extended(selected.job, fitted, names)
+        beside = replace(predictor, simulator=wide.objective.simulator)
+        information = beside.information(wide.objective, wide.point, fitted.criterion)
+        space, vector = wide.objective.space, np.asarray(wide.point.coefficients)
+        scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+        linear = linear_of(information, scaled, space.prior_mean, predictor.loss)
+        return Innovations(selected, fitted, space, vector, linear)
+
+    def in_doubt(self) -> dict[str, float]:
+        """Return how far coefficients would move with terms that were left out.
+
+        Of what set-points hide, by least squares.
+        """
+        outside = _outside(self.selected)
+        groups = [
+            (columns, presence_of(names))
+            for names in outside.values()
+            if len(columns := self._columns(names))
+        ]
+        if not groups:
+            return dict(self.selected.in_doubt)
+        model = self._model(self.fitted.objective.space.names)
+        moves = in_doubt(self.linear, model, groups)
+        return {
+            **self.selected.in_doubt,
+            **{self.space.names[i]: float(moves[i]) for i in model},
+        }
+
+    def selection(self, had: Collection[str], *, first: bool = False) -> Selected | None:
+        """Return the terms that innovations call for and their fit, one linear step on.
+
+        From all that describe one thing, and those that are in already, backwards: what chance
+        explains goes first. What is left has to be as large as a term that is not as good as
+        absent. None if no other terms are called for, or none was tried.
+
+        What stands in for other terms least squares may have taken for gusts, and from there
+        the others look as if they were not needed: ``first`` it goes. Of what is left it is judged
+        again, as far as least squares ``had`` it.
+        """
+        base, tried = self.selected.base, self._tried()
+        within = {name: names for name, names in tried.items() if self._is_in(name)}
+        without = {name: names for name, names in within.items() if first and is_stand_in(name)}
+        begin = {
+            name: names
+            for name, names in tried.items()
+            if name not in without and (name in within or name in had or not is_stand_in(name))
+        }
+        if base is None or not (begin or without):
+            return None
+        judged = names_in(tried)
+        model = self._model([n for n in self.fitted.objective.space.names if n not in judged])
+        kept, _ = surviving(
+            self.linear,
+            model,
+            {name: self._columns(names) for name, names in begin.items()},
+            candidates=len(tried),
+            neutral=self._neutral(tried),
+            without=self._columns(names_in(without)),
+            stand_ins=[name for name in begin if is_stand_in(name)],
+            no_gusts=list(begin),  # they are followed
+            material=0.0,
+        )
+        change = self._change(model, tried, kept)
+        size = np.abs(self.linear.scaled + change - self._neutral(tried)) / self.linear.prior_sd
+        large = [name for name in kept if size[self._columns(tried[name])].max() > SMALLEST]
+        if set(large) == set(within):
+            return None
+        return self._with(base, tried, large, self._change(model, tried, large))
+
+    def _with(
+        self, base: tuple[Job, Fitted], tried: Groups, kept: Collection[str], change: Array
+    ) -> Selected:
+        """Return the selection with some of the groups that were tried."""
+        rows = [
+            _judged(row, kept=row.group in kept) if row.group in tried else row
+            for row in self.selected.rows
+        ]
+        rows.sort(key=lambda row: not row.kept)
+        groups = {row.group: row.names for row in rows if row.kept and row.reason in EARNING}
+        moved = vector_after(self.space, jnp.asarray(self.vector), change)
+        vector = dict(zip(self.space.names, moved.tolist(), strict=True))
+        said = findings_at(self.selected.job, self.selected.fitted)
+        job, fitted = with_groups(base, groups, self.fitted, vector, said=said)
+        return replace(self.selected, job=job, fitted=fitted, rows=tuple(rows))
+
+    def _tried(self) -> dict[str, tuple[str, ...]]:
+        """Return the groups that innovations can judge: all of whose columns they see."""
+        return {
+            row.group: row.names
+            for row in self.selected.rows
+            if row.reason in (EARNING if row.kept else REFUSED)
+            and not hidden(row.names).any()
+            and not set(row.names) & set(conditions())
+        }
+
+    def _is_in(self, group: str) -> bool:
+        return any(row.group == group and row.kept for row in self.selected.rows)
+
+    def _change(self, model: Columns, tried: Groups, kept: Collection[str]) -> Array:
+        """Return the step (P,) to the minimum with some groups, the others at neutral values."""
+        free = np.concatenate([model, *(self._columns(tried[name]) for name in kept)])
+        away = np.zeros(len(self.linear.scaled))
+        for name in set(tried) - set(kept):
+            gone = self._columns(tried[name])
+            away[gone] = (self._neutral(tried) - self.linear.scaled)[gone]
+        everything = np.ones(len(self.linear.flight), bool)
+        return self.linear.step(free.astype(np.intp), inside=everything, from_=away)
+
+    def _neutral(self, tried: Groups) -> Array:
+        """Return neutral values (P,) of the groups, scaled; zero for all others."""
+        neutral = start_of(names_in(tried))
+        return np.array(
+            [p.scaled(neutral[p.name]) if p.name in neutral else 0.0 for p in self.space.parameters]
+        )
+
+    def _model(self, names: Sequence[str]) -> Columns:
+        """Return the columns of what the model holds anyway, and innovations see."""
+        return self._columns([name for name in names if name not in self.fitted.held])
+
+    def _columns(self, names: Sequence[str]) -> Columns:
+        seen = ~hidden(self.space.names)
+        return np.flatnonzero(np.isin(self.space.names, list(names)) & seen)
+
+
+def _outside(selected: Selected) -> Groups:
+    """Return what was tried and left out. A steady wind is a disturbance like others."""
+    around = set(conditions())
+    return {names[0]: names for names in selected.left_out if not around & set(names)}
+
+
+def _judged(row: SelectionRow, *, kept: bool) -> SelectionRow:
+    """Return a group's row after innovations have judged it."""
+    if row.kept == kept:
+        return row
+    reason = SelectionCode.PREDICTS_SAMPLES if kept else SelectionCode.NOT_SIGNIFICANT
+    return row.model_copy(update={"kept": kept, "reason": reason})

@@ -1,0 +1,1 @@
+"""Simulated against recorded flights, predictions of held-out ones, flights nobody flew."""

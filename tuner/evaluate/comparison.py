@@ -1,0 +1,389 @@
+"""Recordings laid out once, and compared with any number of vehicles at the recorded stamps.
+
+Simulation and reading at the stamps are those of the fit (`tuner.objective.residuals`), and so are
+the stretches: whole flights where the reference enters, windows from recorded starts where a signal
+further down does. A simulation that is fed motor commands, rotor speeds or rate set-points drifts
+away within seconds, whatever its coefficients; over a window its error says how good they are. A
+window starts from the recorded state, so that its end is predicted; how closely it is met from the
+likeliest start for the vehicle that flies, and with the likeliest trim, is another number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from sim_jax.crash import AIRBORNE, Limits
+from sim_jax.schedule import Schedule
+from tuner.config.job import InletName
+from tuner.evaluate.forces import Forces, acting, in_order
+from tuner.evaluate.rmse import (
+    FlightErrors,
+    SignalErrors,
+    joined,
+    laps_of,
+    limits_of,
+    short_way,
+)
+from tuner.evaluate.simulation_table import roll_pitch_yaw
+from tuner.objective.battery import with_reference_voltage
+from tuner.objective.criterion import Point, units_of
+from tuner.objective.flight import MOTION, TURNED
+from tuner.objective.flown import Flown, fly
+from tuner.objective.inlets import INLETS, window_seconds
+from tuner.objective.job_flights import Recording
+from tuner.objective.noise import noise_of
+from tuner.objective.normal import Objective
+from tuner.objective.residuals import Reading, at_stamps
+from tuner.objective.segments import (
+    CLOCKS,
+    OFFSETS,
+    Segments,
+    segments_of,
+    window_segments,
+)
+from tuner.objective.start import recent_command
+from tuner.objective.windows import Window, windows_of
+from tuner.recordings.flight import Array
+from tuner.search.free_starts import FAR
+from tuner.search.progress import plain_criterion
+from tuner.vehicle import ControllerFile, VehicleFile, check_mixer
+from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed
+from tuner.vehicle.space import Space
+
+POSE = ("position", "attitude")
+LAG = 0.03
+"""s over which recent commands give the speed of a rotor without tachometer."""
+BEYOND = 0.02
+"""s simulated beyond a window, for stamps that are late."""
+LOOSE = 10.0
+"""Multiple of the noise by which a simulation may miss before its start is doubted."""
+FORCES_RATE = 50.0
+"""Hz at which forces along a flight are kept: they are drawn, nothing is computed from them."""
+ROUNDS = 3
+"""Steps towards the likeliest start."""
+
+
+class Comparison:
+    """Recordings laid out once, to be compared with any number of vehicles.
+
+    Parameters
+    ----------
+    recordings
+        At least one. Their clock offsets are taken as known (`with_offsets` of
+        `tuner.objective.job_flights`); one that a fit would estimate counts as zero.
+    controller
+        What flew.
+    window
+        s, length of the windows of flights that are not simulated in a closed loop; None takes
+        that of their inlet.
+
+    Raises
+    ------
+    RecordingError
+        A flight does not hold what its inlet needs.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        controller: ControllerFile,
+        *,
+        window: float | None = None,
+    ) -> None:
+        self._names = [recording.flight.name for recording in recordings]
+        by_inlet: dict[InletName, list[Recording]] = {}
+        for recording in recordings:
+            by_inlet.setdefault(recording.inlet, []).append(recording)
+        self._groups = [
+            _Group(members, controller, inlet, window_seconds([inlet], window))
+            for inlet, members in by_inlet.items()
+        ]
+
+    def fly_from_fitted_starts(self, vehicle: VehicleFile) -> dict[str, FlightErrors]:
+        """Return what `fly` does of flights in windows, but from the likeliest starts and trims.
+
+        These are fitted to each window: how well the vehicle can meet it, not how well it predicts.
+        """
+        errors: dict[str, FlightErrors] = {}
+        for group in self._groups:
+            if group.windowed:
+                errors |= group.fly(vehicle, fitted_starts=True)
+        return {name: errors[name] for name in self._names if name in errors}
+
+    def fly(
+        self,
+        vehicle: VehicleFile,
+        *,
+        computed: Collection[str] = (),
+        flier: Callable[..., Flown] = fly,
+    ) -> dict[str, FlightErrors]:
+        """Return flight name to its errors with a vehicle, in the recordings' order.
+
+        Parameters
+        ----------
+        vehicle
+            What flies.
+        computed
+            Coefficients of terms that are computed although the vehicle may lack them, so that
+            vehicles with and without them share a program.
+        flier
+            What flies segments: another simulator than this project's.
+
+        Raises
+        ------
+        ConfigError
+            The vehicle has rotors that the mixer above an inlet cannot fly.
+        """
+        errors: dict[str, FlightErrors] = {}
+        for group in self._groups:
+            errors |= group.fly(vehicle, computed=computed, flier=flier)
+        return {name: errors[name] for name in self._names}
+
+
+class _Group:
+    """The recordings that enter the loop at the same place, flown side by side."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        controller: ControllerFile,
+        inlet: InletName,
+        seconds: float,
+    ) -> None:
+        self._recordings, self._controller = tuple(recordings), controller
+        self._schedule = schedule_of(controller)
+        self._has_mixer = INLETS[inlet].has_mixer
+        self._inlet, self._seconds = inlet, seconds
+        self.windowed = not INLETS[inlet].closed_loop
+        self._stride = max(1, round(self._schedule.log_rate / FORCES_RATE))
+        rate, flights = self._schedule.log_rate, [recording.flight for recording in recordings]
+        if self.windowed:
+            self._windows = [
+                windows_of(flight, seconds, fed=INLETS[inlet].fed(flight), smoothed_widely=False)
+                for flight in flights
+            ]
+            self._segments = self._laid(free_starts=False)
+            self._samples, self._limits = math.ceil((seconds + BEYOND) * rate), AIRBORNE
+        else:
+            self._windows = [(Window(flight, 0.0),) for flight in flights]
+            self._segments = segments_of(
+                flights, noise=dict.fromkeys(POSE, 1.0), schedule=self._schedule
+            )
+            longest = max(flight.duration for flight in flights)
+            self._samples, self._limits = math.ceil(longest * rate) + 2, limits_of(flights)
+        late = np.array([recording.time_offset or 0.0 for recording in recordings])
+        self._late = late[np.asarray(self._segments.flight)]
+        names = sorted({name for recording in recordings for name in recording.conditions})
+        self._conditions = {
+            name: np.array([recording.conditions.get(name, 0.0) for recording in recordings])
+            for name in names
+        }
+
+    def _laid(self, *, free_starts: bool) -> Segments:
+        """Return the windows, which start as recorded or near there."""
+        flights = [recording.flight for recording in self._recordings]
+        return window_segments(
+            flights,
+            inlets=[self._inlet] * len(flights),
+            seconds=self._seconds,
+            schedule=self._schedule,
+            lag=LAG,
+            noise=noise_of(flights),
+            free_starts=free_starts,
+            input_late={r.flight.name: r.input_late for r in self._recordings},
+        )
+
+    def fly(
+        self,
+        vehicle: VehicleFile,
+        *,
+        fitted_starts: bool = False,
+        computed: Collection[str] = (),
+        flier: Callable[..., Flown] = fly,
+    ) -> dict[str, FlightErrors]:
+        """Return flight name to its errors, those of windows behind each other."""
+        if self._has_mixer:
+            check_mixer(vehicle)
+        flights = [recording.flight for recording in self._recordings]
+        model = model_of(with_reference_voltage(vehicle, flights), self._controller)
+        model = with_terms_computed(model, computed)
+        owner = np.asarray(self._segments.flight)
+        segments, states = self._segments, None
+        if fitted_starts:
+            segments = self._laid(free_starts=True)
+            states = self._likeliest_starts(model, segments)
+        elif self.windowed:
+            segments = self._spinning(vehicle)
+        simulated, acted, crash_times = _flown(
+            model,
+            segments,
+            self._late,
+            {name: values[owner] for name, values in self._conditions.items()},
+            schedule=self._schedule,
+            samples=self._samples,
+            limits=self._limits,
+            states=states,
+            stride=self._stride,
+            flier=flier,
+        )
+        errors, first = {}, 0
+        for recording, windows in zip(self._recordings, self._windows, strict=True):
+            flight, crash = recording.flight, float(crash_times[first])
+            position, attitude = (
+                joined(
+                    [
+                        self._errors(signal, simulated[signal], first + number, window)
+                        for number, window in enumerate(windows)
+                    ]
+                )
+                for signal in POSE
+            )
+            crashed = not self.windowed and crash <= flight.duration
+            errors[flight.name] = FlightErrors(
+                flight.name,
+                position,
+                attitude,
+                laps_of(flight),
+                crash if crashed else None,
+                self._forces(acted, first, windows, min(crash, flight.duration)),
+            )
+            first += len(windows)
+        return errors
+
+    def _errors(self, signal: str, simulated: Array, segment: int, window: Window) -> SignalErrors:
+        """Return the errors at the complete samples of a segment."""
+        measured = self._segments.measured[signal]
+        time = np.asarray(measured.time)[:, segment]
+        used = (np.asarray(measured.weight)[..., segment] > 0).all(axis=1)
+        if self.windowed:  # the next one begins where this one ends
+            used &= time < window.flight.duration
+        recorded = np.asarray(measured.values)[used, :, segment]
+        flown = simulated[segment, used]
+        if signal == "attitude":
+            recorded, flown = roll_pitch_yaw(recorded), roll_pitch_yaw(flown)
+            return SignalErrors(time[used] + window.begin, recorded, short_way(flown - recorded))
+        return SignalErrors(time[used] + window.begin, recorded, flown - recorded)
+
+    def _forces(
+        self, acted: Mapping[str, Array], first: int, windows: Sequence[Window], end: float
+    ) -> Forces:
+        """Return what acted along the segments of a flight, behind each other, up to a time in s.
+
+        A window's last instants, which the next one begins with, are left out.
+        """
+        of_term = in_order(acted)
+        count = next(iter(of_term.values())).shape[1]
+        time = np.arange(count) * self._stride / self._schedule.log_rate
+        shown = time < (self._seconds if self.windowed else end)
+        segments = range(first, first + len(windows))
+        whole = Forces(
+            np.concatenate([time[shown] + window.begin for window in windows]),
+            {
+                name: np.concatenate([values[segment, shown] for segment in segments])
+                for name, values in of_term.items()
+            },
+        )
+        return whole.before(windows[0].flight.duration) if self.windowed else whole
+
+    def _spinning(self, vehicle: VehicleFile) -> Segments:
+        """Return the windows whose rotors without tachometer have followed their commands."""
+        motor = vehicle.motor
+        lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
+        pieces = [window.flight for windows in self._windows for window in windows]
+        turning = jnp.asarray(np.stack([recent_command(piece, lag) for piece in pieces], axis=-1))
+        segments: Segments = eqx.tree_at(lambda s: s.turning, self._segments, turning)
+        return segments
+
+    def _likeliest_starts(self, model: Model, segments: Segments) -> Array:
+        """Return the likeliest starts (L, F), in the segments' standard deviations.
+
+        By Gauss and Newton's steps from the recorded starts, halved where they overshoot.
+        """
+        assert segments.freedom is not None
+        names, flights = tuple(self._conditions), len(self._recordings)
+        objective = Objective(
+            model,
+            segments,
+            Space([], {}),
+            self._schedule,
+            self._samples,
+            self._limits,
+            conditions=names,
+        )
+        rows = [
+            values / unit
+            for values, unit in zip(self._conditions.values(), units_of(names), strict=True)
+        ]
+        none = np.zeros((len(OFFSETS), flights))
+        point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
+        loose = {name: np.full(flights, LOOSE) for name in segments.measured}
+        criterion = plain_criterion(objective, self._samples, loose)
+        trial = best = np.zeros(segments.freedom.shape)
+        least = np.full(trial.shape[1], np.inf)
+        for _ in range(ROUNDS + 1):  # the last one judges the step before it
+            there = replace(criterion, states=jnp.asarray(trial))
+            sums = objective.sums(point, there, derivatives=False)
+            squares = np.sum([np.asarray(each) for each in sums.squares.values()], axis=0)
+            misfit = np.nan_to_num(squares / LOOSE**2 + (trial**2).sum(axis=0), nan=np.inf)
+            better = misfit <= least
+            best, least = np.where(better, trial, best), np.where(better, misfit, least)
+            asked = np.asarray(sums.states)
+            asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
+            trial = np.where(better, asked, 0.5 * (best + trial))
+        return best
+
+
+def _flown(
+    model: Model,
+    segments: Segments,
+    late: Array,
+    conditions: Mapping[str, Array],
+    *,
+    schedule: Schedule,
+    samples: int,
+    limits: Limits,
+    states: Array | None,
+    stride: int,
+    flier: Callable[..., Flown],
+) -> tuple[dict[str, Array], dict[str, Array], Array]:
+    """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
+
+    Between the two, term -> what acted at every ``stride``-th sample, (F, m, 6).
+
+    A stamp that is so late that it was taken before the simulation begins, or so early that it was
+    taken behind its end, is compared with the simulation's first or last sample.
+    """
+    flown = flier(
+        model,
+        segments,
+        schedule,
+        samples=samples,
+        limits=limits,
+        states=states,
+        conditions=conditions,
+        channels=(*POSE, "rotor_speed", MOTION, TURNED),
+    )
+    rate, calm = float(schedule.log_rate), np.zeros(segments.count)
+    acted = acting(
+        model.vehicle,
+        flown.channels[MOTION],
+        flown.channels[TURNED],
+        flown.channels["rotor_speed"],
+        rate=rate,
+        wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
+        stride=stride,
+    )
+    on_time = np.zeros((len(OFFSETS), segments.count))
+    reading = Reading(on_time, on_time[: len(CLOCKS)], rate, samples)
+    simulated = {}
+    for signal in POSE:
+        time = np.asarray(segments.measured[signal].time)
+        taken = np.clip(time - late, 0.0, (samples - 1) / rate).T
+        simulated[signal] = at_stamps(flown.channels[signal], signal, taken, reading)
+    return simulated, acted, flown.crash_time

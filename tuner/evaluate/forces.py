@@ -1,0 +1,158 @@
+"""What acted along a simulated flight: the force and moment of each term of the simulator.
+
+The thesis draws them so (Fig. 8.2), to see which effect matters in which flight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array as JaxArray
+
+from lanes import Argument, Program
+from sim_jax.environment import Environment
+from sim_jax.numeric import GRAVITY
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.terms.air import Air
+from sim_jax.terms.total import TERMS, wrench_of_each_term
+from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
+from tuner.recordings.flight import Array
+
+COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
+"""Force in N and moment in N m, about the centre of mass in body axes."""
+WEIGHT = "gravity"
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Forces:
+    """Force and moment of each term along a flight.
+
+    Together the forces are mass times acceleration, the moments the rate of change of the angular
+    momentum.
+
+    Attributes
+    ----------
+    time
+        (n,) s since the flight's start.
+    of_term
+        Term -> (n, 6) in N and N m, body axes; see `COMPONENTS`. Gravity is one of them.
+    """
+
+    time: Array
+    of_term: Mapping[str, Array]
+
+    def before(self, end: float) -> Forces:
+        """Return what acted until a time in s."""
+        inside = self.time < end
+        return Forces(self.time[inside], {n: v[inside] for n, v in self.of_term.items()})
+
+
+def acting(
+    vehicle: Vehicle,
+    motion: Array,
+    attitude: Array,
+    rotor_speed: Array,
+    *,
+    rate: float,
+    wind: tuple[Array, Array] | None = None,
+    stride: int = 1,
+) -> dict[str, Array]:
+    """Return term -> (F, m, 6) of what acted at every ``stride``-th sample, as in `Forces`.
+
+    Parameters
+    ----------
+    vehicle
+        What flew.
+    motion
+        (F, n, 9) logged position, velocity (world) and body rate.
+    attitude
+        (F, n, 4) quaternion, body to world.
+    rotor_speed
+        (F, n, rotors) rad/s. A rotor's acceleration is the central difference of its logged speed.
+    rate
+        Hz of the log.
+    wind
+        (F,) m/s each, world x and y; None in still air.
+    """
+    accelerations = rate * np.gradient(rotor_speed, axis=1)
+    logged = (motion, attitude, rotor_speed, accelerations)
+    flights, samples = motion[:, ::stride].shape[:2]
+    rows = [part[:, ::stride].reshape(flights * samples, -1).T for part in logged]
+    calm = np.zeros(flights)
+    air = [np.repeat(along, samples) for along in (*(wind or (calm, calm)), calm)]
+    given = (jax.tree.map(np.asarray, vehicle), *rows, np.stack(air))
+    leaves, structure = jax.tree.flatten(given)
+    shapes = [
+        Argument(np.shape(leaf), np.result_type(leaf), lanes=False)
+        for leaf in jax.tree.leaves(given[0])
+    ]
+    by_lane = [Argument(np.shape(leaf)[:-1], float, lanes=True) for leaf in leaves[len(shapes) :]]
+    program = _program((*shapes, *by_lane), structure)
+    acted: dict[str, Array] = program(given, lanes=flights * samples).values
+    return {name: values.reshape(flights, samples, 6) for name, values in acted.items()}
+
+
+@lru_cache(maxsize=16)
+def _program(arguments: tuple[Argument, ...], structure: Any) -> Program:
+    return Program(_acting, jax.tree.unflatten(structure, arguments), name="forces")
+
+
+def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
+    """Return term -> (6,) of what acts at one sample."""
+    vehicle, motion, attitude, speeds, accelerations, wind = given
+    rotors = len(vehicle.rotors)
+    moves = Motion(
+        Vec3.of(motion[0:3]), Vec3.of(motion[3:6]), Quaternion.of(attitude), Vec3.of(motion[6:9])
+    )
+    around = Environment(wind=Vec3.of(wind))
+    turning = tuple(speeds[i] for i in range(rotors))
+    air = Air.around(vehicle, moves, around, tuple(accelerations[i] for i in range(rotors)))
+    wrenches = wrench_of_each_term(vehicle, moves, turning, air)
+    parts = {
+        name: (*_components(wrench.force), *_components(wrench.moment))
+        for name, wrench in wrenches.items()
+    }
+    pull = air.up * (-GRAVITY * vehicle.body.mass)
+    none = jnp.zeros(())
+    parts[WEIGHT] = (*_components(pull), none, none, none)
+    return {
+        name: jnp.stack([jnp.broadcast_to(value, ()) for value in values])
+        for name, values in parts.items()
+    }
+
+
+def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Forces:
+    """Return what acted along a simulated flight.
+
+    Parameters
+    ----------
+    vehicle
+        What flew.
+    time, signals
+        Of a `tuner.evaluate.simulate.Simulation`.
+    """
+    rate = (len(time) - 1) / (time[-1] - time[0])
+    names = ("position", "velocity", "body_rate")
+    motion = np.concatenate([signals[name] for name in names], axis=1)
+    logged = (motion, signals["attitude"], signals["rotor_speed"])
+    parts = acting(vehicle, *(np.asarray(part, float)[None] for part in logged), rate=rate)
+    return Forces(time, in_order({name: part[0] for name, part in parts.items()}))
+
+
+def in_order(parts: Mapping[str, T]) -> dict[str, T]:
+    """Return term -> what belongs to it, in the order of the simulator's terms, gravity last."""
+    names = (*(term.__name__ for term in TERMS), WEIGHT)
+    return {name: parts[name] for name in names if name in parts}
+
+
+def _components(vector: Vec3) -> tuple[JaxArray, JaxArray, JaxArray]:
+    return vector.x, vector.y, vector.z

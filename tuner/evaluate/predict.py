@@ -1,0 +1,219 @@
+"""What a vehicle does after each recorded state, fed with the recorded inputs, against what it did.
+
+A prediction begins at the recorded state (`tuner.recordings.states`) and is simulated open loop
+for a stated time. Nothing is fitted to the flight that is predicted: no start, no trim, no offset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.crash import AIRBORNE
+from sim_jax.schedule import Schedule
+from tuner.config.job import InletName
+from tuner.objective.battery import with_reference_voltage
+from tuner.objective.flight import MOTION
+from tuner.objective.flown import fly
+from tuner.objective.inlets import INLETS
+from tuner.objective.segments import Segments, window_segments
+from tuner.recordings.flight import Array, Flight
+from tuner.recordings.states import States, states_at
+from tuner.vehicle import ControllerFile, VehicleFile
+from tuner.vehicle.model import Model, model_of, schedule_of
+
+UNITS: Mapping[str, str] = {
+    "position": "m",
+    "velocity": "m/s",
+    "attitude": "rad",
+    "body_rate": "rad/s",
+}
+"""What is predicted, with its unit."""
+AT_ONCE = 4096
+"""Predictions that are simulated side by side."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Predictions of one flight: n from one recorded state each, compared at S steps.
+
+    Attributes
+    ----------
+    begins
+        (n,) s since the mission's start at which they begin.
+    ahead
+        (S,) s after that at which they are compared.
+    errors
+        Quantity of `UNITS` -> (S, n): Euclidean distance from the recorded one, for an attitude the
+        angle of the rotation between both; what the inlet follows, and does not predict, is left
+        out.
+    """
+
+    begins: Array
+    ahead: Array
+    errors: Mapping[str, Array]
+
+    def mean(self, seconds: float) -> dict[str, float]:
+        """Return each quantity's mean error so many s ahead, NaN of what is not predicted."""
+        (step,) = np.flatnonzero(np.isclose(self.ahead, seconds, atol=1e-6))
+        means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
+        return dict.fromkeys(UNITS, np.nan) | means
+
+
+def predict(
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    flight: Flight,
+    inlet: InletName,
+    *,
+    seconds: float = 0.5,
+    stride: float | None = None,
+    input_late: float = 0.0,
+) -> Predictions:
+    """Predict a flight open loop from many of its recorded states.
+
+    Parameters
+    ----------
+    vehicle, controller
+        What flies; the controller gives the rates of the simulation.
+    flight, inlet
+        The recording and what of it is fed in.
+    seconds
+        s that each prediction lasts.
+    stride
+        s from one prediction to the next; by default one sample.
+    input_late
+        s by which what is fed in is stamped later than the recorded state.
+
+    Raises
+    ------
+    RecordingError
+        The flight never holds so many s of pose and input.
+    """
+    segments, begins = starts_of(
+        flight,
+        inlet,
+        schedule_of(controller),
+        seconds=seconds,
+        stride=1.0 / flight.rate if stride is None else stride,
+        lag=0.5 * (vehicle.motor.time_constant_up + vehicle.motor.time_constant_down),
+        input_late=input_late,
+    )
+    model = model_of(with_reference_voltage(vehicle, [flight]), controller)
+    steps = round(seconds * flight.rate)
+    ahead = np.arange(1, steps + 1) / flight.rate
+    reached = _simulated(model, segments, schedule_of(controller), ahead)
+    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
+    errors = errors_of(reached, recorded, (steps, len(begins)))
+    followed = INLETS[inlet].silences
+    predicted = {name: distances for name, distances in errors.items() if name not in followed}
+    return Predictions(begins, ahead, predicted)
+
+
+def starts_of(
+    flight: Flight,
+    inlet: InletName,
+    schedule: Schedule,
+    *,
+    seconds: float,
+    stride: float,
+    lag: float,
+    input_late: float = 0.0,
+) -> tuple[Segments, Array]:
+    """Return the recorded states of a flight that are so many s from its end, and their times."""
+    segments = window_segments(
+        [flight],
+        inlets=[inlet],
+        seconds=seconds,
+        schedule=schedule,
+        lag=lag,
+        noise={},
+        stride=stride,
+        free_starts=False,
+        input_late={flight.name: input_late},
+    )
+    begins = segments.begins
+    whole = np.flatnonzero(begins + seconds <= flight.duration + 1e-9)
+    return _taken(segments, whole), begins[whole]
+
+
+def errors_of(
+    reached: Mapping[str, Array], recorded: States, shape: tuple[int, int]
+) -> dict[str, Array]:
+    """Return quantity -> (S, n) distances of what was reached (S, n, k) from recorded states."""
+    errors = {}
+    for name in UNITS:
+        there = getattr(recorded, name).reshape(*shape, -1)
+        if name == "attitude":
+            along = np.abs(np.sum(reached[name] * there, axis=-1))
+            errors[name] = 2.0 * np.arccos(np.clip(along, 0.0, 1.0))
+        else:
+            errors[name] = np.linalg.norm(reached[name] - there, axis=-1)
+    return errors
+
+
+def _simulated(
+    model: Model, segments: Segments, schedule: Schedule, ahead: Array
+) -> dict[str, Array]:
+    """Return quantity -> (S, n, k) that the simulations reach so many s (S,) ahead."""
+    samples = int(np.ceil(ahead[-1] * schedule.log_rate - 1e-6)) + 2
+    parts = []
+    for first in range(0, segments.count, AT_ONCE):
+        chosen = np.arange(first, min(first + AT_ONCE, segments.count))
+        parts.append(_reached(model, _taken(segments, chosen), ahead, schedule, samples))
+    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in UNITS}
+
+
+def _reached(
+    model: Model, segments: Segments, ahead: Array, schedule: Schedule, samples: int
+) -> dict[str, Array]:
+    channels = ("position", "attitude", MOTION)
+    flown = fly(
+        model, segments, schedule, samples=samples, limits=AIRBORNE, channels=channels
+    ).channels
+    place = ahead * schedule.log_rate
+    below = np.floor(place + 1e-6).astype(int)
+    share = (place - below)[:, None, None]
+
+    def at(logged: Array) -> Array:
+        before, after = np.moveaxis(logged[:, below], 0, 1), np.moveaxis(logged[:, below + 1], 0, 1)
+        return np.asarray(before + share * (after - before))
+
+    turned = at(flown["attitude"])
+    return {
+        "position": at(flown["position"]),
+        "velocity": at(flown[MOTION][..., 3:6]),
+        "attitude": turned / np.linalg.norm(turned, axis=-1, keepdims=True),
+        "body_rate": at(flown[MOTION][..., 6:9]),
+    }
+
+
+def _taken(segments: Segments, chosen: NDArray[np.intp]) -> Segments:
+    """Return some of the segments, which lie along the last axis."""
+    taken: Segments = jax.tree.map(lambda leaf: leaf[..., chosen], segments)
+    return taken
+
+
+def hold(flight: Flight, begins: Array, ahead: Array) -> Predictions:
+    """Predict that the state stays as it was recorded: the naive predictor."""
+    start = states_at(flight.series, begins)
+    shape = (len(ahead), len(begins))
+    reached = {
+        name: np.broadcast_to(getattr(start, name), (*shape, getattr(start, name).shape[-1]))
+        for name in UNITS
+    }
+    recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
+    return Predictions(begins, ahead, errors_of(reached, recorded, shape))
+
+
+def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, float]:
+    """Return each quantity's mean error so many s ahead, over all predictions of some flights."""
+    counts = [len(p.begins) for p in predictions]
+    means = [p.mean(seconds) for p in predictions]
+    return {
+        name: float(np.average([mean[name] for mean in means], weights=counts)) for name in UNITS
+    }

@@ -1,0 +1,153 @@
+"""What a comparison gives: simulated minus recorded at the recorded stamps, and its RMSE."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.crash import AIRBORNE, Limits
+from tuner.evaluate.forces import Forces
+from tuner.recordings.flight import Array, Flight
+from tuner.result import RMSE_UNITS, AxesRmse
+
+Pose = Literal["position", "attitude"]
+
+#: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
+CLEARANCE = 0.3
+
+
+@dataclass(frozen=True)
+class SignalErrors:
+    """One recorded signal and how far a simulation is from it.
+
+    Attributes
+    ----------
+    time
+        (n,) s since the mission's start.
+    recorded
+        (n, 3) m, world, or degrees of roll, pitch, yaw.
+    error
+        (n, 3) simulated minus recorded in the same unit; angles within ±180 degrees.
+    """
+
+    time: Array
+    recorded: Array
+    error: Array
+
+    def between(self, start: float, end: float) -> SignalErrors:
+        """Return the samples from ``start`` in s to before ``end``."""
+        inside = (self.time >= start) & (self.time < end)
+        return SignalErrors(self.time[inside], self.recorded[inside], self.error[inside])
+
+    @property
+    def simulated(self) -> Array:
+        """What was simulated (n, 3), angles beside the recorded ones rather than within ±180."""
+        return self.recorded + self.error
+
+
+@dataclass(frozen=True)
+class FlightErrors:
+    """One flight, flown with one vehicle.
+
+    Attributes
+    ----------
+    name
+        Of the flight.
+    position
+        In m.
+    attitude
+        In degrees of roll, pitch, yaw.
+    laps
+        (k,) s at which laps were completed.
+    crash_time
+        s; None for a flight that did not crash.
+    forces
+        What acted along the simulation, term by term, until it crashed.
+    """
+
+    name: str
+    position: SignalErrors
+    attitude: SignalErrors
+    laps: Array
+    crash_time: float | None
+    forces: Forces | None = None
+
+    def between(self, start: float, end: float) -> FlightErrors:
+        """Return the errors from ``start`` in s to before ``end``."""
+        position, attitude = self.position.between(start, end), self.attitude.between(start, end)
+        return FlightErrors(self.name, position, attitude, self.laps, self.crash_time)
+
+    @property
+    def rmse(self) -> AxesRmse:
+        """The thesis's six; None throughout for a crash."""
+        return rmse_of([self])
+
+    def length(self, signal: Pose) -> float:
+        """Return the RMSE over a signal's axes together, m or degrees; infinite for a crash."""
+        rmse = self.rmse
+        axes = ("x", "y", "z") if signal == "position" else ("roll", "pitch", "yaw")
+        values = [getattr(rmse, axis) for axis in axes]
+        known = [value for value in values if value is not None]
+        return float(np.linalg.norm(known)) if known else np.inf
+
+
+def rmse_of(flights: Sequence[FlightErrors]) -> AxesRmse:
+    """Return the RMSE over all samples of some flights, None throughout if one crashed."""
+    if any(flight.crash_time is not None for flight in flights):
+        return AxesRmse(**dict.fromkeys(RMSE_UNITS))
+    values = [
+        *_root_mean_square(np.concatenate([flight.position.error for flight in flights])),
+        *_root_mean_square(np.concatenate([flight.attitude.error for flight in flights])),
+    ]
+    return AxesRmse(**dict(zip(RMSE_UNITS, values, strict=True)))
+
+
+def _root_mean_square(errors: Array) -> list[float | None]:
+    columns = [column[np.isfinite(column)] for column in errors.T]
+    return [float(np.sqrt(np.mean(c**2))) if len(c) else None for c in columns]
+
+
+def joined(parts: Sequence[SignalErrors]) -> SignalErrors:
+    """Return the errors of stretches of one signal, behind each other."""
+    return SignalErrors(
+        *(
+            np.concatenate([getattr(part, field) for part in parts])
+            for field in ("time", "recorded", "error")
+        )
+    )
+
+
+def short_way(degrees: Array) -> Array:
+    """Return angles in degrees within ±180."""
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def laps_of(flight: Flight) -> Array:
+    """Return the (k,) times in s at which the lap counter rose within the mission."""
+    series = flight.series.get("lap")
+    if series is None:
+        return np.zeros(0)
+    count = series.values[:, 0]
+    rises: NDArray[np.bool_] = np.diff(count, prepend=0.0) > 0
+    inside = rises & (series.time > 0) & (series.time <= flight.duration)
+    return series.time[inside]
+
+
+def limits_of(flights: Sequence[Flight]) -> Limits:
+    """Return the space in which these flights count as flying.
+
+    The simulator's own arena, unless a recording itself comes near its floor or leaves it.
+    """
+    arena = Limits()
+    for flight in flights:
+        place = flight.series["position"]
+        inside = (place.time >= 0) & (place.time <= flight.duration)
+        places = place.values[inside & np.isfinite(place.values).all(axis=1)]
+        low = places[:, 2].min() < arena.floor + CLEARANCE
+        if low or np.abs(places).max() > arena.half_width / 2:
+            return AIRBORNE
+    return arena

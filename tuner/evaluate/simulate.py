@@ -1,0 +1,268 @@
+"""The closed loop flown with given coefficients, one vehicle or a grid of them side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from lanes import Argument, Program
+from sim_jax.environment import NOTHING_AROUND
+from sim_jax.inlet import Inlet
+from sim_jax.numeric import GRAVITY
+from sim_jax.precision import Precision
+from sim_jax.rollout import begun
+from sim_jax.schedule import Schedule
+from sim_jax.state import State, hover
+from sim_jax.vector import Vec3
+from tuner.config import TrajectorySettings
+from tuner.engine import Here, Report, current
+from tuner.evaluate.forces import Forces, forces_of
+from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
+from tuner.objective.trajectory import Published, published
+from tuner.recordings.flight import Array, Series
+from tuner.recordings.resample import resample
+from tuner.vehicle import ControllerFile, VehicleFile, check_mixer
+from tuner.vehicle.model import Model, model_of, schedule_of, with_coefficients
+
+#: Vehicles that fly at once; more take turns, so that memory stays bounded.
+CHUNK = 256
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """One simulated flight.
+
+    Attributes
+    ----------
+    time
+        (N,) s, uniform, from 0.
+    signals
+        Signal -> (N, k), named, in units and frames as in `tuner.recordings.flight.SIGNALS`;
+        ``acceleration`` is the specific force in body axes, as an accelerometer shows it.
+    crash_time
+        s at which the vehicle crashed and was frozen; None if it never did.
+    coefficients
+        What was varied for this flight: coefficient -> value.
+    forces
+        What acted until it crashed, term by term, if asked for.
+    """
+
+    time: Array
+    signals: Mapping[str, Array]
+    crash_time: float | None
+    coefficients: Mapping[str, float]
+    forces: Forces | None = None
+
+
+def simulate(
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    trajectory: TrajectorySettings,
+    *,
+    duration: float = 40.0,
+    rate: float = 100.0,
+    grid: Mapping[str, Array] | None = None,
+    precision: Precision = "float64",
+    forces: bool = False,
+) -> Iterator[Simulation]:
+    """Fly a trajectory, starting at rest at its first point.
+
+    The engine in force flies the pieces of a grid.
+
+    Parameters
+    ----------
+    vehicle, controller
+        What flies.
+    trajectory
+        What is flown.
+    duration
+        s.
+    rate
+        Hz of the result.
+    grid
+        Coefficient -> (B,) values of B vehicles; None flies the vehicle alone.
+    precision
+        What to compute in: single precision is twice as fast for many vehicles.
+    forces
+        Whether to give what acted along each flight, term by term.
+
+    Yields
+    ------
+    Simulation
+        One, or B of them in the order of the grid.
+    """
+    check_mixer(vehicle)
+    asked = _Asked(vehicle, controller, trajectory, duration, rate, precision, forces)
+    pieces = ((asked, columns, wanted) for columns, wanted in _chunks(grid or {}))
+    engine = current()
+    here = isinstance(engine, Here)  # flights then need not be in memory all at once
+    for flights in map(_flights, pieces) if here else engine.stream(_flown, pieces):
+        yield from flights
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """What every vehicle of a grid flies; as of `simulate`."""
+
+    vehicle: VehicleFile
+    controller: ControllerFile
+    trajectory: TrajectorySettings
+    duration: float
+    rate: float
+    precision: Precision
+    forces: bool
+
+
+_Piece = tuple[_Asked, dict[str, Array], int]
+
+
+def _flown(piece: _Piece, _report: Report) -> list[Simulation]:
+    """Return what `_flights` yields: it leaves the process all at once."""
+    return list(_flights(piece))
+
+
+def _flights(piece: _Piece) -> Iterator[Simulation]:
+    """Fly a piece of a grid, and yield as many of its flights as are wanted."""
+    asked, columns, wanted = piece
+    controller, rate = asked.controller, asked.rate
+    clock = np.arange(math.floor(asked.duration * rate + 1e-9) + 1) / rate
+    fits = round(controller.physics.rate) % rate == 0
+    schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
+    control_rate = schedule.position_control_rate
+    reference = published(asked.trajectory, duration=asked.duration, control_rate=control_rate)
+    sent = _sent(reference, clock, control_rate)
+    samples = math.ceil(asked.duration * schedule.log_rate) + 1
+    log_time = np.arange(samples) / schedule.log_rate
+    model = model_of(asked.vehicle, controller)
+    fed = reference.inlet, reference.start
+    logged, crashes = _logged((columns, model, *fed), schedule, samples, asked.precision)
+    for segment in range(wanted):
+        signals = {
+            name: resample(name, Series(log_time, values[segment]), clock)
+            for name, values in logged.items()
+        }
+        signals["acceleration"] = _specific_force(clock, signals)
+        coefficients = {name: float(column[segment]) for name, column in columns.items()}
+        flight = Simulation(
+            time=clock,
+            signals=signals | sent,
+            crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
+            coefficients=coefficients,
+        )
+        yield _with_forces(flight, model) if asked.forces else flight
+
+
+def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:
+    """Yield a grid in pieces of one size, the last filled up, and how many of each are wanted."""
+    count = len(next(iter(grid.values()))) if grid else 1
+    size = min(count, CHUNK)
+    for start in range(0, count, size):
+        piece = {name: np.asarray(column)[start : start + size] for name, column in grid.items()}
+        wanted = min(size, count - start)
+        yield (
+            {name: np.pad(column, (0, size - wanted), "edge") for name, column in piece.items()},
+            wanted,
+        )
+
+
+def _logged(
+    flown: tuple[Mapping[str, Array], Model, Inlet, Vec3],
+    schedule: Schedule,
+    samples: int,
+    precision: Precision,
+) -> tuple[dict[str, Array], Array]:
+    """Return signal -> (segments, samples, k), and the times (segments,) in s of crashes."""
+    given = jax.tree.map(np.asarray, flown)
+    columns, *shared = given
+    real = np.dtype(precision)
+
+    def kind(leaf: Array, *, lanes: bool, table: bool = False) -> Argument:
+        dtype = real if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype
+        if lanes:
+            return Argument((), dtype, lanes=True)
+        return Argument(
+            ("ticks", *leaf.shape[1:]) if table and leaf.ndim else leaf.shape, dtype, False
+        )
+
+    arguments = (
+        jax.tree.map(lambda leaf: kind(leaf, lanes=True), columns),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[0]),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False, table=True), shared[1]),
+        jax.tree.map(lambda leaf: kind(leaf, lanes=False), shared[2]),
+    )
+    leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
+    program = _program(tuple(leaves), structure, schedule, precision)
+    lanes = len(next(iter(columns.values()))) if columns else 1
+    rows_of, crash_time = program(given, lanes=lanes, turns=samples).values
+    motion, setpoints = rows_of[MOTION], rows_of[SETPOINTS]
+    logged = {
+        "position": motion[..., 0:3],
+        "velocity": motion[..., 3:6],
+        "attitude": rows_of[TURNED],
+        "body_rate": motion[..., 6:9],
+        "rotor_speed": rows_of["rotor_speed"],
+        "command": rows_of["command"],
+        "rate_setpoint": setpoints[..., 0:3],
+        "thrust_setpoint": setpoints[..., 3:],
+    }
+    return {name: np.asarray(rows, np.float64) for name, rows in logged.items()}, crash_time
+
+
+@lru_cache(maxsize=16)
+def _program(
+    leaves: tuple[Argument, ...], structure: Any, schedule: Schedule, precision: Precision
+) -> Program:
+    def fly(given: Any, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
+        columns, model, inlet, start = given
+        flown = with_coefficients(model, columns)
+        plant, first = begun(
+            flown.vehicle,
+            flown.controller,
+            schedule,
+            inlet,
+            hover(flown.vehicle, start),
+            precision=precision,
+        )
+
+        def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
+            after, row = plant.sample(state, number)
+            channels = ("rotor_speed", "command", MOTION, TURNED, SETPOINTS)
+            return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
+
+        last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
+        return logged, last.crash_time
+
+    return Program(fly, jax.tree.unflatten(structure, leaves), name="simulated flight")
+
+
+def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:
+    """Return the reference in force at each instant of a clock."""
+    tick = np.floor(clock * control_rate + 1e-9).astype(int)
+    sent = {name: values[tick] for name, values in reference.signals.items()}
+    return sent | {"lap": reference.lap[tick, None].astype(np.float64)}
+
+
+def _with_forces(flight: Simulation, model: Model) -> Simulation:
+    """Return a simulation with what acted until it ended or crashed."""
+    values = {name: jnp.asarray(value) for name, value in flight.coefficients.items()}
+    forces = forces_of(with_coefficients(model, values).vehicle, flight.time, flight.signals)
+    crashed = flight.crash_time
+    return replace(flight, forces=forces if crashed is None else forces.before(crashed))
+
+
+def _specific_force(clock: Array, signals: Mapping[str, Array]) -> Array:
+    """Return (N, 3) m/s² in body axes, from differences of the velocity."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
+
+    force = np.gradient(signals["velocity"], clock, axis=0) + np.array([0.0, 0.0, GRAVITY])
+    turns = Rotation.from_quat(signals["attitude"], scalar_first=True)
+    turned: Array = turns.inv().apply(force)
+    return turned

@@ -1,1 +1,0 @@
-"""What recordings say of each coefficient: uncertainty and sensitivity together, as data."""

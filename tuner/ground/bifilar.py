@@ -1,0 +1,162 @@
+"""A bifilar pendulum's swing to the moment of inertia about its vertical axis (thesis 3.1)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from tuner.core.errors import RecordingError
+from tuner.ground.laws import bifilar_inertia
+from tuner.ground.measurement import Array, Curve, Measurement, Remark
+
+FEWEST_SWINGS = 5.0
+LARGE_SWING = math.radians(20)
+"""Amplitude beyond which the law's small angles are wrong by more than the correction knows."""
+BEAT = 0.15
+"""Share of the amplitude that a second frequency may have before the swing is called a beat."""
+
+
+def bifilar(
+    name: str,
+    path: str,
+    samples: Mapping[str, Array],
+    *,
+    axis: str,
+    mass: float,
+    wire_distance: float,
+    wire_length: float,
+    mass_error: float,
+    wire_distance_error: float,
+    wire_length_error: float,
+) -> Measurement:
+    """Return the moment of inertia of one axis.
+
+    A damped sine with offset and drift is fitted to the angle; its phase runs slower while the
+    swing is wide (by amplitude²/16, as a pendulum's), and its frequency is corrected for damping.
+
+    Parameters
+    ----------
+    name, path
+        Of the experiment and its recording.
+    samples
+        ``time`` s and ``angle`` rad.
+    axis
+        ``x``, ``y`` or ``z``: the body axis that hung vertical.
+    mass, wire_distance, wire_length
+        kg, m and m; each with its standard error, which enters the result's.
+
+    Raises
+    ------
+    RecordingError
+        Too few oscillations, too wide ones, or none.
+    """
+    time, angle = samples["time"] - samples["time"][0], samples["angle"]
+    known = np.isfinite(angle)
+    time, angle = time[known], angle[known]
+    guess = _spectral_guess(time, angle)
+    swings = guess * time[-1]
+    if swings < FEWEST_SWINGS:
+        what = f"shows {swings:.1f} oscillations, fewer than {FEWEST_SWINGS:g}"
+        raise RecordingError(path, what, "let it swing longer")
+    solution = _fit(time, angle, guess)
+    amplitude, decay, phase_rate = abs(solution.x[0]), solution.x[1], solution.x[2]
+    if amplitude > LARGE_SWING:
+        what = f"swings by {math.degrees(amplitude):.0f} degrees"
+        raise RecordingError(
+            path, what, "release it within 20 degrees, the law is for small angles"
+        )
+    residual = solution.fun
+    noise = float(residual.std(ddof=len(solution.x)))
+    if noise > 0.5 * amplitude:
+        raise RecordingError(path, "shows no damped oscillation", "check the angle's column")
+    frequency = math.hypot(phase_rate, decay / (2 * math.pi))
+    error = _frequency_error(solution, residual)
+    inertia = bifilar_inertia(
+        frequency, mass=mass, wire_distance=wire_distance, wire_length=wire_length
+    )
+    variance = (
+        (2 * error / frequency) ** 2
+        + (mass_error / mass) ** 2
+        + (2 * wire_distance_error / wire_distance) ** 2
+        + (wire_length_error / wire_length) ** 2
+    )
+    remarks = [
+        Remark("swing", {"oscillations": swings, "amplitude": amplitude, "frequency": frequency})
+    ]
+    second = _second_frequency(time, residual) / amplitude
+    if second > BEAT:
+        remarks.append(Remark("beat", {"share": second}))
+    drift = abs(solution.x[5]) * time[-1]
+    if drift > 0.2 * amplitude:
+        remarks.append(Remark("drift", {"drift": drift}))
+    used = np.ones(len(time), bool)
+    dense = np.linspace(0.0, time[-1], 2000)
+    curve = Curve(
+        f"Swing about {axis}", "time, s", "angle, rad", time, angle, used, dense,
+        _swing(solution.x, dense),
+    )  # fmt: skip
+    return Measurement(
+        name,
+        ({f"inertia_{axis}{axis}": 1.0},),
+        np.array([math.log(inertia)]),
+        np.array([[variance]]),
+        tuple(remarks),
+        (curve,),
+    )
+
+
+def _swing(parameters: Array, time: Array) -> Array:
+    amplitude, decay, frequency, phase, offset, drift = parameters
+    # a pendulum's period grows by amplitude²/16; integrated over the decaying amplitude
+    slow = (
+        amplitude**2
+        / 16
+        * (time if abs(decay) < 1e-9 else -np.expm1(-2 * decay * time) / (2 * decay))
+    )
+    angle = 2 * math.pi * frequency * (time - slow) + phase
+    return np.asarray(amplitude * np.exp(-decay * time) * np.cos(angle) + offset + drift * time)
+
+
+def _spectral_guess(time: Array, angle: Array) -> float:
+    """Return the frequency, Hz, of the highest peak of the spectrum."""
+    count = len(time)
+    even = np.linspace(time[0], time[-1], count)
+    values = np.interp(even, time, angle)
+    values = values - np.polyval(np.polyfit(even, values, 1), even)
+    padded = 8 * count
+    power = np.abs(np.fft.rfft(values * np.hanning(count), padded))
+    frequencies = np.fft.rfftfreq(padded, (even[-1] - even[0]) / (count - 1))
+    power[frequencies < 0.5 / (even[-1] - even[0])] = 0.0
+    return float(frequencies[int(np.argmax(power))])
+
+
+def _fit(time: Array, angle: Array, guess: float) -> Any:
+    turns = 2 * math.pi * guess * time
+    waves = np.column_stack([np.cos(turns), -np.sin(turns), np.ones_like(time)])
+    cosine, sine, offset = np.linalg.lstsq(waves, angle, rcond=None)[0]
+    half = 0.5 * float(np.ptp(angle))
+    start = np.array([half, 0.5 / time[-1], guess, math.atan2(sine, cosine), offset, 0.0])
+    return least_squares(
+        lambda p: _swing(p, time) - angle, start, x_scale=np.maximum(np.abs(start), 1e-3)
+    )
+
+
+def _frequency_error(solution: Any, residual: Array) -> float:
+    """Return the frequency's standard error, Hz, correlated residuals included."""
+    jacobian = solution.jac
+    covariance = np.linalg.pinv(jacobian.T @ jacobian)
+    white = covariance[2, 2] * float(residual @ residual) / max(len(residual) - len(solution.x), 1)
+    influence = covariance[2] @ jacobian.T * residual
+    blocks = np.array([part.sum() for part in np.array_split(influence, 20)])
+    return math.sqrt(max(white, float(blocks @ blocks)))
+
+
+def _second_frequency(time: Array, residual: Array) -> float:
+    """Return the amplitude of the strongest oscillation that the fit leaves, in its unit."""
+    even = np.linspace(time[0], time[-1], len(time))
+    spectrum = np.abs(np.fft.rfft(np.interp(even, time, residual))) * 2 / len(time)
+    return float(spectrum.max(initial=0.0))

@@ -1,0 +1,133 @@
+"""Hovers with weights and steady yaw spins: what the balance of force and torque says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from tuner.core.errors import ConfigError
+from tuner.core.numerics import GRAVITY
+from tuner.ground.laws import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
+from tuner.ground.measurement import Curve, Measurement, Remark
+
+
+def hover_weights(
+    name: str,
+    points: Sequence[tuple[float, float]],
+    *,
+    rotors: int,
+    mass_error: float,
+    rotor_speed_error: float,
+) -> Measurement:
+    """Return the motor constant from hovers of (mass kg, rotor speed rad/s): m g = n k Ω² (6.4.1).
+
+    Parameters
+    ----------
+    name
+        Of the experiment.
+    points
+        Each a hover.
+    rotors
+        How many carry the weight.
+    mass_error, rotor_speed_error
+        Standard errors of one point, kg and rad/s; where three and more points scatter by more,
+        their scatter counts.
+    """
+    mass, speed = (np.array(column, float) for column in zip(*points, strict=True))
+    values = np.log([hover_motor_constant(m, w, rotors) for m, w in points])
+    variance = (mass_error / mass) ** 2 + (2 * rotor_speed_error / speed) ** 2
+    weight = 1.0 / variance
+    mean = float(weight @ values / weight.sum())
+    error2 = 1.0 / float(weight.sum())
+    freedom = len(points) - 1
+    if freedom >= 2:
+        birge = float(weight @ (values - mean) ** 2) / freedom
+        error2 *= max(1.0, birge)
+    weights = np.linspace(0.95 * mass.min(), 1.05 * mass.max(), 50)
+    curve = Curve(
+        "Hover", "mass, kg", "rotor speed, rad/s", mass, speed, np.ones(len(points), bool), weights,
+        np.sqrt(weights * GRAVITY / (rotors * math.exp(mean))),
+    )  # fmt: skip
+    return Measurement(
+        name, ({"motor_constant": 1.0},), np.array([mean]), np.array([[error2]]),
+        (Remark("points", {"points": len(points)}),), (curve,),
+    )  # fmt: skip
+
+
+def yaw_spin(
+    name: str,
+    points: Sequence[tuple[float, float, float | None]],
+    *,
+    mass: float,
+    radius: float,
+    motor_constant: float,
+    rotor_speed_error: float,
+) -> Measurement:
+    """Return the relation of rotor drag to torque from spins of (yaw rate, slow pair, fast pair).
+
+    rotor_drag_coefficient / (moment_constant · motor_constant) = (Ω_fast - Ω_slow)/(ω r²)
+    (Eq. 8.3, see `spin_drag_over_torque`). Where the fast pair was not measured it follows from
+    the weight and the motor constant, on which the relation then depends.
+
+    Parameters
+    ----------
+    name
+        Of the experiment.
+    points
+        Yaw rate rad/s, speed of the slow pair rad/s, and of the fast pair or None.
+    mass, radius
+        kg, and m from the yaw axis to each rotor.
+    motor_constant
+        N s²/rad², where the fast pair's speed is linearised.
+    rotor_speed_error
+        Standard error of one speed, rad/s.
+
+    Raises
+    ------
+    ConfigError
+        The fast pair is slower than the slow one.
+    """
+    rows, values, variances = [], [], []
+    for rate, slow, fast in points:
+        weighed = fast is None
+        quick = (
+            float(fast_pair_speed(slow, mass=mass, motor_constant=motor_constant))
+            if weighed
+            else float(fast or 0)
+        )
+        if quick <= slow:
+            what = f"has a fast pair at {quick:.0f} rad/s and a slow pair at {slow:.0f} rad/s"
+            remedy = "check the speeds, the mass and the motor constant"
+            raise ConfigError(name, what, remedy)
+        value = math.log(float(spin_drag_over_torque(abs(rate), slow, quick, radius=radius)))
+        follows = 0.0
+        spread = math.sqrt(2.0)
+        if weighed:
+            # dΩ_fast/dlog k of the weight's balance, and dΩ_fast/dΩ_slow = -Ω_slow/Ω_fast
+            follows = -(mass * GRAVITY / (2 * motor_constant)) / (2 * quick) / (quick - slow)
+            spread = 1.0 + slow / quick
+        rows.append(
+            {
+                "rotor_drag_coefficient": 1.0,
+                "moment_constant": -1.0,
+                "motor_constant": -1.0 - follows,
+            }
+        )
+        values.append(value - follows * math.log(motor_constant))
+        variances.append((spread * rotor_speed_error / (quick - slow)) ** 2)
+    rates = np.array([abs(point[0]) for point in points])
+    ratios = np.array([
+        math.exp(v + (-1 - r["motor_constant"]) * math.log(motor_constant))
+        for v, r in zip(values, rows, strict=True)
+    ])  # fmt: skip
+    mean = float(np.exp(np.log(ratios).mean()))
+    curve = Curve(
+        "Steady spin", "yaw rate, rad/s", "rotor drag over torque constant, rad s/m²", rates,
+        ratios, np.ones(len(points), bool), rates, np.full(len(points), mean),
+    )  # fmt: skip
+    return Measurement(
+        name, tuple(rows), np.array(values), np.diag(variances),
+        (Remark("points", {"points": len(points)}),), (curve,),
+    )  # fmt: skip

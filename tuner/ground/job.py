@@ -1,0 +1,339 @@
+"""The command `tune bench` as a function: read, estimate, combine, write, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydantic import JsonValue
+
+from tuner.core.disk import make_folder
+from tuner.core.errors import ConfigError
+from tuner.core.findings import Code, Finding
+from tuner.core.numerics import Z95
+from tuner.core.shipped import find_config
+from tuner.core.versions import PROGRAM, versions
+from tuner.ground.bench_json import bench_record
+from tuner.ground.combine import Combination, combine
+from tuner.ground.experiments import measure, names_of
+from tuner.ground.measurement import Measurement
+from tuner.ground.plan import BenchFile, YawSpin, read_bench
+from tuner.ground.scales import error_of, scaled_of, value_of
+from tuner.job.folder import folder_for
+from tuner.report import render
+from tuner.result import (
+    BEST_FIT_FILE,
+    CoefficientResult,
+    Ending,
+    RunResult,
+    SearchResult,
+    Status,
+)
+from tuner.uncertainty.verdict import (
+    IDENTIFIABLE_ERROR,
+    NOT_FITTED,
+    WELL_KNOWN,
+    Reason,
+    ReasonCode,
+    Verdict,
+)
+from tuner.vehicle import (
+    COEFFICIENTS,
+    VehicleFile,
+    read_vehicle,
+    values_of,
+    with_values,
+    write_vehicle,
+)
+from tuner.vehicle.size import size_of, sized
+from tuner.wording.verdicts import judgement_in_words
+
+RELINEARISATIONS = 3
+"""Times that yaw spins are linearised at the motor constant that all experiments give."""
+
+
+@dataclass(frozen=True)
+class BenchResult:
+    """What the ground measurements gave, and the folder that holds it.
+
+    Attributes
+    ----------
+    folder
+        With ``result.json``, ``best_fit.yaml``, ``bench.json`` and ``report.html``.
+    result
+        The content of ``result.json``.
+    measurements
+        Of each experiment, in the order of ``bench.yaml``.
+    combination
+        What they say together.
+    """
+
+    folder: Path
+    result: RunResult
+    measurements: tuple[Measurement, ...]
+    combination: Combination
+
+
+def bench(path: Path, *, out: Path | None = None, command: str = "") -> BenchResult:
+    """Estimate coefficients from ground measurements and write a result folder.
+
+    Parameters
+    ----------
+    path
+        ``bench.yaml``.
+    out
+        Result folder; None makes one under ``runs/`` named by the time.
+    command
+        What the user typed, for the record.
+
+    Raises
+    ------
+    InputError
+        The input cannot be used; nothing was written.
+    OutputError
+        The result folder cannot be written to.
+    """
+    began = time.perf_counter()
+    plan = read_bench(path)
+    base = path.parent
+    given = read_vehicle(find_config("vehicles", plan.vehicle, base))
+    start = given if plan.weighed_mass is None else given.replace(mass=plan.weighed_mass)
+    folder = folder_for(out)
+    measurements, combination, vehicle = _estimate(path, plan, start)
+    header = f"From the ground measurements of {path.name}; the rest as in {start.name}."
+    return written(
+        folder,
+        given,
+        vehicle.replace(name=f"{start.name}_bench"),
+        measurements,
+        combination,
+        findings=conflicts_of(combination),
+        settings={"command": command, "bench": plan.model_dump(mode="json")},
+        source={"bench": path.name},
+        header=header,
+        began=began,
+    )
+
+
+def written(
+    folder: Path,
+    given: VehicleFile,
+    vehicle: VehicleFile,
+    measurements: tuple[Measurement, ...],
+    combination: Combination,
+    *,
+    findings: tuple[Finding, ...],
+    settings: Mapping[str, JsonValue],
+    source: Mapping[str, str],
+    header: str,
+    began: float,
+) -> BenchResult:
+    """Write a result folder of measurements, and return what it holds.
+
+    Parameters
+    ----------
+    folder
+        Is made.
+    given, vehicle
+        As the user has it, and with the measured coefficients.
+    measurements, combination, findings
+        What was measured, what it says together, and what a user should know of it.
+    settings, source
+        For ``result.json``, beside the vehicle, and for ``best_fit.yaml``.
+    header
+        First line of ``best_fit.yaml``.
+    began
+        s of `time.perf_counter` at the start.
+    """
+    result = RunResult(
+        status=Status.CONVERGED,
+        seed=0,
+        versions=versions(),
+        settings={**settings, "vehicle": given.model_dump(mode="json")},
+        coefficients=_coefficients(given, vehicle, combination, measurements),
+        flights=(),
+        findings=findings,
+        search=SearchResult(
+            method="bench",
+            evaluations=0,
+            iterations=0,
+            wall_time=time.perf_counter() - began,
+            cost_initial=None,
+            cost_best=None,
+            converged=True,
+            message=Ending.NO_FURTHER_GAIN,
+        ),
+    )
+    make_folder(folder)
+    made_by = {"made_by": f"{PROGRAM} {result.versions[PROGRAM]}", **source}
+    write_vehicle(vehicle.replace(source=made_by), folder / BEST_FIT_FILE, header=header)
+    bench_record(combination, measurements).write(folder)
+    result.write(folder)
+    render(folder)
+    return BenchResult(folder, result, measurements, combination)
+
+
+def _estimate(
+    path: Path, plan: BenchFile, start: VehicleFile
+) -> tuple[tuple[Measurement, ...], Combination, VehicleFile]:
+    """Return each measurement, what they say together, and the vehicle that follows."""
+    names, base = names_of(plan.experiments), path.parent
+    known = known_of(start)
+    measured = {
+        name: measure(name, experiment, start, base)
+        for name, experiment in zip(names, plan.experiments, strict=True)
+        if not isinstance(experiment, YawSpin)
+    }
+    spins = {
+        name: experiment
+        for name, experiment in zip(names, plan.experiments, strict=True)
+        if isinstance(experiment, YawSpin)
+    }
+    vehicle = start
+    for _ in range(1 if not spins else RELINEARISATIONS):
+        if measured:
+            vehicle = vehicle_of(path, start, combine(tuple(measured.values()), known))
+        measured |= {name: measure(name, spin, vehicle, base) for name, spin in spins.items()}
+    measurements = tuple(measured[name] for name in names)
+    combination = combine(measurements, known)
+    return measurements, combination, vehicle_of(path, start, combination)
+
+
+def known_of(vehicle: VehicleFile) -> dict[str, float]:
+    """Return coefficient -> scaled coordinate in a vehicle file, or where its term vanishes."""
+    neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
+    values = neutral | values_of(vehicle)
+    return {name: scaled_of(name, v) for name, v in values.items() if _has_scale(name, v)}
+
+
+def _has_scale(name: str, value: float) -> bool:
+    return value > 0 or COEFFICIENTS[name].scale == "linear"
+
+
+def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
+    """Return the vehicle with the measured coefficients.
+
+    Raises
+    ------
+    ConfigError
+        They are those of no vehicle.
+    """
+    values = {
+        name: value_of(name, float(scaled))
+        for name, scaled in zip(combination.names, combination.scaled, strict=True)
+    }
+    moments = [name for name in values if COEFFICIENTS[name].place[0] == "inertia"]
+    try:
+        return with_values(start, values)
+    except ConfigError as error:
+        if not moments:
+            raise ConfigError(path, error.what, error.remedy) from None
+        remedy = "check which axis hung vertical in each pendulum, and hang the axes not measured"
+        raise ConfigError(path, error.what, remedy) from None
+
+
+def _coefficients(
+    start: VehicleFile,
+    vehicle: VehicleFile,
+    combination: Combination,
+    measurements: Sequence[Measurement],
+) -> dict[str, CoefficientResult]:
+    initial, best = values_of(start), values_of(vehicle)
+    places = {name: place for place, name in enumerate(combination.names)}
+    coefficients = {}
+    for name, value in best.items():
+        row = COEFFICIENTS[name]
+        unit, before = row.unit, initial.get(name, value if row.neutral is None else row.neutral)
+        if name not in places:
+            coefficients[name] = CoefficientResult(
+                unit=unit,
+                initial=before,
+                best=value,
+                fitted=False,
+                verdict=Verdict.FIXED,
+                reason=NOT_FITTED,
+                note=judgement_in_words(Verdict.FIXED, NOT_FITTED),
+            )
+            continue
+        place = places[name]
+        least = least_noticed(name, start)
+        verdict, reason = _judged(name, place, combination, measurements, least)
+        known = bool(combination.determined[place])
+        scaled = float(combination.scaled[place])
+        deviation = float(np.sqrt(combination.covariance[place, place]))
+        ends = (scaled - Z95 * deviation, scaled + Z95 * deviation)
+        coefficients[name] = CoefficientResult(
+            unit=unit,
+            initial=before,
+            best=value,
+            fitted=True,
+            std_error=error_of(name, scaled, deviation) if known else None,
+            ci95=(value_of(name, ends[0]), value_of(name, ends[1])) if known else None,
+            identifiable=reason.identifiable,
+            verdict=verdict,
+            reason=reason,
+            note=judgement_in_words(verdict, reason),
+        )
+    return coefficients
+
+
+def least_noticed(name: str, vehicle: VehicleFile) -> float:
+    """Return the size of a coefficient that is no logarithm below which nobody notices it."""
+    return sized(COEFFICIENTS[name], size_of(vehicle)).step
+
+
+def _judged(
+    name: str,
+    place: int,
+    combination: Combination,
+    measurements: Sequence[Measurement],
+    least: float,
+) -> tuple[Verdict, Reason]:
+    """Return how well the experiments determine a coefficient, and why."""
+    if not combination.determined[place]:
+        rows = [row for m in measurements for row in m.rows if name in row]
+        partners = [n for row in rows for n in row if n != name]
+        places = {n: i for i, n in enumerate(combination.names)}
+        partners.sort(key=lambda n: bool(combination.determined[places[n]]))
+        partner = partners[0] if partners else None
+        reason = Reason(code=ReasonCode.COMBINATION_MEASURED, correlated_with=partner)
+        return Verdict.NOT_IDENTIFIABLE, reason
+    row, scaled = COEFFICIENTS[name], float(combination.scaled[place])
+    deviation = float(np.sqrt(combination.covariance[place, place]))
+    relative = deviation if row.scale == "log" else deviation / max(abs(scaled), least)
+    half_width = Z95 * deviation
+    unit = None if row.scale == "log" else row.unit
+    if relative > IDENTIFIABLE_ERROR:
+        code = ReasonCode.MEASURED_ROUGHLY
+        return Verdict.NOT_IDENTIFIABLE, Reason(code=code, half_width=half_width, unit=unit)
+    best = max(measurements, key=lambda m: _weight(name, m, combination)).experiment
+    well = Z95 * relative < WELL_KNOWN
+    reason = Reason(code=ReasonCode.INTERVAL, half_width=half_width, unit=unit, channel=best)
+    return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, reason
+
+
+def _weight(name: str, measurement: Measurement, combination: Combination) -> float:
+    """Return an experiment's information on a coefficient, given what is known of the others."""
+    total = 0.0
+    for row, variance in zip(measurement.rows, np.diag(measurement.covariance), strict=True):
+        others = np.array([row.get(n, 0.0) if n != name else 0.0 for n in combination.names])
+        spread = float(variance + others @ combination.covariance @ others)
+        total += row.get(name, 0.0) ** 2 / spread
+    return total
+
+
+def conflicts_of(combination: Combination) -> tuple[Finding, ...]:
+    """Return the experiments that the others contradict."""
+    return tuple(
+        Finding(
+            Code.BENCH_CONFLICT,
+            "warning",
+            conflict.experiment,
+            {"deviation": conflict.deviation},
+            conflict.names,
+        )
+        for conflict in combination.conflicts
+    )

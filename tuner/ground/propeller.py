@@ -1,0 +1,85 @@
+"""Published propeller coefficients as a wide prior: theory was 60 % high in the thesis (6.2)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from tuner.core.errors import RecordingError
+from tuner.ground.laws import propeller_moment_constant, propeller_motor_constant
+from tuner.ground.measurement import Array, Curve, Measurement, Remark
+
+THEORY = 0.4
+"""Standard deviation of the logarithm by which a table's propeller on a vehicle differs from it."""
+TORQUE_THEORY = 0.3
+"""The same of the ratio of torque to thrust, in which part of the error cancels."""
+MAX_BYTES = 1_000_000
+
+
+def read_static_table(path: Path) -> Array:
+    """Return (n, 3) RPM, C_T and C_P of a static table as UIUC's propeller data site has it.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read or holds no such rows.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise RecordingError(path, "is larger than 1 MB", "give the propeller's static table")
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError as error:
+        raise RecordingError(path, f"cannot be read ({error.strerror})", "check the path") from None
+    rows = []
+    for line in lines:
+        try:
+            numbers = [float(word) for word in line.replace(",", " ").split()]
+        except ValueError:
+            continue
+        if len(numbers) >= 3 and all(math.isfinite(n) for n in numbers[:3]):
+            rows.append(numbers[:3])
+    table = np.array(rows)
+    plausible = len(rows) > 0 and bool(
+        (table[:, 0] > 200).all() and (table[:, 1:] > 0).all() and (table[:, 1:] < 1).all()
+    )
+    if not plausible:
+        raise RecordingError(path, "holds no rows of RPM, CT and CP", "give a static table")
+    return table
+
+
+def propeller(
+    name: str, table: Array, *, diameter: float, air_density: float, path: str = ""
+) -> Measurement:
+    """Return motor and moment constant of a propeller from (n, 3) RPM, C_T, C_P.
+
+    Parameters
+    ----------
+    name, path
+        Of the experiment and its table.
+    table
+        One row a speed; the median counts.
+    diameter, air_density
+        m and kg/m³.
+    """
+    if not 0.01 < diameter < 2.0:
+        what = f"a propeller of {diameter:g} m is none of a multirotor"
+        raise RecordingError(path or name, what, "give the diameter in m: 11 inch are 0.2794")
+    thrust, power = (float(np.median(table[:, column])) for column in (1, 2))
+    values = np.log([
+        propeller_motor_constant(thrust, diameter=diameter, density=air_density),
+        propeller_moment_constant(thrust, power, diameter=diameter),
+    ])  # fmt: skip
+    curve = Curve(
+        "Propeller table", "RPM", "thrust coefficient", table[:, 0], table[:, 1],
+        np.ones(len(table), bool), table[:, 0], np.full(len(table), thrust),
+    )  # fmt: skip
+    return Measurement(
+        name,
+        ({"motor_constant": 1.0}, {"moment_constant": 1.0}),
+        values,
+        np.diag([THEORY**2, TORQUE_THEORY**2]),
+        (Remark("theory", {"thrust_coefficient": thrust, "power_coefficient": power}),),
+        (curve,),
+    )

@@ -1,0 +1,179 @@
+"""Thrust and torque stands: force against squared rotor speed, level by level (6.3, 7.3)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.errors import RecordingError
+from tuner.core.numerics import scaled_inverse
+from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.ground.plateaus import levels_of, mean_and_error, student, without_outliers
+
+SHORTEST = 1.0
+"""s below which a level of the rotor speed is a transient."""
+STEP = 0.03
+"""Change of the rotor speed, relative to its largest, that counts as a step."""
+FEWEST = 4
+"""Levels without which slope, offset and drift cannot be told apart."""
+SPREAD = 1.3
+"""Ratio of the fastest to the slowest level without which an offset looks like another slope."""
+TRUSTED = 4
+"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
+
+
+@dataclass(frozen=True)
+class _Level:
+    speed: float
+    speed_error: float
+    force: float
+    force_error: float
+    time: float
+
+
+def thrust_stand(
+    name: str,
+    path: str,
+    samples: Mapping[str, Array],
+    *,
+    rotors: int,
+    lever_ratio: float,
+    lever_ratio_error: float,
+) -> Measurement:
+    """Return the motor constant from F · lever_ratio = n k Ω² (Eq. 6.8) and an offset.
+
+    Parameters
+    ----------
+    name, path
+        Of the experiment and its recording.
+    samples
+        ``time`` s, ``rotor_speed`` rad/s, ``force`` N.
+    rotors
+        How many turned.
+    lever_ratio, lever_ratio_error
+        Thrust over the force that the sensor reads, and its relative standard error.
+
+    Raises
+    ------
+    RecordingError
+        There are too few steps, they are too short, or the force does not grow with the speed.
+    """
+    slope, error, remarks, curves = _slope(path, samples, "Thrust stand")
+    value = math.log(slope * lever_ratio / rotors)
+    variance = (error / slope) ** 2 + lever_ratio_error**2
+    return Measurement(
+        name, ({"motor_constant": 1.0},), np.array([value]), np.array([[variance]]), remarks, curves
+    )
+
+
+def torque_stand(
+    name: str,
+    path: str,
+    samples: Mapping[str, Array],
+    *,
+    rotors: int,
+    lever_arm: float,
+    lever_arm_error: float,
+) -> Measurement:
+    """Return moment_constant · motor_constant from lever_arm · F = n k_M k_F Ω² (7.3.2).
+
+    Parameters and errors as of `thrust_stand`; ``lever_arm`` in m, its error relative.
+    """
+    slope, error, remarks, curves = _slope(path, samples, "Torque stand")
+    value = math.log(slope * lever_arm / rotors)
+    variance = (error / slope) ** 2 + lever_arm_error**2
+    row = {"moment_constant": 1.0, "motor_constant": 1.0}
+    return Measurement(name, (row,), np.array([value]), np.array([[variance]]), remarks, curves)
+
+
+def _slope(
+    path: str, samples: Mapping[str, Array], title: str
+) -> tuple[float, float, tuple[Remark, ...], tuple[Curve, ...]]:
+    """Return dF/dΩ², N s²/rad², its standard error, remarks and the picture."""
+    time, speed, force = samples["time"], samples["rotor_speed"], samples["force"]
+    levels, used, dropped = _levels(time, speed, force)
+    if len(levels) < FEWEST:
+        what = f"holds {len(levels)} steady levels of rotor speed of {SHORTEST:g} s and more"
+        raise RecordingError(path, what, f"record {FEWEST} or more, each for some seconds")
+    fastest, slowest = max(v.speed for v in levels), min(v.speed for v in levels)
+    if fastest < SPREAD * slowest:
+        what = f"has levels from {slowest:.0f} to {fastest:.0f} rad/s, too alike for a slope"
+        raise RecordingError(path, what, "step from slow to fast")
+    design = np.array([[v.speed**2, 1.0, v.time - levels[0].time] for v in levels])
+    if len(levels) < FEWEST + 2:
+        design = design[:, :2]
+    measured = np.array([v.force for v in levels])
+    solution, covariance = _weighted(design, measured, levels)
+    slope = float(solution[0])
+    if slope <= 0:
+        raise RecordingError(
+            path, "has a force that falls as the rotors speed up", "check the sign"
+        )
+    fit = design @ solution
+    remarks = [
+        Remark("levels", {"levels": len(levels), "outliers": dropped}),
+        Remark("offset", {"force": float(solution[1])}),
+    ]
+    bend, bend_error = _curvature(design, measured, levels)
+    if abs(bend) > 3 * bend_error and len(levels) >= FEWEST + 2:
+        remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
+    squares = design[:, 0]
+    order = np.argsort(squares)
+    curves = (
+        Curve("Rotor speed", "time, s", "rotor speed, rad/s", time, speed, used,
+              np.array([v.time for v in levels]), np.array([v.speed for v in levels]), law=False),
+        Curve(title, "rotor speed squared, rad²/s²", "force, N", squares, measured,
+              np.ones(len(levels), bool), squares[order], fit[order]),
+    )  # fmt: skip
+    return slope, math.sqrt(covariance[0, 0]), tuple(remarks), curves
+
+
+def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDArray[np.bool_], int]:
+    step = STEP * float(np.nanquantile(speed, 0.98))
+    levels, used, dropped = [], np.zeros(len(time), bool), 0
+    for plateau in levels_of(speed, time, shortest=SHORTEST, step=step):
+        kept = without_outliers(speed[plateau.samples]) & np.isfinite(force[plateau.samples])
+        dropped += int((~kept).sum())
+        inside = plateau.samples[kept]
+        if len(inside) < 4:
+            continue
+        used[inside] = True
+        mean_speed, speed_error = mean_and_error(speed[inside])
+        mean_force, force_error = mean_and_error(force[inside])
+        middle = 0.5 * (plateau.begin + plateau.end)
+        levels.append(_Level(mean_speed, speed_error, mean_force, force_error, middle))
+    return levels, used, dropped
+
+
+def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Array, Array]:
+    """Return the weighted least squares solution and covariance, Student's t for few levels.
+
+    A speed's error counts as a force's through the slope; the residuals' scatter about the
+    law scales them (Birge's ratio), but a few residuals that happen to be small do not.
+    """
+    slope = float(np.linalg.lstsq(design, measured, rcond=None)[0][0])
+    variance = np.array(
+        [v.force_error**2 + (2 * slope * v.speed * v.speed_error) ** 2 for v in levels]
+    )
+    variance = np.maximum(variance, 0.25 * np.median(variance))
+    weight = 1.0 / np.maximum(variance, 1e-30)
+    normal = design.T @ (design * weight[:, None])
+    inverse = scaled_inverse(normal)
+    solution = inverse @ (design.T @ (weight * measured))
+    freedom = len(levels) - design.shape[1]
+    residual = measured - design @ solution
+    scale = float(residual @ (weight * residual)) / max(freedom, 1)
+    if freedom < TRUSTED:
+        scale = max(scale, 1.0)
+    return solution, inverse * scale * student(freedom) ** 2
+
+
+def _curvature(design: Array, measured: Array, levels: list[_Level]) -> tuple[float, float]:
+    """Return the coefficient of Ω⁴ beside Ω², relative units, and its standard error."""
+    squares = design[:, 0] / design[:, 0].max()
+    solution, covariance = _weighted(np.column_stack([design, squares**2]), measured, levels)
+    return float(solution[-1]), math.sqrt(covariance[-1, -1])

@@ -1,0 +1,257 @@
+"""Command steps to the motors' time constants and delay: the exact first-order response."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+from scipy.optimize import least_squares
+
+from tuner.core.errors import RecordingError
+from tuner.core.numerics import robust_sd
+from tuner.ground.measurement import Array, Curve, Measurement, Remark
+from tuner.ground.plateaus import OUTLIER, student
+
+STEP = 0.02
+"""Change of the command between two samples that counts as a step."""
+FEWEST = 2
+"""Steps up, and steps down, without which a time constant has no error."""
+SETTLED = 3.0
+"""Time constants that a step must last for its level to be known."""
+NOT_FIRST_ORDER = 0.1
+"""Share of the residuals' sum of squares that a second lag may explain in a first-order motor."""
+GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+"""Time constants, s, from the best of which the fit begins."""
+EARLIEST = 0.05
+"""s by which a speed may react before its command's stamp, where two loggers wrote them."""
+TOLD = 2.0
+"""Standard errors by which it must do so for a remark."""
+MOST_STEPS = 200
+MOST = 12_000
+"""Samples beyond which those long after a step are thinned."""
+
+
+def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measurement:
+    """Return time constants up and down, s, and the actuator latency, s.
+
+    Between two steps of the command the speed approaches its level as exp(-(t - delay)/τ), with
+    τ = time_constant_up while it rises and time_constant_down while it falls (Eq. 5.3); every level
+    is fitted. Where two loggers wrote speed and command, their clocks may differ, and the speed may
+    react before its command's stamp: the delay is estimated in both directions. One below zero is
+    no latency; how far the clocks are off, in either direction, is then in its interval, and a
+    remark says so. A second lag is tried beside it: where it explains much, the shape is not first
+    order (thesis 5.4.1), and a remark says so.
+
+    Parameters
+    ----------
+    name, path
+        Of the experiment and its recording.
+    samples
+        ``time`` s, ``command`` 0..1, ``rotor_speed`` rad/s.
+
+    Raises
+    ------
+    RecordingError
+        Steps are missing in one direction, or too short.
+    """
+    time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
+    known = np.isfinite(speed) & np.isfinite(command)
+    time, command, speed = time[known], command[known], speed[known]
+    near = _near_steps(time, command)
+    time, command, speed = time[near], command[near], speed[near]
+    edges = _edges(command)
+    if len(edges) > MOST_STEPS:
+        what = f"has a command that changes {len(edges)} times"
+        raise RecordingError(path, what, f"record no more than {MOST_STEPS} steps of the command")
+    rises = command[np.minimum(edges + 1, len(command) - 1)] > command[edges - 1]
+    for direction, count in (("up", int(rises.sum())), ("down", int((~rises).sum()))):
+        if count < FEWEST:
+            what = f"holds {count} steps {direction} of the command"
+            raise RecordingError(path, what, f"record {FEWEST} or more in each direction")
+    steps = _Steps(time, np.concatenate([[0], edges, [len(time)]]), rises)
+    kept = _near_neighbours(speed)
+    first = _fit(steps, speed, kept, _first_guess(steps, speed, kept), second=False)
+    residual = steps.simulated(first, speed, kept) - speed
+    spread = float(robust_sd(residual[kept]))
+    kept &= np.abs(residual) <= 2 * OUTLIER * spread
+    lags = _fit(steps, speed, kept, first, second=False)
+    up, down, delay = np.exp(lags[0]), np.exp(lags[1]), lags[2]
+    shortest = float(np.diff(time[edges]).min(initial=np.inf))
+    if shortest < SETTLED * max(up, down):
+        longest = max(up, down)
+        what = f"has steps of {shortest:.2g} s, too short for a time constant of {longest:.2g} s"
+        raise RecordingError(path, what, "hold each command longer")
+    covariance = _covariance(steps, lags, speed, kept)
+    # a step shows at the first sample after it: half an interval late on average, but by as much
+    # at every step where the log and the commands keep time
+    interval = float(np.median(np.diff(time)))
+    covariance[2, 2] += interval**2 / 12
+    latency = delay + 0.5 * interval
+    early = max(-latency, 0.0)
+    told = early > TOLD * math.sqrt(covariance[2, 2])
+    covariance[2, 2] += early**2  # clocks that differ may do so in either direction
+    outliers = int((~kept).sum())
+    numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
+    remarks = [Remark("steps", numbers)]
+    if told:
+        remarks.append(Remark("command_late", {"seconds": early}))
+    richer = _fit(steps, speed, kept, lags, second=True)
+    plain = steps.simulated(lags, speed, kept)
+    misfit = [float(np.sum((fit - speed)[kept] ** 2)) for fit in
+              (plain, steps.simulated(richer, speed, kept))]  # fmt: skip
+    explained = 1.0 - misfit[1] / max(misfit[0], 1e-300)
+    if explained > NOT_FIRST_ORDER:
+        lag = float(np.exp(richer[3]))
+        remarks.append(Remark("not_first_order", {"explained": explained, "lag": lag}))
+    return Measurement(
+        name,
+        ({"time_constant_up": 1.0}, {"time_constant_down": 1.0}, {"actuator_latency": 1.0}),
+        np.array([lags[0], lags[1], max(latency, 0.0)]),
+        covariance,
+        tuple(remarks),
+        (Curve("Step response", "time, s", "rotor speed, rad/s", time, speed, kept, time, plain),),
+    )
+
+
+def _edges(command: Array) -> NDArray[np.intp]:
+    """Return the samples with which a new level of the command begins."""
+    edges = np.flatnonzero(np.abs(np.diff(command)) > STEP) + 1
+    return np.asarray(edges[np.diff(edges, prepend=-10) > 1])
+
+
+def _near_steps(time: Array, command: Array) -> NDArray[np.bool_]:
+    """Return (n,) which samples to use: all, or of a long recording those after steps and some."""
+    count = len(command)
+    near = np.arange(count) % max(1, 2 * count // MOST) == 0
+    edges = _edges(command)
+    reach = MOST // (2 * max(len(edges), 1))
+    before = min(max(2, round(EARLIEST / float(np.median(np.diff(time))))), reach)
+    for edge in edges[:MOST_STEPS]:
+        near[max(edge - before, 0) : edge + reach] = True
+    return np.asarray(near)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The steps of a recording: sample times (n,) in s, begins of the levels, which ones rise."""
+
+    time: Array
+    bounds: NDArray[np.intp]
+    rises: NDArray[np.bool_]
+
+    def design(self, lags: Array) -> Array:
+        """Return (n, levels): the speed is linear in the levels once the lags are given."""
+        levels = len(self.bounds) - 1
+        design = np.zeros((len(self.time), levels))
+        state = np.eye(levels)[0]
+        begins = self.time[self.bounds[1:-1]] + lags[2]
+        places = [*np.searchsorted(self.time, begins), len(self.time)]
+        design[: places[0]] = state
+        lag = math.exp(lags[3]) if len(lags) > 3 else 0.0
+        for number in range(1, levels):
+            after = slice(places[number - 1], places[number])
+            constant = math.exp(lags[0] if self.rises[number - 1] else lags[1])
+            decay = _decay(self.time[after] - begins[number - 1], constant, lag)[:, None]
+            goal = np.eye(levels)[number]
+            design[after] = goal + (state - goal) * decay
+            if number + 1 < levels:
+                end = self.time[self.bounds[number + 1]] - self.time[self.bounds[number]]
+                state = goal + (state - goal) * float(_decay(np.array([end]), constant, lag)[0])
+        return design
+
+    def simulated(self, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
+        """Return the speed (n,) of the best levels for some lags."""
+        design = self.design(lags)
+        return np.asarray(design @ _levels(design[kept], speed[kept]))
+
+
+def _levels(design: Array, speed: Array) -> Array:
+    """Return the least squares solution; the columns are steps apart, hence never near parallel."""
+    normal = design.T @ design
+    ridge = 1e-12 * np.trace(normal) * np.eye(len(normal))
+    return np.asarray(np.linalg.solve(normal + ridge, design.T @ speed))
+
+
+def _decay(time: Array, constant: float, lag: float) -> Array:
+    if lag < 1e-6:
+        return np.asarray(np.exp(-time / constant))
+    if abs(constant - lag) < 1e-4 * constant:
+        lag = 1.0001 * constant
+    slow, quick = np.exp(-time / constant), np.exp(-time / lag)
+    return np.asarray((constant * slow - lag * quick) / (constant - lag))
+
+
+def _near_neighbours(speed: Array) -> NDArray[np.bool_]:
+    """Return (n,) which samples are no spikes of the tachometer."""
+    difference = np.abs(speed - median_filter(speed, size=5, mode="nearest"))
+    spread = max(float(robust_sd(difference)), 1e-9)
+    return np.asarray(difference <= 6 * OUTLIER * spread)
+
+
+def _fit(
+    steps: _Steps, speed: Array, kept: NDArray[np.bool_], start: Array, *, second: bool
+) -> Array:
+    """Return the logarithms of both time constants, the delay in s, and of a second lag.
+
+    Parameters
+    ----------
+    start
+        (3,) where to begin with the first three.
+    second
+        Whether there is a second lag; else it is left out.
+    """
+    shortest = float(np.diff(steps.time[steps.bounds[1:-1]]).min(initial=1.0))
+    more = int(second)
+    earliest = -min(EARLIEST, 0.5 * shortest)
+    low = np.array([math.log(1e-4), math.log(1e-4), earliest, *[math.log(1e-5)] * more])
+    high = np.array([math.log(10.0), math.log(10.0), 0.5 * shortest, *[0.0] * more])
+    begin = np.array([*start, *[start[:2].min() + math.log(0.3)] * more])
+    solution = least_squares(
+        lambda lags: (steps.simulated(lags, speed, kept) - speed)[kept],
+        np.clip(begin, low + 1e-6, high - 1e-6),
+        bounds=(low, high),
+        x_scale=[1.0, 1.0, math.exp(begin[:2].min()), 1.0][: len(begin)],
+        xtol=1e-6,
+        ftol=1e-9,
+    )
+    return np.asarray(solution.x)
+
+
+def _first_guess(steps: _Steps, speed: Array, kept: NDArray[np.bool_]) -> Array:
+    """Return where to begin: the common time constant, of a few, that meets the speeds best."""
+
+    def misfit(start: Array) -> float:
+        return float(np.sum((steps.simulated(start, speed, kept) - speed)[kept] ** 2))
+
+    starts = [np.array([math.log(c), math.log(c), 0.002]) for c in GUESSES]
+    return min(starts, key=misfit)
+
+
+def _covariance(steps: _Steps, lags: Array, speed: Array, kept: NDArray[np.bool_]) -> Array:
+    """Return the covariance (3, 3), from white noise or from steps that differ, the larger."""
+    design = steps.design(lags)
+    levels = _levels(design[kept], speed[kept])
+    columns = []
+    for index, step in enumerate((1e-4, 1e-4, 1e-6)):
+        moved = np.eye(3)[index] * step
+        change = steps.design(lags + moved) - steps.design(lags - moved)
+        columns.append(change @ levels / (2 * step))
+    jacobian = np.column_stack([*columns, design])[kept]
+    residual = (design @ levels - speed)[kept]
+    inverse = np.linalg.pinv(jacobian.T @ jacobian)
+    white = inverse * float(residual @ residual) / (len(residual) - jacobian.shape[1])
+    number = np.searchsorted(steps.bounds[1:-1], np.arange(len(kept)), side="right")[kept]
+    scores = np.array([
+        (jacobian[number == n] * residual[number == n, None]).sum(axis=0) for n in np.unique(number)
+    ])  # fmt: skip
+    clusters = len(scores)
+    sandwich = inverse @ (scores.T @ scores) @ inverse * clusters / max(clusters - 1, 1)
+    # few steps make the sandwich erratic: chance alone is taken off before it may widen
+    chance = 1.0 + math.sqrt(2.0 / max(clusters - 1, 1))
+    ratio = np.diag(sandwich) * student(clusters - 1) ** 2 / np.diag(white) / chance
+    grown = np.sqrt(np.maximum(ratio, 1.0))
+    return np.asarray((white * np.outer(grown, grown))[:3, :3])

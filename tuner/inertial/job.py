@@ -1,0 +1,228 @@
+"""A fit of flights without motion capture: gyro, accelerometer and motor commands alone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from tuner.config import Settings
+from tuner.core.disk import exists
+from tuner.core.errors import ConfigError, InputError, RecordingError
+from tuner.core.findings import Code, Finding
+from tuner.ground.combine import Combination, combine
+from tuner.ground.job import BenchResult, conflicts_of, known_of, vehicle_of, written
+from tuner.ground.measurement import Measurement
+from tuner.ground.scales import value_of
+from tuner.inertial.ahead import AHEAD, rate_errors
+from tuner.inertial.measurement import agreeing, measure_inertial
+from tuner.inertial.signals import stretches_of
+from tuner.job.folder import folder_for
+from tuner.objective.job_flights import left_out_of
+from tuner.objective.motor_order import columns_of_rotors, in_rotor_order
+from tuner.recordings.inertial import InertialFlight, read_inertial
+from tuner.search.listener import SILENT, Listener
+from tuner.vehicle import VehicleFile, values_of, with_values
+
+BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
+"""What a flight without a pose gives over the mass."""
+
+
+def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
+    """Return the flights of a job, if none of its recordings holds a pose, and what is left out.
+
+    Where one does there are none: the others take no part (`tuner.recordings` names them).
+
+    Raises
+    ------
+    RecordingError
+        No recording can be used.
+    """
+    job = settings.job
+    flights: list[InertialFlight] = []
+    left_out: list[tuple[Path, RecordingError]] = []
+    for path in settings.flights:
+        try:
+            flight = read_inertial(path, topics=job.topics, namespace=job.namespace)
+        except RecordingError as error:
+            if not exists(path):
+                raise
+            left_out.append((path, error))
+            continue
+        if flight is None:
+            return (), ()
+        columns = columns_of_rotors(settings.vehicle, flight.notes)
+        if columns is not None:
+            flight = replace(flight, series=in_rotor_order(flight.series, columns))
+        flights.append(flight)
+    if left_out and not flights:
+        raise left_out[0][1]
+    return tuple(flights), tuple(left_out_of(path.stem, error) for path, error in left_out)
+
+
+def fit_without_pose(
+    settings: Settings,
+    flights: Sequence[InertialFlight],
+    *,
+    left_out: Sequence[Finding] = (),
+    out: Path | None = None,
+    listener: Listener = SILENT,
+    command: str = "",
+) -> BenchResult:
+    """Estimate coefficients from flights without a pose and write a result folder.
+
+    Parameters
+    ----------
+    settings
+        Of the job; its vehicle is of the weighed mass.
+    flights
+        At least one; those that the job holds out are predicted, and not fitted, and those that
+        cannot be fitted are left out, if others are left.
+    left_out
+        Findings of those that already were.
+    out
+        Result folder; None makes one under ``runs/`` named by the time.
+    listener
+        Whom to report to.
+    command
+        What the user typed, for the record.
+
+    Raises
+    ------
+    InputError
+        No flight can be used; nothing was written.
+    OutputError
+        The result folder cannot be written to.
+    """
+    began = time.perf_counter()
+    start, folder = settings.vehicle, folder_for(out)
+    held_out = [flight for flight in flights if flight.name in settings.job.holdout]
+    to_fit = [flight for flight in flights if flight.name not in settings.job.holdout]
+    measured, used, unusable = _measured(to_fit, start, listener)
+    left_out = (*left_out, *unusable)
+    known = known_of(start)
+    alone = combine(measured, known)
+    measurements = agreeing(measured, alone.chi_square, alone.degrees_of_freedom)
+    combination = combine(measurements, known)
+    path = Path(used[0].path)
+    try:
+        vehicle = vehicle_of(path, start, combination)
+    except ConfigError:  # moment_constant over inertia_zz, shared out, gave what no body can have
+        measurements = tuple(_without_yaw(m) for m in measurements)
+        combination = combine(measurements, known)
+        vehicle = vehicle_of(path, _as_flat(start, combination), combination)
+    return written(
+        folder,
+        start,
+        vehicle.replace(name=f"{start.name}_inertial"),
+        measurements,
+        combination,
+        findings=(
+            *left_out,
+            *_left_open(settings, combination.names),
+            *_foretold(used, start, vehicle),
+            *_foretold(held_out, start, vehicle, held_out=True),
+            *conflicts_of(combination),
+        ),
+        settings={"command": command, "origin": dict(settings.origin)},
+        source={"flights": ", ".join(flight.name for flight in used)},
+        header=f"From flights without a pose; the rest as in {start.name}.",
+        began=began,
+    )
+
+
+def _measured(
+    flights: Sequence[InertialFlight], start: VehicleFile, listener: Listener
+) -> tuple[list[Measurement], list[InertialFlight], list[Finding]]:
+    """Return what flights say, those that say it, and findings of those that cannot be fitted."""
+    measured, used, errors = [], [], []
+    for flight in flights:
+        listener.on_message(f"{flight.name}: fitting body rate and specific force without a pose.")
+        try:
+            measured.append(measure_inertial(flight, start))
+        except RecordingError as error:
+            errors.append((flight.name, error))
+        else:
+            used.append(flight)
+    if not used:
+        what, to_do = "holds out all flights that can be used", "leave one to fit"
+        raise errors[0][1] if errors else InputError("--holdout", what, to_do)
+    return measured, used, [left_out_of(name, error) for name, error in errors]
+
+
+def _foretold(
+    flights: Sequence[InertialFlight],
+    start: VehicleFile,
+    vehicle: VehicleFile,
+    *,
+    held_out: bool = False,
+) -> tuple[Finding, ...]:
+    """Return of which flights body rate is foretold worse than before, or than by holding it.
+
+    Of flights that were held out it is said how well it is foretold in any case.
+    """
+    findings = []
+    for flight in flights:
+        errors = rate_errors(stretches_of(flight.series, flight.flying), start, vehicle)
+        if errors is None:
+            continue
+        numbers = {
+            "before": errors.initial,
+            "after": errors.fitted,
+            "hold": errors.hold,
+            "seconds": AHEAD,
+        }
+        if errors.fitted > errors.initial:
+            findings.append(Finding(Code.RATE_WORSE, "warning", flight.name, numbers))
+        elif errors.fitted > errors.hold:
+            findings.append(Finding(Code.RATE_NOT_FORETOLD, "info", flight.name, numbers))
+        elif held_out:
+            findings.append(Finding(Code.RATE_FORETOLD, "info", flight.name, numbers))
+    return tuple(findings)
+
+
+def _as_flat(vehicle: VehicleFile, combination: Combination) -> VehicleFile:
+    """Return a vehicle of the size that was found: its yaw inertia in the file's proportion.
+
+    What the flights say of roll and pitch says how large the vehicle is, of which the file knows
+    nothing where another vehicle flew.
+    """
+    before = values_of(vehicle)
+    changes = [
+        value_of(name, float(scaled)) / before[name]
+        for name, scaled in zip(combination.names, combination.scaled, strict=True)
+        if name in ("inertia_xx", "inertia_yy")
+    ]
+    size = float(np.exp(np.mean(np.log(changes)))) if changes else 1.0
+    others = {name: size * before[name] for name in ("inertia_xx", "inertia_yy", "inertia_zz")}
+    return with_values(vehicle, others)
+
+
+def _without_yaw(measurement: Measurement) -> Measurement:
+    """Return a measurement without what it says of inertia_zz, which it does not say alone."""
+    about_z = {"inertia_zz", "torque_trim_z"}
+    kept = [i for i, row in enumerate(measurement.rows) if not about_z & set(row)]
+    return replace(
+        measurement,
+        rows=tuple(measurement.rows[i] for i in kept),
+        value=measurement.value[kept],
+        covariance=measurement.covariance[np.ix_(kept, kept)],
+    )
+
+
+def _left_open(settings: Settings, names: Sequence[str]) -> tuple[Finding, ...]:
+    """Return what such flights leave open, and which number closes it."""
+    vehicle, scaled = settings.vehicle, tuple(name for name in BY_MASS if name in names)
+    mass = {"mass": values_of(vehicle)["mass"]}
+    findings = [
+        Finding(Code.SCALES_WITH_MASS, "info", "mass", mass, scaled),
+        Finding(Code.NO_TACHOMETER, "info", "input_scaling"),
+    ]
+    if "moment_constant" in names:
+        findings.append(Finding(Code.YAW_OPEN, "info", "inertia_zz"))
+    if settings.origin.get("vehicle", "").startswith("default"):
+        findings.insert(0, Finding(Code.VEHICLE_NOT_GIVEN, "warning", vehicle.name))
+    return tuple(findings)

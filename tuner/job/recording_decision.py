@@ -1,0 +1,50 @@
+"""What `tune` decides of one recording before it simulates anything, by its own functions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tuner.config import Settings
+from tuner.core.errors import InputError
+from tuner.core.findings import Code, Finding
+from tuner.inertial.job import without_pose
+from tuner.job.recording_verdict import Verdict
+from tuner.objective.inlets import bypassed_by
+from tuner.objective.job_flights import as_logged, read_usable
+from tuner.vehicle import COEFFICIENTS
+from tuner.wording.findings import sentence
+
+
+def decided(path: Path, settings: Settings) -> Verdict:
+    """Return whether and how `tune` would fit a recording, and why.
+
+    Parameters
+    ----------
+    path
+        The recording, the only one of the settings.
+    settings
+        Of the job.
+    """
+    settings, logged = as_logged(settings)
+    gains = tuple(g for f in logged if f.code is Code.LOGGED_GAINS for g in f.names)
+    try:
+        bare, _ = without_pose(settings)
+        if bare:
+            seconds = sum(end - begin for flight in bare for begin, end in flight.flying)
+            why = (
+                f"No pose was recorded: body rate and specific force of {seconds:.0f} s in the air "
+                "are fitted, from the motor commands."
+            )
+            return Verdict(str(path), True, ("none",), (why,))
+        recordings, findings = read_usable(settings, holdout=(), fits=False)
+    except InputError as error:
+        return Verdict(str(path), False, why=(f"{error.what}; {error.remedy}",))
+    inlets = [recording.inlet for recording in recordings]
+    bypassed = bypassed_by(inlets, [recording.flight for recording in recordings])
+    hidden = tuple(n for n in COEFFICIENTS if n in bypassed and not COEFFICIENTS[n].is_effect)
+    return Verdict(str(path), True, tuple(inlets), _reasons(findings), hidden, gains)
+
+
+def _reasons(findings: Sequence[Finding]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(sentence(finding) for finding in findings))

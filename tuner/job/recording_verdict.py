@@ -1,0 +1,154 @@
+"""Whether recordings can be fitted, and how: what `tune` decides, before it simulates anything."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from tuner.config import Options, Settings, settle
+from tuner.recordings.cache import cached, digest, load, store
+from tuner.recordings.inspection import Inspection
+from tuner.recordings.px4_logging import Advice, advice_of, settings_in_words
+from tuner.recordings.sidecar import read_sidecar
+from tuner.recordings.ulog import parameters_of
+from tuner.wording.phrases import listed
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What `tune` would do with a recording.
+
+    Attributes
+    ----------
+    path
+        The recording.
+    fits
+        Whether something can be fitted to it.
+    inlets
+        Where each of its missions enters the simulated loop; ``none`` of a log without a pose.
+    why
+        In sentences: why it cannot be fitted, or why it enters there.
+    not_shown
+        Coefficients that act above those places, which this recording cannot show.
+    gains
+        What the log's own parameters have otherwise than the controller file.
+    logging
+        What would have to be logged more of.
+    settings
+        The logger's settings that would do that; empty where nothing is missing.
+    """
+
+    path: str
+    fits: bool
+    inlets: tuple[str, ...] = ()
+    why: tuple[str, ...] = ()
+    not_shown: tuple[str, ...] = ()
+    gains: tuple[str, ...] = ()
+    logging: tuple[Advice, ...] = ()
+    settings: str = ""
+
+
+def verdict_of(
+    inspection: Inspection,
+    *,
+    topics: str | None = None,
+    namespace: str | None = None,
+    vehicle: str | None = None,
+) -> Verdict:
+    """Return what `tune` would do with a recording, by the job file beside it.
+
+    Parameters
+    ----------
+    inspection
+        What it holds.
+    topics, namespace, vehicle
+        As of the command line.
+
+    Raises
+    ------
+    InputError
+        The settings are wrong, rather than the recording.
+    """
+    path = Path(inspection.path)
+    options = Options([str(path)], topics=topics, namespace=namespace, vehicle=vehicle)
+    decided = _decided(path, settle(options, fits=False))
+    parameters = parameters_of(path)
+    logging: tuple[Advice, ...] = ()
+    if inspection.format == "ulog" and inspection.duration > 0:
+        rates = {
+            topic.name: topic.rate or topic.count / inspection.duration
+            for topic in inspection.topics
+        }
+        logging = advice_of(rates)
+    words = settings_in_words(logging, parameters)
+    return replace(decided, logging=logging, settings=words)
+
+
+def _decided(path: Path, settings: Settings) -> Verdict:
+    """Return what `tune` decides, from the cache where it was asked before."""
+    job = settings.job
+    inputs = settings.vehicle, settings.controller, job, read_sidecar(path)
+    maps = [digest(file) for file in (job.topics,) if file is not None and file.exists()]
+    key = (digest(path), path.name, _version(), *map(repr, (*inputs, *maps)))
+    kept = cached("verdict", *key)
+    if (content := load(kept)) is not None:
+        return Verdict(**{**_tuples(json.loads(content)), "path": str(path)})
+    from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
+
+    configure()
+    from tuner.job.recording_decision import decided  # noqa: PLC0415
+
+    verdict = decided(path, settings)
+    store(kept, json.dumps(asdict(verdict)).encode())
+    return verdict
+
+
+def _tuples(raw: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: tuple(of) if isinstance(of, list) else of for name, of in raw.items()}
+
+
+@cache
+def _version() -> str:
+    """Return a digest of the source that decides: any change decides anew."""
+    tuner, total = Path(__file__).resolve().parents[1], hashlib.sha256()
+    for folder in ("objective", "inertial", "config", "vehicle"):
+        for file in sorted((tuner / folder).glob("*.py")):
+            total.update(file.read_bytes())
+    for name in ("recording_decision.py", "recording_verdict.py"):
+        total.update((tuner / "job" / name).read_bytes())
+    return total.hexdigest()
+
+
+def in_words(verdict: Verdict) -> list[str]:
+    """Return a verdict as lines: what `tune` does first, and then what would change it."""
+    if not verdict.fits:
+        return [f"cannot be fitted: {verdict.why[0]}", *_logger_in_words(verdict)]
+    if verdict.inlets == ("none",):
+        lines = ["can be fitted without motion capture"]
+    else:
+        inlets = dict.fromkeys(verdict.inlets)
+        lines = [f"can be fitted, through the inlet {listed(tuple(inlets))}"]
+    lines += [f"  {why}" for why in verdict.why]
+    if verdict.not_shown:
+        lines.append(f"  It cannot show {listed(verdict.not_shown)}, which act above there.")
+    if verdict.gains:
+        lines.append(f"  The log's own parameters are simulated: {'; '.join(verdict.gains)}.")
+    return [*lines, *_logger_in_words(verdict)]
+
+
+def _logger_in_words(verdict: Verdict) -> list[str]:
+    """Return what would have to be logged more of, a line a message."""
+    lines = []
+    for advice in verdict.logging:
+        logged = f"{advice.logged:.0f} Hz" if advice.logged else "not logged"
+        lines.append(
+            f"  {advice.message}: {logged}, {advice.wanted:.0f} Hz would show {advice.shows}"
+        )
+    if verdict.settings:
+        lines.append(f"  That is logged by {verdict.settings}.")
+    return lines

@@ -1,0 +1,311 @@
+"""Which flights a job uses, where each enters the simulated loop, and how late its clocks are.
+
+All commands take their flights from here: the fit, the comparison, the sensitivity, the export's
+check and the cross-validation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from tuner.config import Settings, TrajectorySettings
+from tuner.config.job import InletName
+from tuner.core.disk import exists
+from tuner.core.errors import InputError, RecordingError, did_you_mean
+from tuner.core.findings import Code, Finding
+from tuner.core.yaml_section import build
+from tuner.objective.allocation import with_commands
+from tuner.objective.choice import FED_BY, choose_inlet
+from tuner.objective.inlets import INLETS, window_seconds
+from tuner.objective.motor_order import flight_in_rotor_order
+from tuner.objective.speed_unit import with_speeds_in_si
+from tuner.objective.trajectory import with_named_reference
+from tuner.objective.windows import require_windows
+from tuner.recordings.contradiction import noted_contradiction
+from tuner.recordings.flight import Flight
+from tuner.recordings.load import load_flights
+from tuner.recordings.notes import NoteCode
+from tuner.recordings.stale import is_stale
+from tuner.recordings.ulog import parameters_of
+from tuner.vehicle import check_mixer
+from tuner.vehicle.px4_parameters import PLACES, with_parameters
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight, and what a job does with it.
+
+    Attributes
+    ----------
+    flight
+        The mission.
+    inlet
+        Where it enters the simulated loop.
+    time_offset
+        s by which its stamps are late; None where the fit estimates that.
+    holdout
+        Whether it is evaluated and never fitted.
+    conditions
+        What surrounded it, of `tuner.vehicle.conditions`, as far as that is known.
+    because
+        Why it does not enter at the most upstream place whose signals were recorded.
+    input_late
+        s by which what is fed in is stamped later than the recorded state.
+    """
+
+    flight: Flight
+    inlet: InletName = "reference"
+    time_offset: float | None = 0.0
+    holdout: bool = False
+    conditions: Mapping[str, float] = field(default_factory=dict)
+    because: Finding | None = None
+    input_late: float = 0.0
+
+
+def as_logged(settings: Settings) -> tuple[Settings, tuple[Finding, ...]]:
+    """Return settings with the rate loop that PX4 logs among the flights tell by their parameters.
+
+    Returns
+    -------
+    tuple
+        The settings, and what the controller file had.
+    """
+    logs = {path: parameters for path in settings.flights if (parameters := parameters_of(path))}
+    if not logs:
+        return settings, ()
+    first, *others = logs.values()
+    controller, changes = with_parameters(settings.controller, first)
+    known = [name for name in PLACES.values() if name in first]
+    unlike = [name for name in known if any(other.get(name) != first[name] for other in others)]
+    findings = []
+    if changes:
+        named = not settings.origin.get("controller", "default").startswith("default")
+        names = tuple(str(change) for change in changes)
+        level: Literal["warning", "info"] = "warning" if named else "info"
+        findings.append(Finding(Code.LOGGED_GAINS, level, next(iter(logs)).stem, names=names))
+    if unlike:
+        findings.append(Finding(Code.LOGS_DIFFER, "warning", "flights", names=tuple(unlike)))
+    origin = {**settings.origin, "controller": f"{settings.origin.get('controller', '')}, the log"}
+    changed = replace(settings, controller=controller, origin=origin) if changes else settings
+    return changed, tuple(findings)
+
+
+def read_recordings(
+    settings: Settings, *, holdout: Sequence[str] | None = None
+) -> tuple[Recording, ...]:
+    """Read every mission of the settled files, and assign it what the job file says of it.
+
+    What cannot be used is left out (`read_usable` names it), if others are left.
+
+    Parameters
+    ----------
+    settings
+        Of the job.
+    holdout
+        Names of the flights that are held out; None takes the job's.
+
+    Raises
+    ------
+    InputError
+        No file can be read, no flight holds what its inlet needs, a side-car names an
+        impossible trajectory, or a held-out flight does not exist.
+    """
+    recordings, _ = read_usable(settings, holdout=holdout)
+    return recordings
+
+
+def read_usable(
+    settings: Settings, *, holdout: Sequence[str] | None = None, fits: bool = True
+) -> tuple[tuple[Recording, ...], tuple[Finding, ...]]:
+    """Read every mission of the settled files that can be simulated, and name the others.
+
+    Parameters
+    ----------
+    settings, holdout
+        As of `read_recordings`.
+    fits
+        Whether one that is not held out has to be left.
+
+    Returns
+    -------
+    tuple
+        The recordings, and a finding for each that is left out because it cannot be read, because
+        nothing flies in it, because it contradicts itself, or because it does not hold what its
+        inlet needs, and for each that enters further down than its signals would let it.
+
+    Raises
+    ------
+    InputError
+        As `read_recordings`.
+    """
+    job = settings.job
+    flights: list[Flight] = []
+    left_out: list[tuple[str, RecordingError]] = []
+    for path in settings.flights:
+        try:
+            flights += load_flights(path, topics=job.topics, namespace=job.namespace)
+        except RecordingError as error:
+            if not exists(path):
+                raise
+            left_out.append((path.stem, error))
+    flights, passed_over = _chosen(flights)
+    names = [*(flight.name for flight in flights), *(name for name, _ in left_out)]
+    for name in job.holdout:
+        if name not in names:
+            raise InputError("--holdout", f"there is no flight '{name}'", did_you_mean(name, names))
+    recordings: list[Recording] = []
+    for flight in flights:
+        try:
+            (recording,) = recordings_of(
+                settings, [_with_reference(flight, settings)], holdout=holdout
+            )
+        except RecordingError as error:
+            left_out.append((flight.name, error))
+        else:
+            recordings.append(recording)
+    held_out = job.holdout if holdout is None else holdout
+    none_to_fit = not any(recording.flight.name not in held_out for recording in recordings)
+    if left_out and (not recordings or (fits and none_to_fit)):
+        raise left_out[0][1]
+    recordings = [_as_fitted(recording, recordings, settings) for recording in recordings]
+    chosen = (recording.because for recording in recordings if recording.because is not None)
+    return tuple(recordings), (
+        *passed_over,
+        *(left_out_of(name, error) for name, error in left_out),
+        *chosen,
+    )
+
+
+def _chosen(flights: Sequence[Flight]) -> tuple[list[Flight], list[Finding]]:
+    """Return the flights without the manoeuvres of long recordings that are not fitted."""
+    chosen = {flight.name for flight in flights if not _is_passed_over(flight)}
+    findings = []
+    for path in dict.fromkeys(f.path for f in flights if f.name not in chosen):
+        of_path = [flight for flight in flights if flight.path == path]
+        fitted = [str(n) for n, flight in enumerate(of_path, 1) if flight.name in chosen]
+        numbers = {"fitted": float(len(fitted)), "flights": float(len(of_path))}
+        names = (of_path[0].name, *fitted)
+        findings.append(Finding(Code.MANOEUVRES_CHOSEN, "info", of_path[0].name, numbers, names))
+    return [flight for flight in flights if flight.name in chosen], findings
+
+
+def _is_passed_over(flight: Flight) -> bool:
+    return any(note.code is NoteCode.NOT_CHOSEN for note in flight.notes)
+
+
+def left_out_of(name: str, error: RecordingError) -> Finding:
+    """Return the finding that a flight takes no part, and why."""
+    return Finding(Code.LEFT_OUT, "warning", name, names=(error.what, error.remedy))
+
+
+def recordings_of(
+    settings: Settings, flights: Iterable[Flight], *, holdout: Sequence[str] | None = None
+) -> tuple[Recording, ...]:
+    """Assign flights the inlet, the clock offset and the part that a job's settings give them.
+
+    Parameters
+    ----------
+    settings, holdout
+        As of `read_recordings`.
+    flights
+        With a reference where one is named.
+
+    Raises
+    ------
+    RecordingError
+        A flight contradicts itself, or does not hold what its inlet needs, or hardly ever all of it
+        together.
+    ConfigError
+        The vehicle has rotors that the mixer above an inlet cannot fly.
+    """
+    held_out = settings.job.holdout if holdout is None else holdout
+    return tuple(_assigned(settings, flight, flight.name in held_out) for flight in flights)
+
+
+def with_offsets(
+    recordings: Sequence[Recording], offsets: Mapping[str, float]
+) -> tuple[Recording, ...]:
+    """Return recordings whose clocks are late by known s: flight name -> s."""
+    return tuple(replace(r, time_offset=offsets[r.flight.name]) for r in recordings)
+
+
+def with_conditions(
+    recordings: Sequence[Recording], conditions: Mapping[str, Mapping[str, float]]
+) -> tuple[Recording, ...]:
+    """Return recordings with what is known of their surroundings: flight name -> name -> value."""
+    return tuple(replace(r, conditions=conditions[r.flight.name]) for r in recordings)
+
+
+def with_inputs_late(
+    recordings: Sequence[Recording], late: Mapping[str, float]
+) -> tuple[Recording, ...]:
+    """Return recordings whose inputs are stamped late by known s: flight name -> s."""
+    return tuple(replace(r, input_late=late[r.flight.name]) for r in recordings)
+
+
+def _assigned(settings: Settings, flight: Flight, holdout: bool) -> Recording:
+    job, flight_settings = settings.job, settings.job.flights.get(flight.name)
+    inlet, offset = job.inlet, job.time_offset
+    if flight_settings is not None:
+        inlet = flight_settings.inlet or inlet
+        offset = offset if flight_settings.time_offset is None else flight_settings.time_offset
+    if is_stale(flight.series, flight.notes):
+        raise RecordingError(
+            flight.path,
+            "its attitude stops changing while the vehicle moves on, too soon for a flight",
+            "look at what stopped: the controller, or the logger",
+        )
+    denied = noted_contradiction(flight.notes)
+    if denied is not None:
+        raise RecordingError(
+            flight.path,
+            f"its {denied.names[0]} and its {denied.names[1]} contradict each other (agreement "
+            f"{denied.numbers['agreement']:.2f} of 1)",
+            "look for a time that runs backwards, and at frame and quaternion in the topic map",
+        )
+    flight = flight_in_rotor_order(flight, settings.vehicle)
+    flight = with_speeds_in_si(with_commands(flight, settings.vehicle), settings.vehicle)
+    choice = choose_inlet(flight, inlet, settings.vehicle, settings.controller)
+    chosen = choice.inlet
+    if not INLETS[chosen].closed_loop:
+        seconds = window_seconds([chosen], job.search.window)
+        require_windows(flight, seconds, INLETS[chosen].fed(flight))
+    if INLETS[chosen].has_mixer:
+        check_mixer(settings.vehicle)
+    late = None if offset == "free" else float(offset)
+    return Recording(flight, chosen, late, holdout, because=choice.because)
+
+
+def _as_fitted(
+    recording: Recording, recordings: Sequence[Recording], settings: Settings
+) -> Recording:
+    """Return a held-out flight with its attitude followed where that of all fitted ones is.
+
+    Nothing would be fitted of how it turns.
+    """
+    job, flight = settings.job, recording.flight
+    own = job.flights.get(flight.name)
+    asked = (None if own is None else own.inlet) or job.inlet
+    fitted = {other.inlet for other in recordings if not other.holdout}
+    turns = recording.inlet in FED_BY and fitted == {"attitude"}
+    if not (recording.holdout and asked == "auto" and turns):
+        return recording
+    try:
+        require_windows(flight, window_seconds(["attitude"], job.search.window), ("attitude",))
+    except RecordingError:
+        return recording
+    because = Finding(Code.ATTITUDE_FOLLOWED, "info", flight.name, names=(recording.inlet,))
+    return replace(recording, inlet="attitude", because=because)
+
+
+def _with_reference(flight: Flight, settings: Settings) -> Flight:
+    """Return a flight with the trajectory that the job file names, or else its side-car."""
+    flight_settings = settings.job.flights.get(flight.name)
+    if flight_settings is not None and flight_settings.trajectory is not None:
+        return with_named_reference(flight, flight_settings.trajectory)
+    if flight.trajectory is not None and not flight.has("reference_position"):
+        named = build(TrajectorySettings, flight.trajectory, f"side-car of {flight.path}")
+        return with_named_reference(flight, named)
+    return flight

@@ -1,0 +1,121 @@
+"""A named trajectory as the simulator's reference, as the thesis's publisher would send it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.control.position import ReferencePoint
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.trajectory import TICK_RATE, publish, shapes
+from sim_jax.vector import Vec3
+from tuner.config import TrajectorySettings
+from tuner.core.errors import InputError
+from tuner.recordings.flight import Flight
+
+
+@dataclass(frozen=True)
+class Published:
+    """A reference over a whole flight.
+
+    Attributes
+    ----------
+    inlet
+        What the simulator flies, one point a control tick.
+    lap
+        (ticks,) laps completed at each control tick.
+    """
+
+    inlet: ReferenceInlet
+    lap: NDArray[np.int64]
+
+    @property
+    def start(self) -> Vec3:
+        """The first point, m."""
+        first: Vec3 = jax.tree.map(lambda axis: np.asarray(axis)[0], self.inlet.points.position)
+        return first
+
+    @property
+    def signals(self) -> dict[str, NDArray[np.float64]]:
+        """The reference at each control tick, (ticks, 3) each, in m, m/s and m/s²."""
+        points = self.inlet.points
+        parts = {
+            "reference_position": points.position,
+            "reference_velocity": points.velocity,
+            "reference_acceleration": points.acceleration,
+        }
+        return {n: np.asarray(part.stacked(), dtype=np.float64).T for n, part in parts.items()}
+
+
+def published(settings: TrajectorySettings, *, duration: float, control_rate: float) -> Published:
+    """Return the reference of a trajectory from rest.
+
+    Parameters
+    ----------
+    settings
+        Shape and its numbers.
+    duration
+        s.
+    control_rate
+        Hz of the position controller, which sees the last of the publisher's 100 Hz ticks.
+    """
+    shape = shapes()[settings.name](
+        radius=jnp.asarray(settings.radius), omega=jnp.asarray(settings.omega)
+    )
+    ticks = math.ceil(duration * TICK_RATE) + 1
+    sent = publish(shape, ticks=ticks, velocity_scaler=settings.speed_scale)
+    count = math.ceil(duration * control_rate) + 1
+    seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
+    rows = seen.astype(int)
+    points: ReferencePoint = jax.tree.map(  # numpy's indexing, for jax's takes a program each
+        lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), sent.points
+    )
+    return Published(
+        ReferenceInlet(
+            points,
+            spins=jnp.asarray(shape.spins),
+            yaw_rate=jnp.asarray(settings.yaw_rate if shape.spins else 0.0),
+        ),
+        np.asarray(sent.lap)[rows],
+    )
+
+
+def with_named_reference(flight: Flight, settings: TrajectorySettings) -> Flight:
+    """Return a recording without a reference with that of a named trajectory.
+
+    The publisher is taken to have started with the mission.
+    """
+    sent = published(settings, duration=flight.duration, control_rate=flight.rate)
+    reference = {name: values[: len(flight.time)] for name, values in sent.signals.items()}
+    spins = shapes()[settings.name].spins
+    spin = settings.yaw_rate if spins else flight.yaw_rate_setpoint
+    return replace(flight, signals={**flight.signals, **reference}, yaw_rate_setpoint=spin)
+
+
+def at_speed(settings: TrajectorySettings, speed: float) -> TrajectorySettings:
+    """Return the trajectory with the velocity scaler at which its reference peaks at a speed.
+
+    Parameters
+    ----------
+    settings
+        Shape and its numbers.
+    speed
+        m/s.
+
+    Raises
+    ------
+    InputError
+        The trajectory stays in one place, or the speed is none.
+    """
+    peak = shapes()[settings.name].peak_speed
+    if not peak:
+        raise InputError("--speed", f"{settings.name} stays in one place", "leave it out")
+    scale = speed / (peak * settings.radius * settings.omega)
+    if not 0 < scale < math.inf:
+        raise InputError("--speed", f"{speed:g} m/s is no speed", "give m/s above zero")
+    return settings.replace(speed_scale=scale)

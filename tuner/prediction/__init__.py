@@ -1,1 +1,0 @@
-"""Open-loop predictions of recorded flights: from the recorded state, nothing fitted to them."""

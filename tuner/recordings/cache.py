@@ -1,0 +1,129 @@
+"""The cache of what was read: keyed by content, settings and the readers' own source.
+
+Standard library only, so that a recording seen before is answered before numpy is imported.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import json
+import logging
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from tuner.core.disk import cache_folder, readable
+
+logger = logging.getLogger(__name__)
+
+#: Files above this, in bytes, are not read again only to learn that they are unchanged.
+LARGE = 256 << 20
+#: Together the cached files take no more than this; the longest unused go first.
+ROOM = 2 << 30
+
+
+def own_folder() -> Path:
+    """Return the folder of the cache: ``TUNE_CACHE_DIR``, or the user's own for this program."""
+    named = os.environ.get("TUNE_CACHE_DIR")
+    return Path(named) if named else cache_folder()
+
+
+def digest(path: Path) -> str:
+    """Return the SHA-256 of a file, or of all the files in a folder with their names.
+
+    Raises
+    ------
+    RecordingError
+        A file cannot be read.
+    """
+    with readable(path):
+        return _digest_of(path)
+
+
+def _digest_of(path: Path) -> str:
+    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+    about = [(str(file), file.stat()) for file in files]
+    if sum(stat.st_size for _, stat in about) <= LARGE:
+        return _digest(path, files)
+    # Name, size and time of change stand for the content of what takes seconds to read.
+    parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
+    known = cached("digest", json.dumps(parts))
+    if (known_digest := load(known)) is not None and len(known_digest) == 64:
+        return known_digest.decode()
+    fresh = _digest(path, files)
+    store(known, fresh.encode())
+    return fresh
+
+
+def _digest(path: Path, files: Iterable[Path]) -> str:
+    total = hashlib.sha256()
+    for file in files:
+        if path.is_dir():
+            total.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                total.update(block)
+    return total.hexdigest()
+
+
+@functools.cache
+def readers_version() -> str:
+    """Return a digest of the readers' source and the shipped topic maps: any change reads anew."""
+    here = Path(__file__).resolve().parent
+    package = here.parent
+    maps = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
+    total = hashlib.sha256()
+    for file in sorted([*here.rglob("*.py"), *(maps / "topics").glob("*.yaml")]):
+        total.update(file.read_bytes())
+    return total.hexdigest()
+
+
+def cached(kind: str, *key: str) -> Path:
+    """Return the file in which something with this key is kept."""
+    name = hashlib.sha256("\0".join((readers_version(), kind, *key)).encode()).hexdigest()
+    return own_folder() / kind / f"{name[:40]}"
+
+
+def load(path: Path) -> bytes | None:
+    """Return what is kept in a file of the cache; None where nothing is, or it cannot be read."""
+    try:
+        content = path.read_bytes()
+        path.touch()
+    except OSError:
+        return None
+    return content
+
+
+def store(path: Path, content: bytes) -> None:
+    """Keep something: it appears whole or not at all, and a full disk is no error."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                stream.write(content)
+            Path(name).replace(path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        _make_room()
+    except OSError as err:
+        logger.info("nothing is cached in %s: %s", path.parent, err.strerror)
+
+
+def _make_room() -> None:
+    files = []
+    for file in own_folder().rglob("*"):
+        with contextlib.suppress(OSError):
+            if file.is_file():
+                stat = file.stat()
+                files.append((stat.st_mtime, stat.st_size, file))
+    total = sum(size for _, size, _ in files)
+    for _, size, file in sorted(files, key=lambda entry: entry[0]):
+        if total <= ROOM:
+            break
+        file.unlink(missing_ok=True)
+        total -= size

@@ -1,0 +1,342 @@
+"""What a recording holds: its signals cleaned and on one clock, and the missions in them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from tuner.core.errors import RecordingError
+from tuner.recordings.clean import clean
+from tuner.recordings.contradiction import contradiction
+from tuner.recordings.damage import Damage
+from tuner.recordings.extract import Raw, extract
+from tuner.recordings.flight import Series
+from tuner.recordings.formats import is_tabular, open_recording
+from tuner.recordings.frames import DOUBTS, correct_frames
+from tuner.recordings.locate import (
+    Place,
+    choose_map,
+    locate,
+    require_pose,
+    unread,
+    with_guesses,
+)
+from tuner.recordings.manoeuvres import manoeuvres
+from tuner.recordings.mission import Mission, find_missions
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.recording import Contents, Recording, Samples
+from tuner.recordings.sidecar import Sidecar, sidecar_path
+from tuner.recordings.stale import without_stale
+from tuner.recordings.sync import align_pose
+from tuner.recordings.topics import TopicMap, load_topic_map, shipped_maps
+from tuner.recordings.units import to_si
+from tuner.recordings.yardstick import Stamped, is_too_slow, scales_of, unit_of
+from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_words
+
+PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
+"""Messages that ask PX4's own position control for something."""
+PER_MOTOR = ("command", "rotor_speed")
+"""Signals with a column a motor."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a recording is to be read.
+
+    Attributes
+    ----------
+    topics
+        Topic map, its file, or the name of a shipped one; None takes the shipped map that finds
+        most signals.
+    namespace
+        Prefix of the recorded topics that the map does not have, as ``uav1``.
+    rate
+        Hz of the uniform clock.
+    """
+
+    topics: str | Path | TopicMap | None = None
+    namespace: str = ""
+    rate: float = 100.0
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The signals of a recording, cleaned, before a pose is asked for.
+
+    Attributes
+    ----------
+    recording
+        The file.
+    topic_map
+        The map that was used.
+    places
+        Signal -> where it was found.
+    samples
+        Topic -> its messages as recorded.
+    topics
+        Signal -> topic.
+    series
+        Signal -> cleaned samples, in seconds since the first pose, or the first sample without one.
+    notes
+        What was dropped, repaired or doubted.
+    damage
+        What the file has lost, with times as those of ``series``.
+    """
+
+    recording: Recording
+    topic_map: TopicMap
+    places: Mapping[str, Place]
+    samples: Mapping[str, Samples]
+    topics: Mapping[str, str]
+    series: Mapping[str, Series]
+    notes: tuple[Note, ...]
+    damage: tuple[Damage, ...]
+
+
+@dataclass(frozen=True)
+class Content(Signals):
+    """A recording once read: its signals on one clock and in one frame, and what was flown."""
+
+    missions: tuple[Mission, ...]
+
+
+def read_signals(
+    path: Path,
+    settings: Settings,
+    sidecar: Sidecar,
+    given: TopicMap | None,
+    *,
+    with_pose: bool,
+) -> Signals:
+    """Read and clean all signals that a topic map finds in a recording.
+
+    Parameters
+    ----------
+    path, settings, sidecar, given
+        As of `read_content`.
+    with_pose
+        Whether a recording without a pose is an error.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, or holds no pose though one is asked for.
+    ConfigError
+        The topic map is wrong.
+    """
+    recording = open_recording(path, given.messages if given is not None else ())
+    namespace = settings.namespace or sidecar.namespace
+    candidates = [given] if given is not None else list(shipped_maps())
+    candidates = [candidate.under(namespace) for candidate in candidates]
+    if all(candidate.format != recording.format for candidate in candidates):
+        raise RecordingError(
+            path,
+            f"is read as '{recording.format}', the topic map '{candidates[0].name}' is for "
+            f"'{candidates[0].format}'",
+            "give a map for this format",
+        )
+    chosen = choose_map(recording, candidates)
+    taken: tuple[Note, ...] = ()
+    if given is None:
+        chosen, taken = with_guesses(recording, chosen)
+    places, passed_over = locate(recording, chosen, strict=given is not None)
+    if with_pose:
+        require_pose(recording, chosen, places, given=given is not None)
+    raw, contents, noticed = extract(recording, places, chosen.time)
+    of_map = None if given is None else given.motor_order
+    of_log = motor_order_of(getattr(recording, "parameters", {}))
+    order = sidecar.motor_order or of_map or of_log or chosen.motor_order
+    notes = [
+        Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),
+        *taken,
+        *passed_over,
+        *unread(recording, chosen, places),
+        *_open_unit(places),
+        *_alone(places),
+        *_of_px4(places),
+        *contents.notes,
+        *noticed,
+    ]
+    if is_tabular(recording.format) and not any(clock.unit for clock in chosen.time):
+        raw, quicker = _quickened(raw)
+        notes += quicker
+    if order is not None and set(PER_MOTOR) & set(raw):
+        raw = _in_order(raw, columns_of(order))
+        names = (order_in_words([column + 1 for column in columns_of(order)]),)
+        notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
+    series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
+    topics = {signal: data.topic for signal, data in raw.items()}
+    damage = tuple(part.later(_late(raw, contents, epoch)) for part in contents.damage)
+    notes += dropped
+    return Signals(
+        recording, chosen, places, contents.samples, topics, series, tuple(notes), damage
+    )
+
+
+def _alone(places: Mapping[str, Place]) -> list[Note]:
+    """Note that a pose is all that was recorded."""
+    drives = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
+    alone = {"position", "attitude"} <= set(places) and not set(drives) & set(places)
+    return [Note(NoteCode.POSE_ALONE)] if alone else []
+
+
+def _of_px4(places: Mapping[str, Place]) -> list[Note]:
+    """Note that PX4's own position control flew the reference."""
+    place = places.get("reference_position")
+    if place is None or not place.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
+        return []
+    return [Note(NoteCode.PX4_REFERENCE, "info", place.topic)]
+
+
+def _open_unit(places: Mapping[str, Place]) -> list[Note]:
+    """Note that no map says in which unit rotor speeds are, and what they were taken for."""
+    place = places.get("rotor_speed")
+    if place is None or place.source.unit is not None:
+        return []
+    return [Note(NoteCode.SPEED_UNIT_OPEN, "info", place.topic, names=(place.unit,))]
+
+
+def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
+    """Return the s from the recorder's clock to that of the stamps since some nanoseconds."""
+    first = "position" if "position" in raw else min(raw, default=None)
+    if first is None:
+        return 0.0
+    arrival = contents.samples[raw[first].topic].receive
+    return (float(np.median(raw[first].time)) - float(np.median(arrival)) - epoch) * 1e-9
+
+
+def read_content(
+    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
+) -> Content:
+    """Read a recording up to its missions.
+
+    Parameters
+    ----------
+    path
+        The recording.
+    settings, sidecar
+        How to read it.
+    given
+        The topic map that the user or the side-car names; None tries the shipped ones.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read or holds no pose.
+    ConfigError
+        The topic map is wrong.
+    """
+    signals = read_signals(path, settings, sidecar, given, with_pose=True)
+    topics = signals.topics
+    series, shifted = align_pose(signals.series, topics)
+    series, turned = correct_frames(series, topics)
+    cut, stale = without_stale(series)
+    missions = _missions(cut, sidecar)
+    if stale and not missions:  # read for inspection; a fit leaves such a flight out
+        missions = _missions(series, sidecar)
+    else:
+        series = cut
+    denied = contradiction(series, missions)
+    if denied is not None:  # which says what the doubts of frames are about
+        turned = (*(note for note in turned if note.code not in DOUBTS), denied)
+    notes = (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics))
+    read = vars(signals) | {"series": series, "notes": notes}
+    return Content(**read, missions=missions)
+
+
+def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | None:
+    """Return the topic map that the user or, failing that, the side-car names.
+
+    Raises
+    ------
+    ConfigError
+        It is wrong.
+    """
+    if settings.topics is None and sidecar.topics is not None:
+        return load_topic_map(sidecar.topics, base=sidecar_path(path).parent)
+    if isinstance(settings.topics, str | Path):
+        return load_topic_map(settings.topics)
+    return settings.topics
+
+
+def _in_order(raw: dict[str, Raw], columns: list[int]) -> dict[str, Raw]:
+    """Return signals with a column a motor in PX4's order."""
+    ordered = {
+        name: replace(raw[name], values=raw[name].values[:, columns])
+        for name in PER_MOTOR
+        if name in raw
+    }
+    return {name: ordered.get(name, data) for name, data in raw.items()}
+
+
+def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
+    """Return signals with times a thousandth as long, where gravity says that they are."""
+    if not is_too_slow({name: _stamped(data, 0) for name, data in raw.items()}):
+        return raw, []
+    quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
+    return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
+
+
+def _stamped(data: Raw, epoch: int) -> Stamped:
+    return Stamped(np.asarray((data.time - epoch) * 1e-9, dtype=np.float64), data.values)
+
+
+def _clean(
+    path: Path, raw: Mapping[str, Raw], *, with_pose: bool
+) -> tuple[dict[str, Series], int, list[Note]]:
+    first = [raw["position"]] if "position" in raw else list(raw.values())
+    epoch = min((int(data.time.min()) for data in first), default=0)
+    series, units = {}, list[Note]()
+    notes: dict[tuple[object, ...], Note] = {}
+    recorded = {signal: _stamped(data, epoch) for signal, data in raw.items()}
+    scales = scales_of(recorded)
+    for signal, data in raw.items():
+        seconds, measured = recorded[signal].time, recorded[signal].values
+        if signal in scales:
+            unit, read_so = unit_of(signal, data.topic, scales[signal])
+            measured = to_si(measured, unit)
+            units += [] if read_so is None else [replace(read_so, count=len(seconds))]
+        time, values, dropped = clean(signal, data.topic, seconds, measured)
+        for note in dropped:  # signals of one message lack the same samples
+            alike = (note.code, note.topic, note.count, tuple(note.numbers.items()))
+            before = notes[alike].names if alike in notes else ()
+            notes[alike] = replace(note, names=(*before, *note.names))
+        if len(time):
+            series[signal] = Series(time, values)
+    for needed in ("position", "attitude") if with_pose else ():
+        if needed not in series:
+            where = f" in {raw[needed].topic}" if needed in raw and raw[needed].topic else ""
+            raise RecordingError(path, f"no usable {needed}{where}", "inspect the recording")
+    return series, epoch, [*units, *notes.values()]
+
+
+def _unmeasured(series: Mapping[str, Series], topics: Mapping[str, str]) -> list[Note]:
+    """Note which rotors have no tachometer."""
+    if "rotor_speed" not in series:
+        return []
+    missing = np.flatnonzero(np.isnan(series["rotor_speed"].values).all(axis=0))
+    if len(missing) == 0:
+        return []
+    rotors = tuple(str(rotor) for rotor in missing)
+    topic = topics["rotor_speed"]
+    return [Note(NoteCode.NO_TACHOMETER, "info", topic, count=len(rotors), names=rotors)]
+
+
+def _missions(series: Mapping[str, Series], sidecar: Sidecar) -> tuple[Mission, ...]:
+    missions = manoeuvres(series, find_missions(series))
+    if sidecar.missions is not None:
+        numbers = sidecar.missions
+        missions = tuple(
+            replace(mission, fitted=number in numbers) for number, mission in enumerate(missions, 1)
+        )
+    if sidecar.start is None and sidecar.end is None:
+        return missions
+    pose = series["position"].time
+    start = missions[0].start if missions else float(pose[0])
+    end = missions[-1].end if missions else float(pose[-1])
+    start = start if sidecar.start is None else max(sidecar.start, float(pose[0]))
+    end = end if sidecar.end is None else min(sidecar.end, float(pose[-1]))
+    return (Mission(start, end, "the side-car"),) if end > start else ()

@@ -1,0 +1,159 @@
+"""What a recording becomes: signals on their own clocks and the same signals on one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.recordings.damage import Damage
+from tuner.recordings.notes import Note
+
+Array = NDArray[np.float64]
+
+#: The signals a flight can hold: name -> (number of columns, unit, how it lives between samples).
+#: World is ENU, body is FLU, quaternions are (w, x, y, z) body to world.
+SIGNALS: Mapping[str, tuple[int, str, Literal["linear", "arc", "hold"]]] = {
+    "position": (3, "m", "linear"),
+    "velocity": (3, "m/s", "linear"),
+    "attitude": (4, "", "arc"),
+    "body_rate": (3, "rad/s", "linear"),
+    "acceleration": (3, "m/s^2", "linear"),
+    "rotor_speed": (4, "rad/s", "linear"),
+    "command": (4, "", "hold"),
+    "attitude_setpoint": (4, "", "hold"),
+    "rate_setpoint": (3, "rad/s", "hold"),
+    "thrust_setpoint": (1, "", "hold"),
+    "commanded_thrust": (1, "N", "hold"),
+    "commanded_torque": (3, "N m", "hold"),
+    "reference_position": (3, "m", "hold"),
+    "reference_velocity": (3, "m/s", "hold"),
+    "reference_acceleration": (3, "m/s^2", "hold"),
+    "lap": (1, "", "hold"),
+    "battery_voltage": (1, "V", "linear"),
+}
+
+
+@dataclass(frozen=True)
+class Series:
+    """One recorded signal on its own clock.
+
+    Attributes
+    ----------
+    time
+        (n,) seconds since the start of the mission, strictly increasing; negative before it.
+    values
+        (n, k) in the unit of `SIGNALS`; NaN where a column was not measured (a rotor without
+        tachometer).
+    """
+
+    time: Array
+    values: Array
+
+    def __post_init__(self) -> None:
+        if self.time.ndim != 1 or self.values.ndim != 2 or len(self.time) != len(self.values):
+            raise ValueError(f"time {self.time.shape} and values {self.values.shape} do not match")
+        if len(self.time) > 1 and not np.all(np.diff(self.time) > 0):
+            raise ValueError("time is not strictly increasing")
+
+    @property
+    def rate(self) -> float:
+        """Hz, the median; 0 of a single sample."""
+        return 1.0 / float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
+
+    def between(self, start: float, end: float) -> Series:
+        """Return the samples from one time to another, in s, both included."""
+        inside = (self.time >= start) & (self.time <= end)
+        return Series(self.time[inside], self.values[inside])
+
+
+@dataclass(frozen=True)
+class InitialState:
+    """The vehicle at the start of the mission, smoothed from the recording there.
+
+    Attributes
+    ----------
+    position, velocity
+        (3,) m and m/s, world ENU.
+    attitude
+        (4,) unit quaternion (w, x, y, z), body to world.
+    body_rate
+        (3,) rad/s, body FLU.
+    rotor_speed
+        (4,) rad/s; NaN where it was not measured.
+    command
+        (4,) motor command 0..1; NaN where it was not recorded.
+    """
+
+    position: Array
+    velocity: Array
+    attitude: Array
+    body_rate: Array
+    rotor_speed: Array
+    command: Array
+
+
+@dataclass(frozen=True)
+class Flight:
+    """One mission of one recording.
+
+    Attributes
+    ----------
+    name
+        File name without its suffix.
+    path, sha256
+        Where it came from, and the digest of that content.
+    rate
+        Hz of the uniform clock.
+    time
+        (N,) seconds since the start of the mission, uniform, from 0.
+    signals
+        Signal name -> (N, k) on the uniform clock, NaN where nothing was recorded. Vectors are
+        interpolated linearly, quaternions along the shortest arc, set-points hold.
+    series
+        Signal name -> the cleaned samples on their own stamps, from up to two seconds before the
+        mission to its end.
+    initial
+        The vehicle at time 0.
+    yaw_rate_setpoint
+        rad/s of a yaw spin, recognised by its rate set-points; None for a position mission.
+    level_held
+        Whether roll, pitch and position were controlled during a yaw spin.
+    trajectory
+        Name and parameters of the trajectory from a side-car, where no reference was recorded.
+    notes
+        What was dropped, repaired or doubted.
+    damage
+        What the file has lost, if it is broken; the flight is what was salvaged.
+    """
+
+    name: str
+    path: str
+    sha256: str
+    rate: float
+    time: Array
+    signals: Mapping[str, Array]
+    series: Mapping[str, Series]
+    initial: InitialState
+    yaw_rate_setpoint: float | None = None
+    level_held: bool = False
+    trajectory: Mapping[str, object] | None = None
+    notes: tuple[Note, ...] = ()
+    damage: tuple[Damage, ...] = ()
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the start of the mission to the last sample of the uniform clock."""
+        return float(self.time[-1])
+
+    @property
+    def spins_freely(self) -> bool:
+        """Whether it is a yaw spin in which nothing holds position, roll and pitch."""
+        return self.yaw_rate_setpoint is not None and not self.level_held
+
+    def has(self, signal: str) -> bool:
+        """Return whether any sample of a signal was recorded."""
+        return signal in self.signals and bool(np.isfinite(self.signals[signal]).any())

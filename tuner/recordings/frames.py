@@ -1,0 +1,213 @@
+"""Axes and orders that a topic map has wrong: noticed because the motion contradicts itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tuner.core.numerics import GRAVITY
+from tuner.recordings.flight import Array, Series
+from tuner.recordings.motion import (
+    alike,
+    body_rate_of,
+    derivative,
+    on_clock,
+    rms,
+    rotate,
+    smooth,
+    stretch,
+)
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.units import to_enu_flu
+
+#: Notes of what fits no reading.
+DOUBTS = (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED, NoteCode.VELOCITY_DOUBTED)
+#: Motion below these, in m/s^2, rad/s and m/s, contradicts nothing.
+ENOUGH_PUSH = 0.3
+ENOUGH_TURNING = 0.1
+ENOUGH_SPEED = 0.2
+#: Agreement that is believed without a look at alternatives, and how much better one must be.
+GOOD = 0.6
+BETTER = 0.3
+#: What a further misreading must bring to be preferred.
+UNLIKELY = 0.05
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another way to read recorded numbers, and its name in a sentence."""
+
+    name: str
+    read: Callable[[Array], Array]
+
+
+_Judgement = tuple[Reading | None, Note | None]
+"""How else to read what was recorded, or else what is doubted."""
+
+
+def _scalar_last(q: Array) -> Array:
+    return q[:, [3, 0, 1, 2]]
+
+
+def _inverse(q: Array) -> Array:
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
+
+
+#: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
+ATTITUDE_READINGS = (
+    Reading("scalar-last", _scalar_last),
+    Reading("world to body", _inverse),
+    Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
+    Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+)
+_DEGREES = np.pi / 180
+_RATES = (
+    Reading("in FRD axes", lambda w: to_enu_flu(w, "body_rate")),
+    Reading("in degrees per second", lambda w: w * _DEGREES),
+    Reading("in FRD axes and degrees", lambda w: to_enu_flu(w, "body_rate") * _DEGREES),
+)
+
+
+def correct_frames(
+    series: Mapping[str, Series], topics: Mapping[str, str]
+) -> tuple[dict[str, Series], tuple[Note, ...]]:
+    """Return the series with misread attitude, body rate and velocity read rightly.
+
+    A multirotor accelerates where its thrust points, so the attitude must tilt towards the
+    acceleration of the position, and carry the accelerometer's reading upwards; its change must be
+    the body rate; the position's change the velocity. A reading that fails is exchanged for the one
+    that passes, with a warning; where none passes, a warning says so.
+    """
+    fixed = dict(series)
+    notes: list[Note] = []
+    if not {"position", "attitude"} <= set(series):
+        return fixed, ()
+    clock = stretch(series)
+    if len(clock) < 200:
+        return fixed, ()
+
+    def apply(signal: str, reading: Reading | None, doubt: Note | None) -> None:
+        topic = topics.get(signal, signal)
+        if reading is not None:
+            measured = fixed[signal]
+            values = reading.read(measured.values)
+            known = np.isfinite(values).all(axis=1)
+            fixed[signal] = Series(measured.time[known], values[known])
+            count, names = len(measured.time), (signal, reading.name)
+            notes.append(Note(NoteCode.FRAME_TURNED, topic=topic, count=count, names=names))
+        elif doubt is not None:
+            notes.append(replace(doubt, topic=topic))
+
+    apply("attitude", *_judge_attitude(fixed, clock))
+    if "body_rate" in fixed:
+        apply("body_rate", *_judge_rate(fixed, clock))
+    if "velocity" in fixed:
+        apply("velocity", *_judge_velocity(fixed, clock))
+    if {"rate_setpoint", "body_rate"} <= set(fixed):
+        apply("rate_setpoint", _judge_setpoint(fixed, clock), None)
+    return fixed, tuple(notes)
+
+
+def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
+    q = on_clock(series, "attitude", clock)
+    position = smooth(on_clock(series, "position", clock), 0.2)
+    push = smooth(derivative(smooth(derivative(position), 0.2)), 0.2)
+    gyro = on_clock(series, "body_rate", clock) if "body_rate" in series else None
+    force = on_clock(series, "acceleration", clock) if "acceleration" in series else None
+
+    def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
+        """Return how well a reading fits the motion, and how upright it flies."""
+        turned = reading(q)
+        up = rotate(turned, np.tile([0.0, 0.0, 1.0], (len(turned), 1)))
+        scores = []
+        if rms(push[:, :2]) > ENOUGH_PUSH:
+            scores.append(alike(smooth(up[:, :2], 0.2), push[:, :2]))
+        if gyro is not None and rms(gyro) > ENOUGH_TURNING:
+            # The gyro's own axes may be wrong too, though two errors are less likely than one.
+            turning = smooth(body_rate_of(turned))
+            in_flu = alike(turning, smooth(gyro))
+            in_frd = alike(turning, smooth(_RATES[0].read(gyro)))
+            scores.append(max(in_flu, in_frd - UNLIKELY))
+        carried = up if force is None else rotate(turned, force) / GRAVITY
+        upright = float(np.nanmean(carried[:, 2]))
+        return (min(scores) if scores else 1.0), upright
+
+    fit, upright = agreement(lambda values: values)
+    if fit > GOOD and upright > 0.5:
+        return None, None
+    worth = [_worth(*agreement(r.read)) - UNLIKELY * i for i, r in enumerate(ATTITUDE_READINGS)]
+    best = ATTITUDE_READINGS[int(np.argmax(worth))]
+    best_fit, best_upright = agreement(best.read)
+    better = _worth(best_fit, best_upright) > _worth(fit, upright) + BETTER
+    if better and best_fit > GOOD and best_upright > 0.5:
+        return best, None
+    if fit < 0.2 or upright < 0.5:
+        numbers = {"agreement": fit, "upright": upright}
+        return None, Note(NoteCode.ATTITUDE_DOUBTED, numbers=numbers)
+    return None, None
+
+
+def _worth(fit: float, upright: float) -> float:
+    return fit + min(upright, 1.0)
+
+
+def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
+    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)))
+    gyro = smooth(on_clock(series, "body_rate", clock))
+    if min(rms(turning), rms(gyro)) < ENOUGH_TURNING:
+        return None, None
+
+    def mismatch(rates: Array) -> float:
+        """Return the part of the turning that is left when a reading of the gyro is taken off."""
+        known = np.isfinite(turning).all(axis=1) & np.isfinite(rates).all(axis=1)
+        return rms((turning - rates)[known]) / rms(turning[known])
+
+    here = mismatch(gyro)
+    best = min(_RATES, key=lambda r: mismatch(r.read(gyro)))
+    there = mismatch(best.read(gyro))
+    of_another_unit = there < here / 20 and alike(turning, best.read(gyro)) > GOOD
+    if (there < 0.7 and there < here / 2) or of_another_unit:
+        return best, None
+    doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
+    return None, doubt if here > 0.9 else None
+
+
+def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | None:
+    """Return how else to read rate set-points, which a vehicle's body rate follows."""
+    rate = smooth(on_clock(series, "body_rate", clock))
+    wanted = smooth(on_clock(series, "rate_setpoint", clock))
+    if min(rms(rate), rms(wanted)) < ENOUGH_TURNING:
+        return None
+
+    def mismatch(setpoints: Array) -> float:
+        known = np.isfinite(rate).all(axis=1) & np.isfinite(setpoints).all(axis=1)
+        return rms((setpoints - rate)[known]) / rms(rate[known])
+
+    best = min(_RATES, key=lambda r: mismatch(r.read(wanted)))
+    there, here = mismatch(best.read(wanted)), mismatch(wanted)
+    return best if there < GOOD and there < here / 3 else None
+
+
+def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
+    moving = smooth(derivative(on_clock(series, "position", clock)), 0.1)
+    velocity = smooth(on_clock(series, "velocity", clock), 0.1)
+    if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
+        return None, None
+    fit = alike(moving, velocity)
+    if fit > 0.8:
+        return None, None
+    measured = series["velocity"]
+    at_samples = on_clock(series, "attitude", measured.time)
+
+    in_body = Reading("in body axes", lambda _: rotate(at_samples, measured.values))
+    ned = Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
+    fits = {
+        in_body: alike(moving, rotate(on_clock(series, "attitude", clock), velocity)),
+        ned: alike(moving, to_enu_flu(velocity, "velocity")),
+    }
+    best = max(fits, key=lambda r: fits[r])
+    if fits[best] > max(0.8, fit + 0.15):
+        return best, None
+    return None, Note(NoteCode.VELOCITY_DOUBTED, numbers={"agreement": fit})

@@ -1,0 +1,276 @@
+"""MATLAB files: arrays, and structures of arrays, as the columns of a table.
+
+``mocap.t``, ``mocap.pos`` (n x 3) and ``imu.t``, ``imu.gyro`` make the columns ``mocap.pos[0]`` and
+so on, each with the time of its own structure: the table has a row for every stamp of each. scipy
+reads what ``save`` writes by default, h5py the files of version 7.3.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tuner.core.errors import RecordingError
+from tuner.recordings.columns import guess
+from tuner.recordings.flight import Array
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.recording import ROWS, Clock, Contents, Request, Samples, TabularRecording
+from tuner.recordings.times import NEVER, UNIT_NAMES, read_times
+
+MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
+#: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
+LARGEST, MOST_ARRAYS = 1 << 30, 4000
+#: Columns of a matrix that is taken for signals side by side.
+WIDEST = 32
+#: Structures inside structures.
+DEEPEST = 8
+#: The column that stands for the time of every structure, where several have one of their own.
+TIME = "*.time"
+
+
+class MatlabTable(TabularRecording):
+    """Arrays of one or several structures.
+
+    Raises
+    ------
+    RecordingError
+        It is no readable file, or holds no columns.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as stream:
+            newer = stream.read(len(MAGIC_7_3)) == MAGIC_7_3
+        content = _load_hdf5(path) if newer else _load(path)
+        self._columns = dict(_columns("", content, 0))
+        if not self._columns:
+            raise RecordingError(
+                path,
+                "holds no numeric columns (timeseries and tables are objects, which only MATLAB "
+                "reads)",
+                "save arrays, or a structure of arrays",
+            )
+        self._times = {name: _time_of(name, self._columns) for name in self._columns}
+        clocks = {time for time in self._times.values() if time is not None}
+        columns = [*([TIME] if len(clocks) > 1 else []), *self._columns]
+        super().__init__(path, "table", columns)
+        whole = [name for name, value in content.items() if _is_matrix(value)]
+        if len(whole) == 1 and len(self._columns) > 1 and not clocks:
+            name, count = whole[0], len(self._columns)
+            remedy = (
+                f"name them in a topic map (--topics FILE): time: '{name}[0]', and under signals "
+                f"position: ['{name}[1]', '{name}[2]', '{name}[3]'], and so on"
+            )
+            what = f"holds the bare matrix '{name}' of {count} columns, which have no names"
+            self.obstacle = (what, remedy)
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted columns, each at the times of its own structure."""
+        if ROWS not in wanted:
+            return Contents({})
+        request = wanted[ROWS]
+        clock = self.clock(request)
+        groups: dict[str, list[str]] = {}
+        for name in request.fields:
+            time = self._times.get(name) if clock.field == TIME else clock.field
+            if time is not None and len(self._columns[time]) == len(self._columns[name]):
+                groups.setdefault(time, []).append(name)
+        parts, notes = [], []
+        for field, names in groups.items():
+            part, note = self._part(Clock(field=field, unit=clock.unit), names, request.fields)
+            parts.append(part)
+            notes += note
+        if not parts:
+            raise RecordingError(
+                self.path, f"has no column as long as '{clock.field}'", "name another time"
+            )
+        stamps = np.concatenate([part.receive for part in parts])
+        fields = {n: np.concatenate([part.fields[n] for part in parts]) for n in request.fields}
+        return Contents({ROWS: Samples(stamps, stamps, fields)}, tuple(notes))
+
+    def _part(
+        self, clock: Clock, names: list[str], fields: tuple[str, ...]
+    ) -> tuple[Samples, list[Note]]:
+        """Return the rows of one structure, NaN in the columns of the others."""
+        import pyarrow  # noqa: PLC0415 (a third of a second)
+
+        stamps = self._columns[clock.field]
+        column = pyarrow.chunked_array([pyarrow.array(stamps)])
+        held = {name: self._columns[name] for name in names}
+        time, unit = read_times(self.path, column, clock, held.values())
+        known, nothing = time != NEVER, np.full(len(time), np.nan)
+        notes = []
+        if unit is not None and unit != "s":
+            said = (clock.field, UNIT_NAMES[unit])
+            notes.append(Note(NoteCode.UNIT_READ, topic=ROWS, count=len(time), names=said))
+        values = {name: held.get(name, nothing)[known] for name in fields}
+        return Samples(time[known], time[known], values), notes
+
+
+def _load(path: Path) -> Mapping[str, Any]:
+    """Read a file of version 5 to 7."""
+    from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
+
+    data = path.read_bytes() if path.stat().st_size <= LARGEST else b""
+    if not data or _unpacked(data) > LARGEST:
+        raise RecordingError(path, "is larger than any recording of a flight", "cut it")
+    if _arrays(data) > MOST_ARRAYS:
+        raise RecordingError(
+            path, f"holds more than {MOST_ARRAYS} arrays", "save each signal as one array"
+        )
+    try:
+        return dict(loadmat(io.BytesIO(data), simplify_cells=True))
+    except Exception as err:  # whatever a hostile file makes of the library
+        reason = " ".join(str(err).split())[:120]
+        raise RecordingError(
+            path, f"is no readable MATLAB file ({reason})", "save it again"
+        ) from None
+
+
+def _unreadable(path: Path, err: Exception) -> RecordingError:
+    reason = " ".join(str(err).split())[:120]
+    return RecordingError(path, f"is no readable MATLAB file ({reason})", "save it again")
+
+
+def _packed(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield kind and content of the elements of a file."""
+    order = "little" if data[126:128] == b"IM" else "big"
+    at = 128
+    while at + 8 <= len(data):
+        kind = int.from_bytes(data[at : at + 4], order)  # type: ignore[arg-type]
+        size = int.from_bytes(data[at + 4 : at + 8], order)  # type: ignore[arg-type]
+        yield kind, data[at + 8 : at + 8 + size]
+        at += 8 + size
+
+
+_COMPRESSED = 15
+
+
+def _inflated(content: bytes) -> bytes:
+    try:
+        return zlib.decompressobj().decompress(content, LARGEST + 1)
+    except zlib.error:
+        return b""
+
+
+def _unpacked(data: bytes) -> int:
+    """Return how many bytes a file has, unpacked, up to a little over `LARGEST`."""
+    total = len(data)
+    for kind, content in _packed(data):
+        if kind != _COMPRESSED:
+            continue
+        unpacking, left = zlib.decompressobj(), content
+        while left and total <= LARGEST:
+            try:
+                total += len(unpacking.decompress(left, 1 << 20))
+            except zlib.error:
+                break
+            left = unpacking.unconsumed_tail
+    return total
+
+
+def _arrays(data: bytes) -> int:
+    """Return at least how many arrays a file holds, those inside others too."""
+    tags = b"\x0e\0\0\0", b"\0\0\0\x0e"
+    return sum(
+        part.count(tag)
+        for kind, content in _packed(data)
+        for part in (_inflated(content) if kind == _COMPRESSED else content,)
+        for tag in tags
+    )
+
+
+def _load_hdf5(path: Path) -> Mapping[str, Any]:
+    """Read a file of version 7.3, which is HDF5."""
+    try:
+        import h5py  # noqa: PLC0415 (an extra)
+    except ImportError:
+        raise RecordingError(
+            path,
+            "is a MATLAB file of version 7.3, which needs h5py",
+            "install multirotor-tune[matlab], or save it with '-v7'",
+        ) from None
+    try:
+        with h5py.File(path, "r") as file:
+            return _of_group(h5py, file, [0], 0)
+    except RecordingError:
+        raise
+    except Exception as err:  # whatever a hostile file makes of the library
+        reason = " ".join(str(err).split())[:120]
+        raise RecordingError(
+            path, f"is no readable MATLAB file ({reason})", "save it again"
+        ) from None
+
+
+def _of_group(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:
+    """Return the arrays of a group that lie in the file itself."""
+    held: dict[str, Any] = {}
+    for name in list(group)[:MOST_ARRAYS] if depth < DEEPEST else ():
+        if name.startswith("#") or not isinstance(group.get(name, getlink=True), h5py.HardLink):
+            continue
+        item = group[name]
+        if isinstance(item, h5py.Group):
+            held[name] = _of_group(h5py, item, read, depth + 1)
+            continue
+        own = not item.is_virtual and not item.external
+        if own and item.dtype.kind in "fiu" and item.attrs.get("MATLAB_class") != b"char":
+            read[0] += item.size * 8
+            if read[0] > LARGEST:
+                raise RecordingError(
+                    Path(group.file.filename), "is larger than any recording of a flight", "cut it"
+                )
+            held[name] = np.asarray(item).T
+    return held
+
+
+def _columns(prefix: str, value: Any, depth: int) -> Iterator[tuple[str, Array]]:
+    """Yield the numeric columns of a structure, by name."""
+    if isinstance(value, Mapping):
+        label = value.get("label")
+        for name, of in value.items() if depth < DEEPEST else ():
+            if not str(name).startswith("__"):
+                # what Simulink calls a signal stands beside its values
+                own = label if name == "values" and isinstance(label, str) and label else name
+                yield from _columns(f"{prefix}.{own}" if prefix else str(own), of, depth + 1)
+    elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
+        for of in list(value)[:WIDEST] if depth < DEEPEST else ():  # what Simulink calls signals
+            yield from _columns(prefix, of, depth + 1)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
+        if 1 in value.shape or value.ndim == 1:
+            yield prefix, np.asarray(value.ravel(), dtype=np.float64)
+        elif _is_matrix(value):
+            table = value if value.shape[0] > value.shape[1] else value.T
+            for i, column in enumerate(table.T):
+                yield f"{prefix}[{i}]", np.asarray(column, dtype=np.float64)
+
+
+def _is_matrix(value: object) -> bool:
+    return (
+        isinstance(value, np.ndarray)
+        and value.ndim == 2
+        and value.dtype.kind in "fiu"
+        and 1 < min(value.shape) <= WIDEST < max(value.shape)
+    )
+
+
+def _time_of(name: str, columns: Mapping[str, Array]) -> str | None:
+    """Return the time column of the same length in a column's structure, or in the next around."""
+    count = len(columns[name])
+    times = [
+        time
+        for time, values in columns.items()
+        if len(values) == count
+        and (known := guess(time.rpartition(".")[2])) is not None
+        and known.signal == "time"
+    ]
+    around = name
+    while around:
+        around = around.rpartition(".")[0]
+        near = [time for time in times if time.rpartition(".")[0] == around]
+        if near:
+            return near[0]
+    return times[0] if times else None

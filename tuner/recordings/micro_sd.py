@@ -1,0 +1,218 @@
+"""Crazyflie micro-SD logs: the firmware's uSD deck writes named variables, event by event.
+
+A file is one byte 0xBC; the version (1 or 2) and the number of event types, two bytes each; for
+each event type its number, its name and its variables, every one a name with the code of its type
+behind it, as ``acc.x(f)``; then the records, each the number of its event, a time stamp (version 1:
+ms in four bytes, version 2: microseconds in eight) and its variables; last a CRC-32. All is little
+endian. Source: the firmware's ``usddeck.c`` and its ``cfusdlog.py``.
+"""
+
+from __future__ import annotations
+
+import zlib
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.errors import RecordingError
+from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.recording import NANOSECONDS, Contents, Request, Samples, Topic, Usual
+
+MAGIC = 0xBC
+#: Logs are read into memory; a kilohertz of ten variables is 3 MB a minute.
+LARGEST = 128 << 20
+#: Bytes of the CRC at the end.
+CHECKSUM = 4
+#: No firmware logs more at once.
+MOST_EVENTS, MOST_VARIABLES, LONGEST_NAME = 256, 512, 256
+#: Code of a type -> NumPy's.
+TYPES = {
+    "b": "<i1",
+    "B": "<u1",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "q": "<i8",
+    "Q": "<u8",
+    "e": "<f2",
+    "f": "<f4",
+    "d": "<f8",
+}
+_STAMPS = {1: ("<u4", NANOSECONDS["ms"]), 2: ("<u8", NANOSECONDS["us"])}
+
+
+@dataclass(frozen=True)
+class _Event:
+    """One event type: its name, and how its records lie in the file."""
+
+    name: str
+    layout: np.dtype[np.void]
+
+
+class MicroSdRecording:
+    """A micro-SD log; every event type is a topic, every variable a field.
+
+    Raises
+    ------
+    RecordingError
+        The file is no readable log.
+    """
+
+    format = "micro_sd"
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if path.stat().st_size > LARGEST:
+            raise RecordingError(path, "is larger than any log of a flight", "cut it")
+        self._data = path.read_bytes()
+        header = _Header(path, self._data)
+        self._events, self._unit = header.events(), header.unit
+        self._whole = _crc_is_right(self._data)
+        end = len(self._data) - (CHECKSUM if self._whole else 0)
+        self._offsets, self._reached = _records(self._data, header.at, end, self._events)
+        self._lost = end - self._reached
+        self.topics = tuple(
+            Topic(event.name, "log", len(self._offsets[number]))
+            for number, event in self._events.items()
+        )
+
+    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
+        """Return None: users choose the variables of a log."""
+        return None
+
+    def fields(self, topic: str) -> list[str]:
+        """Return the variables of an event."""
+        return [
+            name
+            for event in self._events.values()
+            if event.name == topic
+            for name in event.layout.names or ()
+            if name not in _OWN
+        ]
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return those of some variables that an event does not have."""
+        known = self.fields(topic)
+        return tuple(name for name in fields if name not in known)
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted variables of some events."""
+        samples = {
+            event.name: self._samples(number, event, wanted[event.name])
+            for number, event in self._events.items()
+            if event.name in wanted
+        }
+        return Contents(samples, damage=self._damage())
+
+    def _damage(self) -> tuple[Damage, ...]:
+        """Return what the checksum and the end of the file give away."""
+        if self._whole and not self._lost:
+            return ()
+        if self._whole or self._lost == CHECKSUM:  # whole records, which are not as written
+            return (Damage(Cause.LOG_DAMAGED),)
+        return (Damage(Cause.END_MISSING, bytes_lost=self._lost),)
+
+    def _samples(self, number: int, event: _Event, request: Request) -> Samples:
+        missing = self.lacking(event.name, request.fields)
+        if missing:
+            raise RecordingError(
+                self.path, f"{event.name} has no variable '{missing[0]}'", "correct the topic map"
+            )
+        size = event.layout.itemsize
+        places = np.frombuffer(self._offsets[number], dtype=np.uint32).astype(np.intp)
+        data = np.frombuffer(self._data, dtype=np.uint8)
+        rows = data[places[:, None] + np.arange(size)].reshape(-1).view(event.layout)
+        latest = np.uint64(np.iinfo(np.int64).max // self._unit)
+        time = np.minimum(rows[_STAMP].astype(np.uint64), latest).astype(np.int64) * self._unit
+        fields = {name: _numbers(rows[name]) for name in request.fields}
+        return Samples(time, time, fields)
+
+
+#: Fields of every record that are no variables; a space is in no variable's name.
+_NUMBER, _STAMP = " number", " stamp"
+_OWN = {_NUMBER, _STAMP}
+
+
+class _Header:
+    """The part of a log before its records, read from left to right."""
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self._path, self._data, self.at = path, data, 1
+        version, self._count = self._whole_number(), self._whole_number()
+        if data[0] != MAGIC or version not in _STAMPS:
+            raise RecordingError(
+                path, f"is a micro-SD log of version {version}", "known are versions 1 and 2"
+            )
+        self._stamp, self.unit = _STAMPS[version]
+
+    def events(self) -> dict[int, _Event]:
+        """Read the event types: number -> event."""
+        if not 0 < self._count <= MOST_EVENTS:
+            raise self._absurd(f"{self._count} event types")
+        events = {}
+        for _ in range(self._count):
+            number, name, count = self._whole_number(), self._name(), self._whole_number()
+            if count > MOST_VARIABLES:
+                raise self._absurd(f"{count} variables")
+            names, formats = [_NUMBER, _STAMP], ["<u2", self._stamp]
+            for _ in range(count):
+                variable, _, code = self._name().removesuffix(")").rpartition("(")
+                if code not in TYPES or not variable or variable in names:
+                    raise self._absurd(f"the variable '{variable[:40]}'")
+                names.append(variable)
+                formats.append(TYPES[code])
+            if number in events:
+                raise self._absurd(f"two event types {number}")
+            events[number] = _Event(name, np.dtype({"names": names, "formats": formats}))
+        if len({event.name for event in events.values()}) < len(events):
+            raise self._absurd("two event types of one name")
+        return events
+
+    def _whole_number(self) -> int:
+        part = self._data[self.at : self.at + 2]
+        if len(part) < 2:
+            raise self._absurd("an end inside it")
+        self.at += 2
+        return int.from_bytes(part, "little")
+
+    def _name(self) -> str:
+        end = self._data.find(b"\0", self.at, self.at + LONGEST_NAME)
+        if end < 0:
+            raise self._absurd("a name without an end")
+        name, self.at = self._data[self.at : end].decode(errors="replace"), end + 1
+        return "".join(letter if letter.isprintable() else "�" for letter in name)
+
+    def _absurd(self, what: str) -> RecordingError:
+        return RecordingError(
+            self._path, f"is no readable micro-SD log: its header has {what}", "record it again"
+        )
+
+
+def _crc_is_right(data: bytes) -> bool:
+    return zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
+
+
+def _records(
+    data: bytes, at: int, end: int, events: Mapping[int, _Event]
+) -> tuple[dict[int, array[int]], int]:
+    """Return where the records of each event begin, and the place behind the last whole one."""
+    sizes = {number: event.layout.itemsize for number, event in events.items()}
+    places = {number: array("I") for number in events}
+    while at + 2 <= end:
+        number = data[at] | data[at + 1] << 8
+        size = sizes.get(number)
+        if size is None or at + size > end:
+            break
+        places[number].append(at)
+        at += size
+    return places, at
+
+
+def _numbers(column: NDArray[np.generic]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):  # a signalling NaN of a damaged log
+        return column.astype(np.float64)

@@ -1,0 +1,276 @@
+"""The missions in a recording: where each starts and ends, and whether it is a yaw spin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from tuner.recordings.flight import Array, Series
+
+#: Reference motion below this, in m or m/s, is a reference at rest.
+AT_REST = 1e-5
+#: Set-points that pause for longer, in s, begin another mission.
+PAUSE = 1.0
+#: A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer.
+MOMENT = 0.2
+#: A shorter stretch, in s, is no mission.
+SHORTEST = 2.0
+#: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
+#: not above `CARRIES` of what carries the vehicle in the air, nor below what is off.
+IDLE = 0.12
+IDLE_SPEED = 80.0
+CARRIES = 0.5
+OFF = 0.02
+OFF_SPEED = 20.0
+#: Higher above the ground than this, in m, the vehicle flies.
+CLEAR = 0.12
+#: What stays within this, in m, for a second rests.
+RESTS = 0.01
+#: s of which one mean position is taken.
+BIN = 0.1
+#: Set-points that begin this soon after the pose, in s, ran all the time.
+FROM_THE_START = 0.5
+
+
+@dataclass(frozen=True)
+class Mission:
+    """A stretch of a recording that is flown and compared.
+
+    Attributes
+    ----------
+    start, end
+        Seconds in the time of the series.
+    begins_with
+        What marks its start, for the report.
+    fitted
+        Whether it is fitted: of a long recording only the manoeuvres that show most are.
+    """
+
+    start: float
+    end: float
+    begins_with: str
+    fitted: bool = True
+
+
+def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
+    """Return the missions in the order of flight; empty where nothing flies.
+
+    A mission starts where the attitude set-points begin. Where they run from the start, or where
+    there are none, it starts where the reference begins to move or, without a reference, in the
+    air. What stands on the ground, take-off's first and landing's last centimetres are cut, and
+    so is what follows the last attitude.
+    """
+    pose = series["position"].time
+    first, last = float(pose[0]), float(pose[-1])
+    if "attitude" in series and series["attitude"].time[-1] < last - PAUSE:
+        last = float(series["attitude"].time[-1])
+    flying = airborne(series)
+    setpoints = next((series[n] for n in ("rate_setpoint", "thrust_setpoint") if n in series), None)
+    missions = []
+    if setpoints is not None and len(setpoints.time) > 1:
+        spans = stretches(setpoints.time, np.ones(len(setpoints.time), np.bool_), bridged=PAUSE)
+        whole = len(spans) == 1 and spans[0][0] < first + FROM_THE_START
+        if not whole:
+            for start, end in spans:
+                for up, down in flying:
+                    if start < up:  # they began on the ground
+                        begin, begins_with = _motion_or_flight(series, up, min(end, down))
+                    else:
+                        begin, begins_with = start, "attitude set-points"
+                    missions.append(Mission(begin, min(end, down, last), begins_with))
+            return _long_enough(missions)
+        flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
+    for up, down in flying:
+        begin, begins_with = _motion_or_flight(series, up, down)
+        end = min(down, last, _reference_end(series, last))
+        missions.append(Mission(begin, end, begins_with))
+    return _long_enough(missions)
+
+
+def _motion_or_flight(series: Mapping[str, Series], up: float, down: float) -> tuple[float, str]:
+    moves = _first_motion(series, up, down)
+    return (moves, "the reference's motion") if moves > up else (up, "flight")
+
+
+def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
+    return tuple(m for m in missions if m.end - m.start >= SHORTEST)
+
+
+def _reference_end(series: Mapping[str, Series], last: float) -> float:
+    return float(series["reference_position"].time[-1]) if "reference_position" in series else last
+
+
+def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
+    """Return when the reference begins to move within a stretch; its start if it does not."""
+    firsts = []
+    for name in ("reference_position", "reference_velocity"):
+        if name not in series:
+            continue
+        samples = series[name]
+        inside = np.flatnonzero((samples.time >= start) & (samples.time <= end))
+        if len(inside) == 0:
+            continue
+        values = samples.values[inside]
+        known = np.isfinite(values).all(axis=1)
+        if not known.any():
+            continue
+        moving = np.abs(values - values[known][0]).max(axis=1) > AT_REST
+        if (moving & known).any():
+            firsts.append(float(samples.time[inside[np.argmax(moving & known)]]))
+    return min(firsts, default=start)
+
+
+def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
+    """Return the stretches in which the rotors carry the vehicle.
+
+    The ground is known where motors were seen idle, or where the recording begins or ends at rest
+    and the vehicle climbs away from there; a recording that shows no ground is all in the air. One
+    that comes as low in flight as where it only seemed to stand, or whose motors stop for a moment,
+    flies on.
+    """
+    position = series["position"]
+    time, height = position.time, position.values[:, 2]
+    rests = _rests(time, position.values)
+    idle, observed = _idle(series, time, height)
+    stands = _lasting(time, idle, rests)
+    grounded = stands | (_resting(time, height) & rests & ~observed)
+    if not grounded.any():
+        return [(float(time[0]), float(time[-1]))]
+    low = grounded | ~(height > _ground(time, height, grounded) + CLEAR)
+    if not stands.any():  # the ground is a guess, and what passes it without a rest flies
+        for first, last in _runs(low):
+            low[first:last] = (grounded | rests)[first:last].any()
+    return stretches(time, ~low)
+
+
+def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return where each run of true flags begins, and behind its end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
+    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
+
+
+def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
+    """Return at which of n times the (n, 3) positions of a second around stay where they are."""
+    bins = ((time - time[0]) / BIN).astype(np.int64)
+    held, place = np.unique(bins, return_inverse=True)
+    counts = np.bincount(place)
+    spread = np.zeros(len(held))
+    window = round(1.0 / BIN)
+    for column in positions.T:
+        means = np.bincount(place, column) / counts
+        reach = maximum_filter1d(means, window) - minimum_filter1d(means, window)
+        spread = np.maximum(spread, reach)
+    return np.asarray((spread < RESTS)[place], dtype=np.bool_)
+
+
+def _lasting(time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return where motors idle, but for moments inside a flight in which the vehicle moves on."""
+    lasting = idle.copy()
+    for first, last in _runs(idle):
+        inside = first > 0 and last < len(time)
+        if inside and time[last - 1] - time[first] < PAUSE and not rests[first:last].any():
+            lasting[first:last] = False
+    return lasting
+
+
+def _idle(
+    series: Mapping[str, Series], time: Array, height: Array
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return at which times the motors idle, and at which times that was recorded."""
+    clear = height > float(np.quantile(height, 0.02)) + 3 * CLEAR
+    for name, limit, off in (
+        ("command", IDLE, OFF),
+        ("rotor_speed", IDLE_SPEED, OFF_SPEED),
+        ("thrust_setpoint", IDLE, OFF),
+    ):
+        if name in series and len(series[name].time) > 1:
+            samples = series[name]
+            known = np.isfinite(samples.values).any(axis=1)
+            if not known.any():
+                continue
+            at = np.interp(time, samples.time[known], np.nanmean(samples.values[known], axis=1))
+            observed = (time >= samples.time[0] - MOMENT) & (time <= samples.time[-1] + MOMENT)
+            flown = at[clear & observed]
+            carries = CARRIES * float(np.median(flown)) if len(flown) else limit
+            idle: NDArray[np.bool_] = np.asarray(at < max(off, min(limit, carries)))
+            return observed & idle, observed
+    nothing = np.zeros(len(time), dtype=np.bool_)
+    return nothing, nothing
+
+
+def _resting(time: Array, height: Array) -> NDArray[np.bool_]:
+    """Return when the vehicle lies on the ground from which, or to which, it flies."""
+    resting = np.zeros(len(time), dtype=np.bool_)
+    for near in (time < time[0] + 1.0, time > time[-1] - 1.0):
+        level = float(np.median(height[near]))
+        still = float(np.ptp(height[near])) < 0.01
+        lowest = level < float(np.quantile(height, 0.02)) + 0.03
+        if still and lowest and float(np.quantile(height, 0.9)) - level > 3 * CLEAR:
+            resting |= np.abs(height - level) < 0.03
+    return resting
+
+
+def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
+    """Return the height of the ground at each time: where the vehicle last stood, or will stand."""
+    where = np.flatnonzero(idle)
+    before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
+    gaps = np.diff(where) > 1
+    runs = np.split(height[where], np.flatnonzero(gaps) + 1)
+    levels = np.array([np.median(run) for run in runs])
+    run_of = np.cumsum(np.concatenate([[0], gaps]))
+    return np.asarray(levels[run_of[before]])
+
+
+def stretches(
+    time: Array, up: NDArray[np.bool_], *, bridged: float = MOMENT
+) -> list[tuple[float, float]]:
+    """Return the stretches in which a condition holds, breaks of up to some s bridged."""
+    holds = time[up]
+    if len(holds) == 0:
+        return []
+    runs = np.split(holds, np.flatnonzero(np.diff(holds) > bridged) + 1)
+    return [(float(run[0]), float(run[-1])) for run in runs]
+
+
+@dataclass(frozen=True)
+class YawSpin:
+    """A mission whose yaw rate set-point is constant.
+
+    Attributes
+    ----------
+    yaw_rate
+        rad/s, body z.
+    level_held
+        Whether attitude control sets the roll and pitch rates, so that position and attitude are
+        held; else both set-points are zero, and only thrust is controlled.
+    """
+
+    yaw_rate: float
+    level_held: bool
+
+
+def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin | None:
+    """Return how a mission spins, by its rate set-points; None for one that does not."""
+    if rate_setpoint is None:
+        return None
+    during = (rate_setpoint.time >= start - 1e-3) & (rate_setpoint.time <= end)
+    if during.sum() < 10:
+        return None
+    rates = rate_setpoint.values[during]
+    yaw = float(np.median(rates[:, 2]))
+    constant = np.abs(rates[:, 2] - yaw) < 1e-3 * abs(yaw)
+    if abs(yaw) < 0.05 or not _nearly_always(constant):
+        return None
+    if _nearly_always(constant & (np.abs(rates[:, :2]) < 1e-6).all(axis=1)):
+        return YawSpin(yaw, level_held=False)
+    # what a controller corrects changes from one set-point to the next
+    corrected = np.ptp(rates[constant, :2], axis=0) > 1e-6
+    return YawSpin(yaw, level_held=True) if corrected.all() else None
+
+
+def _nearly_always(flags: NDArray[np.bool_]) -> bool:
+    return float(flags.mean()) > 0.95

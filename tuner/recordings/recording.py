@@ -1,0 +1,230 @@
+"""What every reader hands over: the topics of a file, and the wanted fields as arrays."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
+
+from tuner.core.errors import RecordingError
+from tuner.core.yaml_section import Section
+from tuner.recordings.damage import Damage
+from tuner.recordings.flight import Array
+from tuner.recordings.notes import Note
+
+Nanoseconds = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a recording: its name, message type and number of messages."""
+
+    name: str
+    type: str
+    count: int
+
+
+class Clock(Section):
+    """A field that holds the time of a message, or of a table's row.
+
+    Attributes
+    ----------
+    field
+        Its path or column.
+    unit
+        Key of `NANOSECONDS`; None is seconds in messages, and told by the step in tables.
+    """
+
+    field: str
+    unit: Literal["s", "ms", "us", "ns"] | None = None
+
+    @property
+    def nanoseconds(self) -> int:
+        """How many ns make its unit."""
+        return NANOSECONDS[self.unit or "s"]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"field": value} if isinstance(value, str) else value
+
+
+#: Unit of time -> nanoseconds.
+NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is wanted of a topic.
+
+    Attributes
+    ----------
+    fields
+        Paths of numbers.
+    clocks
+        Fields that may hold the time, the preferred one first; none means the usual header.
+    """
+
+    fields: tuple[str, ...]
+    clocks: tuple[Clock, ...] = ()
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The messages of one topic, in the order of the file.
+
+    Attributes
+    ----------
+    receive
+        (n,) ns, when each message was recorded.
+    stamp
+        (n,) ns, the time written in each message; None where it has none.
+    fields
+        Field path -> (n,) numbers as recorded; NaN where a message has no such element.
+    """
+
+    receive: Nanoseconds
+    stamp: Nanoseconds | None
+    fields: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Usual:
+    """Where a message type holds a signal: its fields, their unit (of `UNITS`) and axes."""
+
+    fields: tuple[str, ...]
+    unit: str = "si"
+    frame: str = "enu_flu"
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The wanted topics of one recording.
+
+    Attributes
+    ----------
+    samples
+        Topic -> its messages.
+    notes
+        What was left out while reading.
+    damage
+        What the recording has lost, with times in s since 1970 by the recorder's clock.
+    """
+
+    samples: Mapping[str, Samples]
+    notes: tuple[Note, ...] = ()
+    damage: tuple[Damage, ...] = ()
+
+
+class Recording(Protocol):
+    """An open file of any format."""
+
+    @property
+    def path(self) -> Path:
+        """Where the recording lies."""
+        ...
+
+    @property
+    def format(self) -> str:
+        """The `Reader.format` by which it was opened."""
+        ...
+
+    @property
+    def topics(self) -> Sequence[Topic]:
+        """Every topic in the file."""
+        ...
+
+    def usual(self, topic: str, signal: str) -> Usual | None:
+        """Return where messages of this topic's type hold a signal; None if they do not."""
+        ...
+
+    def fields(self, topic: str) -> Sequence[str]:
+        """Return the names of a topic's fields, for hints; structures by their first part."""
+        ...
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
+        """Return those of some fields that messages of a topic do not have."""
+        ...
+
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read some topics: topic -> what is wanted of it.
+
+        Raises
+        ------
+        RecordingError
+            A topic has no such field, or nothing can be read.
+        """
+        ...
+
+
+#: The one topic of a table.
+ROWS = ""
+
+
+class TabularRecording:
+    """A recording with one row a time and one number a column; the base of tabular formats.
+
+    Parameters
+    ----------
+    path
+        The file.
+    format_name
+        The `Reader.format`.
+    columns
+        Their names.
+
+    Attributes
+    ----------
+    units
+        Column -> what a row of units says of it.
+    obstacle
+        Why its columns say nothing by themselves, and what to do; None where they may.
+    """
+
+    units: Mapping[str, str] = {}
+    obstacle: tuple[str, str] | None = None
+
+    def __init__(self, path: Path, format_name: str, columns: Sequence[str]) -> None:
+        self.path = path
+        self.format = format_name
+        self.columns = columns
+        self.topics: Sequence[Topic] = (Topic(ROWS, "table", 1),)
+
+    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
+        """Return None: columns have no usual names."""
+        return None
+
+    def fields(self, topic: str) -> Sequence[str]:  # noqa: ARG002
+        """Return the columns."""
+        return self.columns
+
+    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
+        """Return those of some columns that are not there."""
+        return tuple(name for name in fields if name not in self.columns)
+
+    def clock(self, request: Request) -> Clock:
+        """Return the column that holds the time.
+
+        Raises
+        ------
+        RecordingError
+            None of those requested is there.
+        """
+        for clock in request.clocks:
+            if clock.field in self.columns:
+                return clock
+        raise RecordingError(
+            self.path,
+            f"has no time column among {', '.join(self.columns[:8])}, ...",
+            "name it under 'time' in the topic map",
+        )
+
+    @abstractmethod
+    def read(self, wanted: Mapping[str, Request]) -> Contents:
+        """Read the wanted columns of `ROWS`."""

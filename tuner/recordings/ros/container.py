@@ -1,0 +1,176 @@
+"""What the ROS containers have in common: connections, and blocks of their messages."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+from rosbags.interfaces import MessageDefinition
+
+from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.ros.wire import Block, Bytes, Index
+
+#: The largest chunk that is unpacked: cameras and lidars stay far below it.
+LARGEST_CHUNK = 128 << 20
+#: Wanted pieces of an uncompressed chunk that lie this near are read in one go, in bytes.
+NEAR = 1 << 16
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A topic as one publisher wrote it."""
+
+    id: int
+    topic: str
+    type: str
+    definition: MessageDefinition
+    count: int
+
+
+class Container(Protocol):
+    """A file that holds serialised messages."""
+
+    @property
+    def connections(self) -> Mapping[int, Connection]:
+        """The connections by their number."""
+        ...
+
+    @property
+    def aligned(self) -> bool:
+        """Whether messages are CDR (ROS 2), else ROS 1."""
+        ...
+
+    @property
+    def damage(self) -> Sequence[Damage]:
+        """What could not be read so far."""
+        ...
+
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+        """Yield the messages of some connections, each block of one connection."""
+        ...
+
+
+class DamagedError(Exception):
+    """The container's structure cannot be followed here.
+
+    Parameters
+    ----------
+    text
+        Why.
+    cause
+        What that says of the recording, where the error ends the use of its index.
+    """
+
+    def __init__(self, text: str, cause: Cause = Cause.INDEX_DAMAGED) -> None:
+        super().__init__(text)
+        self.cause = cause
+
+
+def unpack(compression: str, packed: bytes, size: int) -> bytes:
+    """Unpack a chunk, or as much of it as is there, never beyond the size it claims.
+
+    Raises
+    ------
+    DamagedError
+        The compression is unknown, the size absurd or nothing can be unpacked.
+    """
+    if compression in ("none", ""):
+        return packed
+    if not 0 < size <= LARGEST_CHUNK:
+        raise DamagedError(f"a chunk claims {size} bytes")
+    try:
+        if compression == "bz2":
+            from bz2 import BZ2Decompressor  # noqa: PLC0415 (each on demand)
+
+            return BZ2Decompressor().decompress(packed, max_length=size)
+        if compression == "lz4":
+            lz4 = importlib.import_module("lz4.frame")
+            unpacked: bytes = lz4.LZ4FrameDecompressor().decompress(packed, max_length=size)
+            return unpacked
+        if compression == "zstd":
+            content: bytes = zstd().ZstdDecompressor().decompress(packed, max_length=size)
+            return content
+    except Exception as err:  # each library has its own, and none is a fault of ours
+        raise DamagedError(f"a chunk cannot be unpacked ({err})") from None
+    raise DamagedError(f"unknown compression '{compression[:20]}'")
+
+
+def zstd() -> Any:
+    """Return the zstd module: Python's own from 3.14 on, before that the one of rosbags."""
+    if sys.version_info >= (3, 14):
+        return importlib.import_module("compression.zstd")
+    return importlib.import_module("backports.zstd")
+
+
+def u16(buffer: Bytes, at: Index) -> Index:
+    """Read little-endian unsigned 16-bit numbers at positions that lie inside a buffer."""
+    return _numbers(buffer, at, 2)
+
+
+def u32(buffer: Bytes, at: Index) -> Index:
+    """Read little-endian unsigned 32-bit numbers at positions that lie inside a buffer."""
+    return _numbers(buffer, at, 4)
+
+
+def u64(buffer: Bytes, at: Index) -> Index:
+    """Read little-endian unsigned 64-bit numbers at positions that lie inside a buffer."""
+    return _numbers(buffer, at, 8)
+
+
+def _numbers(buffer: Bytes, at: Index, size: int) -> Index:
+    spread = buffer[at[:, None] + np.arange(size)]
+    return np.asarray(spread.view(f"<u{size}")[:, 0].astype(np.int64), dtype=np.int64)
+
+
+def joined(times: list[int], payloads: list[bytes]) -> Block:
+    """Return a block of messages that were read one by one."""
+    lengths = np.array([len(payload) for payload in payloads], dtype=np.int64)
+    end = np.cumsum(lengths)
+    content = np.frombuffer(b"".join(payloads), dtype=np.uint8)
+    return Block(content, end - lengths, end, np.array(times, dtype=np.int64))
+
+
+def read_pieces(
+    stream: BinaryIO, origin: int, size: int, starts: Index, bounds: Index
+) -> tuple[Bytes, Index]:
+    """Read the wanted records of an unpacked chunk, and not the images between them.
+
+    Parameters
+    ----------
+    stream
+        The file.
+    origin, size
+        Where the chunk's data begin in it, and how long they are.
+    starts
+        (n,) increasing offsets of wanted records in the chunk.
+    bounds
+        Increasing offsets of all records.
+
+    Returns
+    -------
+    tuple
+        The bytes read, and (n,) where each wanted record begins in them.
+    """
+    if len(starts) == 0 or starts[0] < 0 or starts[-1] >= size:
+        raise DamagedError("an index points nowhere")
+    bounds = np.append(bounds[bounds < size], size)
+    ends = bounds[np.searchsorted(bounds, starts, side="right")]
+    apart = np.flatnonzero(starts[1:] - ends[:-1] > NEAR) + 1
+    first = np.concatenate([[0], apart])
+    last = np.concatenate([apart, [len(starts)]]) - 1
+    pieces = []
+    moved = np.empty_like(starts)
+    length = 0
+    for begin, end in zip(first, last, strict=True):
+        stream.seek(origin + int(starts[begin]))
+        piece = stream.read(int(ends[end] - starts[begin]))
+        moved[begin : end + 1] = starts[begin : end + 1] - starts[begin] + length
+        pieces.append(piece)
+        length += len(piece)
+        if length > LARGEST_CHUNK:
+            raise DamagedError("a chunk is absurdly long")
+    return np.frombuffer(b"".join(pieces), dtype=np.uint8), moved

@@ -1,0 +1,221 @@
+"""A table's times: numbers in whatever unit, dates or times of day, as whole nanoseconds.
+
+Nothing in a table says in which unit its times are. How often a flight is sampled does: between
+`SLOWEST` and `FASTEST` Hz exactly one of s, ms, µs and ns has any given step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.errors import RecordingError
+from tuner.recordings.flight import Array
+from tuner.recordings.recording import NANOSECONDS, Clock, Nanoseconds
+
+if TYPE_CHECKING:
+    import pyarrow
+
+#: Stands for a row without a time.
+NEVER = np.iinfo(np.int64).min
+#: Hz at which flights are sampled: a thousand apart, as the units of time are.
+SLOWEST, FASTEST = 3.0, 3000.0
+#: Rows that one stamp may be on, before it counts as one of too few digits.
+SHARED = 10
+#: Fields by whose samples the step is told.
+LOOKED_AT = 24
+UNIT_NAMES = {
+    "s": "in seconds",
+    "ms": "in milliseconds",
+    "us": "in microseconds",
+    "ns": "in nanoseconds",
+}
+
+_DATE = r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}(\.\d{1,9})?(Z|[+-]\d{2}(:?\d{2})?)?$"
+_TIME_OF_DAY = r"^\d{2}:\d{2}:\d{2}(\.\d{1,9})?$"
+_DAY = 24 * 3600 * NANOSECONDS["s"]
+
+
+def read_times(
+    path: Path, column: pyarrow.ChunkedArray, clock: Clock, fields: Iterable[Array]
+) -> tuple[Nanoseconds, str | None]:
+    """Return the times (n,) of a table's rows in ns, `NEVER` where there is none.
+
+    Parameters
+    ----------
+    path
+        The table, for errors.
+    column
+        As it stands in the table: whole numbers, floats, time stamps or text.
+    clock
+        What the topic map says of it; without a unit, that is told by the step.
+    fields
+        (n,) of the signals, NaN where a row holds no sample.
+
+    Returns
+    -------
+    tuple
+        The times, and the unit of `NANOSECONDS` that was told; None where nothing had to be.
+
+    Raises
+    ------
+    RecordingError
+        It holds neither numbers nor dates, its unit is uncertain, or its stamps are too coarse.
+    """
+    from pyarrow import compute, int64, types  # noqa: PLC0415 (a third of a second)
+
+    if types.is_timestamp(column.type):
+        whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
+        return np.asarray(array_of(compute.fill_null(whole, NEVER)), dtype=np.int64), None
+    numbers = numbers_of(column)
+    sampled = [np.isfinite(field) for field in list(fields)[:LOOKED_AT]] or [np.isfinite(numbers)]
+    if is_text(column) and not np.isfinite(numbers).any():
+        times, unit = _dates(path, column, clock.field), None
+    else:
+        unit = None if clock.unit else _unit(path, clock.field, numbers, sampled)
+        times = _whole(column, numbers, NANOSECONDS[clock.unit or unit or "s"])
+    _require_digits(path, column, times, sampled)
+    return times, unit
+
+
+def numbers_of(column: pyarrow.ChunkedArray) -> Array:
+    """Return a column as floats, NaN where a cell holds no number."""
+    from pyarrow import ArrowInvalid, ArrowNotImplementedError, compute, float64  # noqa: PLC0415
+
+    try:
+        if is_text(column):
+            column = compute.utf8_trim_whitespace(column)
+            column = compute.replace_substring_regex(column, pattern=r"^$", replacement="nan")
+        return np.asarray(array_of(compute.cast(column, float64())), dtype=np.float64)
+    except (ArrowInvalid, ArrowNotImplementedError):
+        return np.array([_number(cell) for cell in column.to_pylist()], dtype=np.float64)
+
+
+def array_of(column: pyarrow.ChunkedArray) -> NDArray[Any]:
+    """Return a column's numbers, in a way that leaves pandas asleep (half a second) if it can."""
+    whole = column.combine_chunks()
+    if whole.null_count:
+        return np.asarray(whole.to_numpy(zero_copy_only=False))
+    return np.from_dlpack(whole)
+
+
+def is_text(column: pyarrow.ChunkedArray) -> bool:
+    """Return whether a column holds text."""
+    from pyarrow import types  # noqa: PLC0415
+
+    return bool(types.is_string(column.type))
+
+
+def _number(cell: object) -> float:
+    try:
+        return float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_]]) -> str | None:
+    """Return the unit in which samples follow each other as those of a flight do."""
+    steps = []
+    for there in sampled:
+        between = np.diff(numbers[there & np.isfinite(numbers)])
+        steps.append(float(np.median(between[between > 0])) if (between > 0).any() else np.nan)
+    if not np.isfinite(steps).any():
+        return None
+    step = float(np.nanmedian(steps))
+    for unit, factor in NANOSECONDS.items():
+        if SLOWEST <= NANOSECONDS["s"] / (step * factor) < FASTEST:
+            return unit
+    raise RecordingError(
+        path,
+        f"its '{field}' goes on by {step:g} from one sample to the next, which is no step of a "
+        "flight in s, ms, us or ns",
+        f"give its unit in a topic map (time: {{field: {field}, unit: ms}})",
+    )
+
+
+def _whole(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
+    """Return a column of numbers in whole ns, with every digit that a text holds."""
+    from pyarrow import ArrowInvalid, compute, int64, types  # noqa: PLC0415
+
+    known = np.isfinite(numbers) & (np.abs(numbers) < 9e18 / unit)
+    result = np.full(len(numbers), NEVER, dtype=np.int64)
+    if types.is_integer(column.type) and not column.null_count:
+        result[known] = np.asarray(array_of(column), dtype=np.int64)[known] * unit
+        return result
+    result[known] = np.rint(numbers[known] * unit)
+    if is_text(column) and known.any() and np.abs(numbers[known]).max() > 1e6:
+        # A float has some 16 digits, too few for nanoseconds since 1970.
+        try:
+            text = compute.utf8_trim_whitespace(column.combine_chunks())
+            parts = compute.split_pattern(text, ".", max_splits=1)
+            whole = compute.list_element(parts, 0)
+            start = np.from_dlpack(compute.cast(whole, int64()))
+        except ArrowInvalid:
+            return result
+        rest = np.zeros(len(numbers))
+        for i, cell in enumerate(text.to_pylist()):
+            rest[i] = _number(f"0.{cell.partition('.')[2]}") if "." in cell else 0.0
+        exact = known & np.isfinite(rest) & (start >= 0)
+        result[exact] = start[exact] * unit + np.rint(rest[exact] * unit).astype(np.int64)
+    return result
+
+
+def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
+    """Return dates and times of day in ns, since 1970 or since midnight."""
+    import pyarrow  # noqa: PLC0415
+    from pyarrow import ArrowInvalid, compute  # noqa: PLC0415
+
+    text = compute.utf8_trim_whitespace(column.combine_chunks())
+    text = compute.replace_substring(text, ",", ".")
+    text = compute.replace_substring(text, "/", "-")
+    of_day = compute.match_substring_regex(text, _TIME_OF_DAY)
+    only_of_day = bool(compute.any(of_day).as_py())
+    text = compute.if_else(of_day, compute.binary_join_element_wise("1970-01-01", text, " "), text)
+    dated = compute.match_substring_regex(text, _DATE)
+    cells = compute.if_else(dated, text, None)
+    for zone in (None, "UTC") if compute.any(dated).as_py() else ():
+        try:
+            stamps = compute.cast(cells, pyarrow.timestamp("ns", zone))
+        except ArrowInvalid:  # some have a zone and some have none
+            continue
+        whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NEVER)
+        times = np.asarray(np.from_dlpack(whole), dtype=np.int64)
+        return _over_midnight(times) if only_of_day else times
+    first = next((cell for cell in text.to_pylist() if cell), "")
+    raise RecordingError(
+        path,
+        f"its '{field}' holds {first[:40]!r}, which is neither a number nor a date",
+        "write seconds, or dates as 2026-04-02T14:13:00.123",
+    )
+
+
+def _over_midnight(times: Nanoseconds) -> Nanoseconds:
+    known = times != NEVER
+    on = times[known]
+    days = np.concatenate([[0], np.cumsum(np.diff(on) < -_DAY // 2)])
+    result = times.copy()
+    result[known] = on + days * _DAY
+    return result
+
+
+def _require_digits(
+    path: Path,
+    column: pyarrow.ChunkedArray,
+    times: Nanoseconds,
+    sampled: list[NDArray[np.bool_]],
+) -> None:
+    """Refuse stamps that were written with so few digits that many rows share them."""
+    there = times[max(sampled, key=np.count_nonzero)]
+    there = there[there != NEVER]
+    different = len(np.unique(there))
+    if len(there) >= 2 * SHARED and different * SHARED <= len(there):
+        first = str(column[0].as_py()).strip()[:30]
+        raise RecordingError(
+            path,
+            f"its {len(there)} rows have {different} different times: '{first}' has too few digits",
+            "write the time with its fraction of a second, or count from the recording's start",
+        )

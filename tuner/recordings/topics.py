@@ -1,0 +1,204 @@
+"""The topic map: which recorded field becomes which signal, read from ``configs/topics``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, model_validator
+
+from tuner.core.errors import ConfigError, did_you_mean
+from tuner.core.shipped import configs_folder, find_config
+from tuner.core.yaml_section import Section, Whole, read_model, refuse
+from tuner.recordings import formats as recording_formats
+from tuner.recordings.flight import SIGNALS
+from tuner.recordings.formats import is_tabular
+from tuner.recordings.recording import Clock
+from tuner.recordings.units import ATTITUDES, UNITS
+from tuner.vehicle.motor_orders import MotorOrder
+
+#: Maps may extend maps this often.
+DEEPEST = 3
+
+
+def _as_list(value: object) -> object:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+class Source(Section):
+    """Where one signal is recorded.
+
+    Attributes
+    ----------
+    topic
+        Name of the topic, in which ``*`` stands for anything; empty in a table, which has one set
+        of columns only.
+    fields
+        Paths into the message (``pose.position.x``, ``channels[0]``) or column names, in the
+        order of the signal's columns; None takes those that the message type usually has.
+    rotor
+        Field that names the rotor, from 0, of a message; `fields` then names one field.
+    unit
+        Unit of the recorded numbers, a key of `UNITS`; None is the usual one of the message type.
+    frame
+        Axes of the recorded numbers: ``enu_flu`` as ROS has them, ``ned_frd`` as PX4 has them;
+        None is the usual one of the message type.
+    quaternion
+        Order of the recorded quaternion, as `fields` lists it; ``rpy`` for an attitude that was
+        recorded as roll, pitch and yaw, turned about z first, then y, then x.
+    stamp
+        ``header`` prefers the time in the message, ``receive`` the time of recording.
+    """
+
+    topic: str = ""
+    fields: tuple[str, ...] | None = None
+    rotor: str | None = None
+    unit: str | None = None
+    frame: Literal["enu_flu", "ned_frd"] | None = None
+    quaternion: Literal["wxyz", "xyzw", "rpy"] = "wxyz"
+    stamp: Literal["header", "receive"] = "header"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"topic": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _makes_sense(self) -> Self:
+        if self.unit is not None and self.unit not in UNITS:
+            raise refuse(f"unknown unit '{self.unit}'", did_you_mean(self.unit, UNITS))
+        if self.rotor is not None and (self.fields is None or len(self.fields) != 1):
+            raise refuse("a source with 'rotor' has one number a message", "name one in 'fields'")
+        return self
+
+
+class TopicMap(Section):
+    """Signals and the sources that may hold them, the preferred one first.
+
+    Attributes
+    ----------
+    name
+        What reports call the map.
+    format
+        Kind of recording that it applies to.
+    extends
+        Another map, by name or file, for all that this one does not say.
+    priority
+        Among maps that find equally many signals in a recording, the highest is taken.
+    time
+        Fields that hold the time, the preferred one first; none means the message's header.
+    messages
+        ``.msg`` files, or folders of them, for ROS types that a recording does not define.
+    motor_order
+        In which the columns of ``command`` and ``rotor_speed`` are listed, of `MOTOR_ORDERS` or
+        four numbers; None where nothing is said.
+    signals
+        Signal of `SIGNALS` to its sources. In a table, a list of columns says it all.
+    """
+
+    name: str
+    format: str
+    extends: str | None = None
+    priority: Whole = 0
+    time: Annotated[tuple[Clock, ...], BeforeValidator(_as_list)] = ()
+    messages: Annotated[tuple[Path, ...], BeforeValidator(_as_list)] = ()
+    motor_order: MotorOrder | None = None
+    signals: Mapping[str, Annotated[tuple[Source, ...], BeforeValidator(_as_list)]]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns(cls, value: Any) -> Any:
+        """Let a table's signal be a list of columns, or one column."""
+        if not (isinstance(value, Mapping) and is_tabular(value.get("format"))):
+            return value
+        signals = value.get("signals")
+        if not isinstance(signals, Mapping):
+            return value
+
+        def as_source(columns: object) -> object:
+            if isinstance(columns, str):
+                return {"fields": [columns]}
+            if isinstance(columns, list) and all(isinstance(name, str) for name in columns):
+                return {"fields": columns}
+            return columns
+
+        return {**value, "signals": {name: as_source(of) for name, of in signals.items()}}
+
+    @model_validator(mode="after")
+    def _know_format_and_signals(self) -> Self:
+        formats = [reader.format for reader in recording_formats.READERS]
+        if self.format not in formats:
+            raise refuse(f"unknown format '{self.format}'", did_you_mean(self.format, formats))
+        for name, sources in self.signals.items():
+            if name not in SIGNALS:
+                raise refuse(f"unknown signal '{name}'", did_you_mean(name, SIGNALS))
+            columns = SIGNALS[name][0]
+            for source in sources:
+                angles = source.quaternion == "rpy" and name in ATTITUDES
+                wanted = 3 if angles else columns
+                count = wanted if source.fields is None else len(source.fields)
+                if source.rotor is None and count != wanted:
+                    raise refuse(f"signal '{name}' has {count} fields", f"name all {wanted}")
+        return self
+
+    def under(self, namespace: str) -> TopicMap:
+        """Return the map with every topic moved under a namespace, as ``uav1`` or ``/uav1``."""
+        prefix = namespace.strip("/")
+        if not prefix:
+            return self
+        signals = {
+            name: tuple(
+                source.replace(topic=f"/{prefix}/{source.topic.lstrip('/')}") for source in sources
+            )
+            for name, sources in self.signals.items()
+        }
+        return self.replace(signals=signals)
+
+
+def load_topic_map(reference: str | Path, *, base: Path | None = None, depth: int = 0) -> TopicMap:
+    """Read a topic map from a file, or a shipped one by its name.
+
+    Parameters
+    ----------
+    reference
+        A path, or the bare name of a shipped map.
+    base
+        Folder from which relative paths count; None is the working folder.
+    depth
+        How many maps this one is extended by.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing, no YAML, or says something that no map can say.
+    """
+    path = find_config("topics", str(reference), base or Path())
+    topic_map = read_model(TopicMap, path)
+    if topic_map.messages:
+        topic_map = topic_map.replace(
+            messages=tuple(path.parent / file for file in topic_map.messages)
+        )
+    if topic_map.extends is None:
+        return topic_map
+    if depth >= DEEPEST:
+        raise ConfigError(path, f"extends '{topic_map.extends}' in a circle", "break it")
+    under = load_topic_map(topic_map.extends, base=path.parent, depth=depth + 1)
+    if under.format != topic_map.format:
+        raise ConfigError(
+            path, f"extends '{under.name}' of another format", "extend one of its own"
+        )
+    return topic_map.replace(
+        signals={**under.signals, **topic_map.signals},
+        time=topic_map.time or under.time,
+        motor_order=topic_map.motor_order or under.motor_order,
+        messages=(*topic_map.messages, *under.messages),
+    )
+
+
+@cache
+def shipped_maps() -> tuple[TopicMap, ...]:
+    """Return every map in ``configs/topics``, by file name."""
+    files = sorted((configs_folder() / "topics").glob("*.yaml"))
+    return tuple(load_topic_map(file) for file in files)

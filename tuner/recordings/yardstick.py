@@ -1,0 +1,275 @@
+"""The unit of recorded lengths, told by gravity.
+
+A multirotor is pushed along its thrust and pulled down by gravity, so that its recorded attitude
+alone says how fast it accelerates:
+
+    a_xy = (g + a_z) t
+
+where t points to where the thrust leans, as long as its tilt's tangent. Lengths in a unit of which
+k make a metre have a_xy and a_z k times as large, but not g, so that a_xy - a_z t is k g t. That
+holds however slow or fast a flight is. Drag, wind and noise of the tilt make k smaller, of slow
+flights by a third, of some hovers by more; nothing makes it larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.numerics import GRAVITY
+from tuner.recordings.flight import Array
+from tuner.recordings.frames import ATTITUDE_READINGS
+from tuner.recordings.motion import rotate
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.units import UNITS
+
+LENGTHS = {"position": False, "velocity": True}
+"""Signals of lengths that may come in another unit than metres; whether they are speeds."""
+NAMED = {"cm": "in centimetres", "mm": "in millimetres"}
+"""Units that are recognised, and how a sentence calls them."""
+
+BIN = 0.1
+"""s of which one median is taken, of noise, bursts of stamps and single corrupt samples."""
+REACH = 3
+"""Bins on either side of a time over which the acceleration there is a mean."""
+LOOKED_AT = 300.0
+"""s to either side of the middle stamp that are looked at; those far off are wrong."""
+SLOW = 0.03
+"""s from sample to sample, above which times may be a thousand times too long."""
+UPRIGHT = 0.3
+"""Cosine of the tilt below which thrust carries little of the weight."""
+
+SEEN = 0.002
+"""rad of tilt, root mean square, of which less is noise."""
+AGREEMENT = 0.8
+"""Share of the tilt that has to point as the vehicle accelerates."""
+UNLIKELY = 3.0
+"""Standard deviations by which chance would have to err for that."""
+BELIEVED = (0.45, 1.6)
+"""How far the lengths of a unit may seem to be from it."""
+FOREIGN = 2.0
+"""Units to a metre that no flight in metres seems to have."""
+SAME = 3.0
+"""Times that a recorded speed may be off the change of a position in its unit."""
+
+
+@dataclass(frozen=True)
+class Stamped:
+    """Samples in any order: (n,) s, and (n, k) values that are NaN where not measured."""
+
+    time: Array
+    values: Array
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How recorded lengths compare with what the recorded tilt says.
+
+    Attributes
+    ----------
+    per_metre
+        How many of their unit make a metre.
+    agreement
+        Share of the tilt, 0..1, that points as the vehicle accelerates.
+    sure
+        Whether that is enough, and not by chance.
+    """
+
+    per_metre: float = 1.0
+    agreement: float = 0.0
+    sure: bool = False
+
+
+def scales_of(recorded: Mapping[str, Stamped]) -> dict[str, Scale]:
+    """Return the scale of each signal of `LENGTHS` that a recording holds.
+
+    Position and speed share the better known one where one changes about as the other says.
+
+    Parameters
+    ----------
+    recorded
+        Signal -> its samples as recorded: position and speed (n, 3), and attitude (m, 4)
+        quaternions in any order and frame that `frames` knows.
+    """
+    if "attitude" not in recorded:
+        return {}
+    scales = {
+        signal: scale_of(recorded[signal], recorded["attitude"], speeds=speeds)
+        for signal, speeds in LENGTHS.items()
+        if signal in recorded
+    }
+    if len(scales) > 1 and _share_a_unit(recorded["position"], recorded["velocity"]):
+        return dict.fromkeys(scales, _best_known(scales.values()))
+    return scales
+
+
+def is_too_slow(recorded: Mapping[str, Stamped]) -> bool:
+    """Return whether times are a thousand times too long: lengths make sense only if they are.
+
+    A table's unit of time is told by its step, which slow microseconds share with quick
+    milliseconds.
+    """
+    if not {"position", "attitude"} <= set(recorded):
+        return False
+    step = np.diff(np.sort(recorded["position"].time))
+    if not len(step) or np.median(step) < SLOW:
+        return False
+    quick = {
+        name: Stamped(1e-3 * samples.time, samples.values) for name, samples in recorded.items()
+    }
+    slowly, quickly = (
+        fits_gravity(signals["position"], signals["attitude"]) for signals in (recorded, quick)
+    )
+    return quickly and not slowly
+
+
+def fits_gravity(
+    position: Stamped, attitude: Stamped, units: Iterable[str] = ("si", *NAMED)
+) -> bool:
+    """Return whether positions in one of some units accelerate as an attitude says."""
+    scale, (low, high) = scale_of(position, attitude), BELIEVED
+    return scale.sure and any(low < scale.per_metre * UNITS[unit][0] < high for unit in units)
+
+
+def unit_of(signal: str, topic: str, scale: Scale) -> tuple[str, Note | None]:
+    """Return the unit of `UNITS` that lengths are to be read in, and what to say of it.
+
+    Metres (``si``) where they are, and wherever that cannot be told.
+    """
+    if not scale.sure or scale.per_metre < FOREIGN:
+        return "si", None
+    low, high = BELIEVED
+    for unit, name in NAMED.items():
+        factor, _ = UNITS[unit]
+        if low < scale.per_metre * factor < high:
+            return unit, Note(NoteCode.UNIT_READ, topic=topic, names=(signal, name))
+    numbers = {"times": scale.per_metre}
+    return "si", Note(NoteCode.UNIT_DOUBTED, topic=topic, numbers=numbers, names=(signal,))
+
+
+def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Scale:
+    """Return the scale of recorded positions or speeds, of that attitude which fits them best.
+
+    Parameters
+    ----------
+    lengths, attitude
+        As of `scales_of`.
+    speeds
+        Whether the lengths are speeds.
+    """
+    middle = np.median(attitude.time) if len(attitude.time) else 0.0
+    lengths, attitude = _around(lengths, middle), _around(attitude, middle)
+    if not len(lengths.time) or not len(attitude.time):
+        return Scale()
+    readings = (attitude.values, *(r.read(attitude.values) for r in ATTITUDE_READINGS))
+    return _best_known(
+        _scale(*pull_and_tilt(lengths, Stamped(attitude.time, values), speeds=speeds))
+        for values in readings
+    )
+
+
+def pull_and_tilt(
+    lengths: Stamped, attitude: Stamped, *, speeds: bool = False
+) -> tuple[Array, Array]:
+    """Return a_xy - a_z t and t, see above, at times a bin apart: (n, 2) each.
+
+    Both are the same weighted mean over `REACH` bins to either side; times at which either is not
+    known, or the vehicle lies on its side, are left out.
+    """
+    centres = _centres(lengths, attitude)
+    if len(centres) <= 2 * REACH:
+        return np.empty((0, 2)), np.empty((0, 2))
+    at = _binned(lengths, centres)
+    if speeds:
+        at = np.where(np.isfinite(at), np.nancumsum(at, axis=0) * BIN, np.nan)
+    # a second difference is the mean of the second derivative by a triangle of weights
+    push = (at[2 * REACH :] - 2 * at[REACH:-REACH] + at[: -2 * REACH]) / (REACH * BIN) ** 2
+    norm = np.linalg.norm(attitude.values, axis=1, keepdims=True)
+    turned = attitude.values / np.where(norm > 0.5, norm, np.nan)
+    up = rotate(turned, np.tile([0.0, 0.0, 1.0], (len(turned), 1)))
+    weights = np.convolve(np.ones(REACH), np.ones(REACH)) / REACH**2
+    columns = _binned(Stamped(attitude.time, up), centres).T
+    leant = np.column_stack([np.convolve(c, weights, "valid")[1:-1] for c in columns])
+    known = np.isfinite(push).all(axis=1) & (leant[:, 2] > UPRIGHT)
+    tilt = leant[known, :2] / leant[known, 2:]
+    return push[known, :2] - push[known, 2:] * tilt, tilt
+
+
+def _scale(pull: Array, tilt: Array) -> Scale:
+    """Return the slope of (n, 2) pulls over tilts, by least absolute deviations."""
+    if len(tilt) <= 2 * REACH:
+        return Scale()
+    # a tilt that stays is wind, or a marker body that was defined on a slope
+    pull, tilt = pull - np.median(pull, axis=0), tilt - np.median(tilt, axis=0)
+    size = np.linalg.norm(tilt, axis=1)
+    pull, tilt, size = pull[size > 0], tilt[size > 0], size[size > 0]
+    if not len(size) or np.sqrt(np.mean(size**2)) < SEEN:
+        return Scale()
+    slope = (pull * tilt).sum(axis=1) / size**2
+    order = np.argsort(slope)
+    middle = np.searchsorted(np.cumsum(size[order]), 0.5 * size.sum())
+    agreement = float(size[slope > 0].sum() / size.sum())
+    # neighbours share what they are means of: one in REACH of them is a throw of its own
+    chance = 0.5 * np.sqrt(REACH * (size**2).sum()) / size.sum()
+    sure = bool(agreement > max(AGREEMENT, 0.5 + UNLIKELY * chance))
+    return Scale(float(slope[order][middle]) / GRAVITY, agreement, sure)
+
+
+def _best_known(scales: Iterable[Scale]) -> Scale:
+    return max(scales, key=lambda scale: (scale.sure, scale.agreement))
+
+
+def _share_a_unit(position: Stamped, speed: Stamped) -> bool:
+    """Return whether the position changes about as fast as a recorded speed says."""
+    middle = np.median(speed.time) if len(speed.time) else 0.0
+    position, speed = _around(position, middle), _around(speed, middle)
+    if not len(position.time) or not len(speed.time):
+        return False
+    centres = _centres(position, speed)
+    if len(centres) < 2:
+        return False
+    moved, said = np.gradient(_binned(position, centres), BIN, axis=0), _binned(speed, centres)
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(said).all(axis=1)
+    if not known.any():
+        return False
+    lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, said))
+    slower, faster = sorted(lengths)
+    return bool(faster < SAME * slower)
+
+
+def _centres(*signals: Stamped) -> Array:
+    """Return the s in the middle of all bins that hold samples of some signals."""
+    first = min(samples.time.min() for samples in signals)
+    last = max(samples.time.max() for samples in signals)
+    return np.asarray(first + BIN * (np.arange(int((last - first) / BIN) + 1) + 0.5))
+
+
+def _around(samples: Stamped, middle: float) -> Stamped:
+    near: NDArray[np.bool_] = np.abs(samples.time - middle) < LOOKED_AT
+    return Stamped(samples.time[near], samples.values[near])
+
+
+def _binned(samples: Stamped, centres: Array) -> Array:
+    """Return (n, k) values at the centres (n,) of bins, between the medians of those around.
+
+    NaN where no bin within `REACH` to either side holds a sample.
+    """
+    result = np.full((len(centres), samples.values.shape[1]), np.nan)
+    for values, column in zip(samples.values.T, result.T, strict=True):
+        known = np.isfinite(values)
+        time, value = samples.time[known], values[known]
+        bins = ((time - centres[0]) / BIN + 0.5).astype(np.int64)
+        held, first, count = np.unique(np.sort(bins), return_index=True, return_counts=True)
+        if len(held) < 2:
+            continue
+        half = first + count // 2
+        when = time[np.lexsort((time, bins))][half]
+        column[:] = np.interp(centres, when, value[np.lexsort((value, bins))][half], np.nan, np.nan)
+        # bins before and behind each that hold something
+        behind = np.clip(np.searchsorted(held, np.arange(len(centres))), 0, len(held) - 1)
+        before = np.where(held[behind] > np.arange(len(centres)), np.maximum(behind - 1, 0), behind)
+        column[held[behind] - held[before] > REACH] = np.nan
+    return result

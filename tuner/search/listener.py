@@ -1,0 +1,42 @@
+"""What a run reports while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tuner.config import Settings
+    from tuner.evaluate.cross_validation import Fold
+    from tuner.search.iteration import Iteration
+    from tuner.search.point_estimate import PointEstimate
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Whom a run calls while it works.
+
+    Attributes
+    ----------
+    on_settings
+        Gets the settings, before anything is read.
+    on_iteration
+        Gets each iteration of the search, and the s that the search may still take (NaN where that
+        is unknown).
+    on_estimates
+        Gets where the search of the base model ended, long before intervals and validation.
+    on_message
+        Gets a sentence on what is done next, or on what a user should know.
+    on_folds
+        Gets the cross-validation's folds.
+    """
+
+    on_settings: Callable[[Settings], None] = lambda _: None
+    on_iteration: Callable[[Iteration, float], None] = lambda *_: None
+    on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None
+    on_message: Callable[[str], None] = lambda _: None
+    on_folds: Callable[[Sequence[Fold]], None] = lambda _: None
+
+
+SILENT = Listener()

@@ -1,0 +1,267 @@
+"""From settled options to the problem that is searched: flights, noise, segments."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sim_jax.crash import AIRBORNE, Limits
+from tuner.config import CHANNELS, JobFile, Settings
+from tuner.config.job import ErrorOf, InletName
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.equation_error.estimate import Estimate
+from tuner.evaluate.rmse import limits_of
+from tuner.objective.battery import require_voltage, with_reference_voltage
+from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
+from tuner.objective.job_flights import Recording
+from tuner.objective.noise import noise_of
+from tuner.objective.normal import Objective
+from tuner.objective.segments import Segments, on_time, segments_of, window_segments
+from tuner.objective.start import begins_gently
+from tuner.objective.voltage import VOLTAGE
+from tuner.recordings.flight import Flight
+from tuner.vehicle import conditions
+from tuner.vehicle.model import model_of, schedule_of
+from tuner.vehicle.space import Space, space_of
+
+#: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust
+#: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
+SPIN_CHANNELS = ("body_rate", "rotor_speed", "command")
+
+OVERLAP = 0.5
+"""Share of a window after which the next one begins, where windows start as recorded."""
+CLIPPED = 0.005
+"""A recorded command below this is a rotor clipped low."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A problem and what it was made of.
+
+    Attributes
+    ----------
+    settings
+        The user's.
+    recordings
+        The fitted ones, then those held out.
+    noise
+        Channel -> standard deviation in its unit (attitude: rad).
+    space
+        Free coefficients.
+    objective
+        What is searched: whole flights where all enter as reference, else windows.
+    windows
+        The same flights in windows, searched first where one does not begin gently; None where
+        all do.
+    first_terms
+        Groups of terms that are free from the beginning of the search.
+    asked
+        The user's settings, where others are searched with.
+    accelerations
+        What a regression of the flights' accelerations said, where physical coefficients are its
+        (`tuner.job.accelerations`).
+    """
+
+    settings: Settings
+    recordings: tuple[Recording, ...]
+    noise: Mapping[str, float]
+    space: Space
+    objective: Objective
+    windows: Objective | None = None
+    first_terms: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    asked: Settings | None = None
+    accelerations: Estimate | None = None
+
+    @property
+    def given(self) -> Settings:
+        """The user's settings."""
+        return self.settings if self.asked is None else self.asked
+
+    @property
+    def flights(self) -> tuple[Flight, ...]:
+        """All flights, the fitted ones first."""
+        return tuple(recording.flight for recording in self.recordings)
+
+    @property
+    def fitted(self) -> tuple[Flight, ...]:
+        """The flights that are fitted."""
+        return tuple(recording.flight for recording in self.recordings if not recording.holdout)
+
+    @property
+    def held_out(self) -> tuple[Flight, ...]:
+        """The flights that are evaluated and never fitted."""
+        return tuple(recording.flight for recording in self.recordings if recording.holdout)
+
+    @property
+    def inlets(self) -> tuple[InletName, ...]:
+        """Where each fitted flight enters the simulated loop."""
+        return tuple(recording.inlet for recording in self.recordings if not recording.holdout)
+
+    @property
+    def offset_is_fixed(self) -> tuple[bool, ...]:
+        """Whether the clock offset of each fitted flight is given rather than estimated."""
+        return tuple(
+            recording.time_offset is not None
+            for recording in self.recordings
+            if not recording.holdout
+        )
+
+    @property
+    def clipped(self) -> bool:
+        """Whether some recorded rotor was clipped low."""
+        return any(
+            bool((np.nan_to_num(flight.signals["command"], nan=1.0) < CLIPPED).any())
+            for flight in self.fitted
+            if flight.has("command")
+        )
+
+    def undecided(self, objective: Objective) -> tuple[str, ...]:
+        """Return the choices of a `Loop` that matter to a problem of this job.
+
+        Where no rotor was clipped nothing saturates, and where the markers sit at the centre of
+        mass and along the body's axes it is the same who sees them.
+        """
+        matters = {
+            "saturation_feedback": self.clipped,
+            "sees_markers": any(INLETS[inlet].closed_loop for inlet in self.inlets)
+            and any(
+                name.startswith("marker_")
+                for name in (*objective.model.vehicle.effects, *objective.space.names)
+            ),
+        }
+        return tuple(choice for choice, flown in matters.items() if flown)
+
+
+def job_of(settings: Settings, recordings: Sequence[Recording]) -> Job:
+    """Build the problem of some recordings.
+
+    Raises
+    ------
+    RecordingError
+        All of them are held out.
+    """
+    recordings = tuple(sorted(recordings, key=lambda recording: recording.holdout))
+    to_fit = [recording for recording in recordings if not recording.holdout]
+    if not to_fit:
+        raise RecordingError(
+            "--holdout", "all flights are held out, none is left to fit", "leave one to fit"
+        )
+    fitted = [recording.flight for recording in to_fit]
+    has_voltage = all(flight.has(VOLTAGE) for flight in fitted)
+    if has_voltage:
+        settings = replace(settings, vehicle=with_reference_voltage(settings.vehicle, fitted))
+    inlets = [recording.inlet for recording in to_fit]
+    job = settings.job
+    channels = [name for name in CHANNELS if job.channels.get(name, True)]
+    noise = noise_of(fitted, channels)
+    space = space_of(
+        settings.vehicle,
+        settings.controller,
+        job,
+        settings.bench,
+        bypassed=bypassed_by(inlets, fitted),
+        freed=freed_by(inlets, terms=job.terms == "auto"),
+    )
+    if "battery_exponent" in space.free or space.fixed.get("battery_exponent"):
+        require_voltage(fitted)
+    schedule = schedule_of(settings.controller)
+    compared = [
+        on_time(r.flight, [n for n in CHANNELS if n in r.flight.series], r.time_offset or 0.0)
+        for r in to_fit
+    ]
+    closed = all(INLETS[inlet].closed_loop for inlet in inlets)
+    longest = max(flight.duration for flight in fitted) + 1.0 / fitted[0].rate
+    model = model_of(settings.vehicle, settings.controller)
+    if not has_voltage:  # battery_exponent would act on some flights and not on others
+        model = replace(model, reference_voltage=None)
+
+    def problem(segments: Segments, seconds: float, limits: Limits) -> Objective:
+        samples = int(np.ceil(seconds * schedule.log_rate - 1e-6))
+        return Objective(
+            model,
+            segments,
+            space,
+            schedule,
+            samples,
+            limits,
+            conditions=_conditions(job, segments.measured),
+        )
+
+    seconds = window_seconds(inlets, job.search.window)
+    windows, free_starts = None, _free_starts(job.search.criterion, inlets)
+    stride = None if free_starts else OVERLAP * seconds
+    if not closed or not all(begins_gently(flight) for flight in fitted):
+        segments = window_segments(
+            compared,
+            inlets=inlets,
+            seconds=seconds,
+            schedule=schedule,
+            lag=settings.vehicle.motor.time_constant_up,
+            noise=noise,
+            weights=_weights(settings, fitted, whole=False),
+            stride=stride,
+            free_starts=free_starts,
+            input_late={recording.flight.name: recording.input_late for recording in to_fit},
+        )
+        windows = problem(segments, min(longest, seconds + 1.0 / fitted[0].rate), AIRBORNE)
+    if closed:
+        whole = segments_of(
+            compared,
+            noise=noise,
+            weights=_weights(settings, fitted, whole=True),
+            schedule=schedule,
+            free_starts=True,
+        )
+        objective = problem(whole, longest, limits_of(fitted))
+        return Job(settings, recordings, noise, space, objective, windows)
+    assert windows is not None
+    return Job(settings, recordings, noise, space, windows)
+
+
+def _free_starts(criterion: ErrorOf, inlets: Sequence[InletName]) -> bool:
+    """Return whether windows begin where the vehicle meets them best, or at recorded states.
+
+    Raises
+    ------
+    ConfigError
+        Predictions are asked for, and no recording holds all that they begin with.
+    """
+    if criterion == "auto":
+        return not all(INLETS[inlet].starts_recorded for inlet in inlets)
+    for inlet in inlets:
+        if criterion == "prediction" and "rate_integral" not in INLETS[inlet].ignores:
+            raise ConfigError(
+                "search.criterion",
+                f"prediction begins at recorded states, and for the {inlet} inlet no recording "
+                "holds that of the rate controller",
+                "use inlet: actuator or rotor_speed, or criterion: output",
+            )
+    return criterion == "output"
+
+
+def _conditions(job: JobFile, channels: Collection[str]) -> tuple[str, ...]:
+    """Return what the job estimates of each flight's surroundings.
+
+    What its terms name, and the accelerometer's bias where that is compared.
+    """
+    named = set() if isinstance(job.terms, str) else set(job.terms)
+    if "acceleration" in channels:
+        named.add("accelerometer")
+    return tuple(name for name, row in conditions().items() if named & {name, row.group})
+
+
+def _weights(
+    settings: Settings, flights: Sequence[Flight], *, whole: bool
+) -> dict[str, dict[str, float]]:
+    """Return flight -> channel -> factor; a whole free yaw spin's position means nothing."""
+    weights: dict[str, dict[str, float]] = {}
+    for flight in flights:
+        flight_settings = settings.job.flights.get(flight.name)
+        factor = 1.0 if flight_settings is None else flight_settings.weight
+        of_channel = {name: factor * settings.job.weights.get(name, 1.0) for name in CHANNELS}
+        if whole and flight.spins_freely:
+            of_channel |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
+        weights[flight.name] = of_channel
+    return weights

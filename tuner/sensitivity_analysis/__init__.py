@@ -1,1 +1,0 @@
-"""Effect of each coefficient on each signal: local by Jacobians, global by Morris or Sobol."""

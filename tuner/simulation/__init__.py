@@ -1,1 +1,0 @@
-"""Flights that nobody flew: any trajectory, vehicle and controller, as tables or recordings."""

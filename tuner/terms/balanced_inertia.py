@@ -1,0 +1,298 @@
+"""Inertia at which recorded motion and measured rotor speeds balance, unless it misleads.
+
+Least squares on simulations that are fed noisy rotor speeds finds what predicts these flights best
+with that noise, and takes inertia for larger than it is: the slower a flight, the more. What the
+balance finds (`tuner.objective.balance`) is not biased by it, and holds for other flights as well.
+All of the balance predicts badly where the measured speeds drift: nothing then damps what the drift
+drives. So the balance settles how strongly rotors turn the vehicle, `TURNS`, and all else is fitted
+again to what flies, drag of the turning above all. Every flight is left out in turn, and that is
+taken unless what was left out is predicted much worse than by least squares alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_jax.markers import markers_of
+from tuner.core.findings import Code, Finding, Level
+from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
+from tuner.objective.alternatives import alternatives_of
+from tuner.objective.balance import Balance, balance_of
+from tuner.objective.criterion import Point, SegmentSums
+from tuner.objective.many_points import sums_at
+from tuner.objective.tunable import Tunable
+from tuner.search.fitted import Fitted
+from tuner.search.least_squares import LeastSquares
+from tuner.search.normal_equations import normal_equations
+from tuner.search.optimiser import Free, StageProblem
+from tuner.search.problem import Job
+from tuner.search.stages import Stage
+from tuner.uncertainty.examination import Examination, examine
+
+Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STEPS = 10
+"""Gauss-Newton steps; the equations are nearly linear."""
+LONGEST_STEP = 1.0
+"""Of a coordinate of the search."""
+SETTLED = 1e-4
+"""Step of a coordinate below which it has arrived."""
+ROBUST = 3.0
+"""Standard deviations beyond which a residual counts linearly."""
+TURNS = ("inertia_xx", "inertia_yy", "inertia_zz", "moment_constant")
+"""Coefficients that the balance settles."""
+TOLERATED = 0.2
+"""Share by which the loss of what was left out may be larger, a tenth in its residuals: least
+squares gains so much from flights that are like each other, and loses it on others."""
+LEFT_OUT = Stage("left out", 0, 1.0, True, False, 8, 1e-3, False, False)
+"""From the fit to all, a fit to the others is a few steps away, or with other inertia."""
+TOLD = 0.1
+"""Share by which an inertia changes from which it is said."""
+
+
+@dataclass(frozen=True)
+class _Settling:
+    """A fit, and the balance of its recordings."""
+
+    fitted: Fitted
+    balance: Balance
+    tunable: Tunable
+
+    def at(self, inside: Mask, begin: ArrayLike) -> Vector:
+        """Return the search vector (K,) at which some windows (F,) balance, from a start.
+
+        What does not act in the balance, the motors above all, stays as it is.
+        """
+        objective, fitted = self.fitted.objective, self.fitted
+        vector = np.array(begin, float)
+        residuals = np.asarray(self.balance.residuals(self.tunable, vector))
+        inside = inside & np.isfinite(residuals).all(axis=(0, 1))
+        held = np.isin(objective.space.names, list(set(fitted.held.values())))
+        for _ in range(STEPS):
+            residuals = np.asarray(self.balance.residuals(self.tunable, vector))
+            columns = np.asarray(self.balance.jacobian(self.tunable, vector))
+            moves = (columns[:, :, inside] != 0.0).any(axis=(0, 1, 2)) & ~held
+            gradient, hessian = self._normal_equations(vector, residuals, columns, inside)
+            free = np.flatnonzero(moves)
+            step = scaled_solve(hessian[np.ix_(free, free)], gradient[free])
+            vector[free] -= np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            if np.abs(step).max(initial=0.0) < SETTLED:
+                break
+        return vector
+
+    def refitted(self, inside: Mask, balanced: Vector) -> Vector:
+        """Return the search vector (K,) that meets some windows best with a balance's `TURNS`."""
+        settled = np.isin(self.fitted.objective.space.names, TURNS)
+        begin = np.where(settled, balanced, np.asarray(self.fitted.point.coefficients))
+        return _fitted_to(self.fitted, inside, begin=begin, settled=settled)
+
+    def _normal_equations(
+        self, vector: Vector, residuals: Vector, columns: Vector, inside: Mask
+    ) -> tuple[Vector, Vector]:
+        """Return gradient (K,) and Hessian (K, K), each kind of residual by its own spread."""
+        objective, point = self.fitted.objective, self.fitted.point
+        shared = _shared_part(residuals[:, :, inside])[:, None, None]
+        error = residuals - shared * residuals.mean(axis=1, keepdims=True)
+        slopes = columns - shared[..., None] * columns.mean(axis=1, keepdims=True)
+        spread = robust_sd(error[:, :, inside], axis=(1, 2))[:, None, None]
+        error = np.where(inside, error, 0.0) / spread
+        slopes = np.where(inside[:, None], slopes, 0.0) / spread[..., None]
+        robust = huber_weights(error, ROBUST)
+        kinds, windows = np.asarray(point.offsets).shape[0], error.shape[-1]
+        size = columns.shape[-1] + kinds
+        gradient, hessian = np.zeros((size, windows)), np.zeros((size, size, windows))
+        gradient[:-kinds] = np.einsum("asfk,asf->kf", slopes, robust * error)
+        hessian[:-kinds, :-kinds] = np.einsum("asfk,asf,asfl->klf", slopes, robust, slopes)
+        sums = SegmentSums(
+            loss=jnp.asarray(0.5 * (robust * error**2).sum(axis=(0, 1))),
+            gradient=jnp.asarray(gradient),
+            hessian=jnp.asarray(hessian),
+            squares={},
+            counts={},
+            crash_time=jnp.full(windows, jnp.inf),
+            states=None,
+        )
+        _, down, curved = normal_equations(
+            objective.space,
+            objective.segments.flight,
+            Point(jnp.asarray(vector), point.offsets),
+            self.fitted.criterion,
+            sums,
+        )
+        count = columns.shape[-1]
+        return np.asarray(down)[:count], np.asarray(curved)[:count, :count]
+
+
+def _shared_part(residuals: Vector) -> Vector:
+    """Return the part (6,) of a window's mean residual to take off, which leaves white ones.
+
+    Drift of the measured speeds is the same throughout a window: a random intercept, whose variance
+    beside that of the rest says how much less the mean tells than what is within (generalised
+    least squares; Fuller and Battese 1973).
+
+    Parameters
+    ----------
+    residuals
+        (6, S, F) of S stretches of F windows.
+    """
+    stretches = residuals.shape[1]
+    mean = residuals.mean(axis=1)
+    within = robust_sd(residuals - mean[:, None], axis=(1, 2)) ** 2
+    within = within * stretches / max(stretches - 1, 1)
+    between = np.maximum(robust_sd(mean, axis=(1,)) ** 2, within / stretches)
+    return np.asarray(1.0 - np.sqrt(within / stretches / between))
+
+
+def with_inputs_balanced(
+    job: Job,
+    fitted: Fitted,
+    examination: Examination,
+    on_message: Callable[[str], None],
+    *,
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
+) -> tuple[Fitted, Examination, tuple[Finding, ...]]:
+    """Return the fit whose inertia balances motion and rotor speeds, or as it is; what to say.
+
+    With it the examination of what is returned, whose intervals reach as far as the balance where
+    that is not taken; ``in_doubt`` is as for `examine`.
+
+    Only where rotor speeds are fed in: how commands turn into them would have to be known first.
+    """
+    objective = fitted.objective
+    segments = objective.segments
+    model = objective.tunable.at(jnp.asarray(fitted.point.coefficients))
+    moved = bool(objective.conditions) or markers_of(model.vehicle) is not None
+    if (
+        moved
+        or job.accelerations is not None
+        or any(inlet != "rotor_speed" for inlet in job.inlets)
+    ):
+        return fitted, examination, ()
+    on_message("Balancing the recorded motion and the rotor speeds.")
+    balance = balance_of(objective, fitted.point, job.fitted)
+    settling = _Settling(fitted, balance, objective.tunable)
+    begin = np.asarray(fitted.point.coefficients)
+    balanced = settling.at(np.ones(segments.count, bool), begin)
+    vector = settling.refitted(np.ones(segments.count, bool), balanced)
+    as_fitted, as_balanced = _losses_left_out(settling, balanced)
+    point = Point(jnp.asarray(vector), fitted.point.offsets)
+    taken = as_balanced <= (1.0 + TOLERATED) * as_fitted
+    findings = _findings(fitted, point, as_balanced / as_fitted, taken=taken)
+    otherwise = alternatives_of(objective, fitted.point)
+    if not taken:
+        space = objective.space
+        here, there = (np.asarray(space.scaled(jnp.asarray(v))) for v in (begin, balanced))
+        moves = dict(zip(space.names, np.abs(there - here).tolist(), strict=True))
+        doubt = {n: max(moves[n], in_doubt.get(n, 0.0)) for n in moves if n in TURNS}
+        kept = examine(fitted, otherwise=otherwise, in_doubt={**in_doubt, **doubt})
+        return fitted, kept, findings
+    scores = objective.sums(point, fitted.criterion, derivatives=False)
+    loss, _, _ = normal_equations(
+        objective.space, np.asarray(segments.flight), point, fitted.criterion, scores
+    )
+    fitted = replace(fitted, point=point, loss_best=float(loss))
+    examination = examine(fitted, otherwise=otherwise, in_doubt=in_doubt, at_minimum=False)
+    return fitted, examination, findings
+
+
+def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, float]:
+    """Return the loss of what is left out, over all folds: as fitted to the rest, and balanced."""
+    fitted = settling.fitted
+    segments = fitted.objective.segments
+    flight = np.asarray(segments.flight)
+    fold = flight
+    if fitted.objective.flights < 2:
+        fold = (segments.begins > np.median(segments.begins)).astype(int)
+    numbers = np.unique(fold)
+    vectors = np.stack(
+        [
+            *(_fitted_to(fitted, fold != number) for number in numbers),
+            *(
+                settling.refitted(fold != number, settling.at(fold != number, balanced))
+                for number in numbers
+            ),
+        ]
+    )
+    offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
+    points = Point(jnp.asarray(vectors), jnp.asarray(offsets))
+    flown = sums_at(fitted.objective, points, fitted.criterion, derivatives=False)
+    losses = np.asarray(flown.loss)
+    out = np.array([losses[row, fold == n].sum() for row, n in enumerate([*numbers, *numbers])])
+    as_fitted, as_balanced = out.reshape(2, -1).sum(axis=1)
+    return float(as_fitted), float(as_balanced)
+
+
+def _fitted_to(
+    fitted: Fitted,
+    inside: Mask,
+    *,
+    begin: Vector | None = None,
+    settled: Mask | None = None,
+) -> Vector:
+    """Return where a few steps lead from the fit, if only some windows (F,) are fitted.
+
+    ``begin`` (K,) is another place to begin, ``settled`` (K,) what stays as it is there.
+    """
+    objective = fitted.objective
+    weights = {
+        name: eqx.tree_at(
+            lambda m: m.weight, measured, measured.weight * jnp.asarray(inside, float)
+        )
+        for name, measured in objective.segments.measured.items()
+    }
+    some = eqx.tree_at(lambda o: o.segments.measured, objective, weights)
+    held = np.isin(objective.space.names, list(set(fitted.held.values())))
+    if settled is not None:
+        held |= settled
+    start = fitted.point.coefficients if begin is None else jnp.asarray(begin)
+    problem = StageProblem(
+        objective=some,
+        criterion=fitted.criterion,
+        stage=LEFT_OUT,
+        points=Point(start[None], fitted.point.offsets[None]),
+        losses=np.array([np.inf]),
+        free=Free(~held, np.zeros(fitted.point.offsets.shape, bool)),
+        seed=0,
+        damping=np.ones(1),
+        last=True,
+    )
+    search = LeastSquares()
+    state = search.init(problem)
+    for _ in range(LEFT_OUT.steps):
+        state, iterate = search.step(problem, state)
+        if search.terminate(problem, state):
+            break
+    return np.asarray(iterate.points.coefficients[0])
+
+
+def _findings(fitted: Fitted, balanced: Point, loss: float, *, taken: bool) -> tuple[Finding, ...]:
+    """Return which moments of inertia the balance changes by more than `TOLD`, if any.
+
+    ``loss`` is that of what was left out, over the fit's.
+    """
+    space = fitted.objective.space
+    before, after = (space.numbers(p.coefficients) for p in (fitted.point, balanced))
+    changed = {
+        name: (before[name], after[name])
+        for name in before
+        if name.startswith("inertia_") and abs(after[name] / before[name] - 1.0) > TOLD
+    }
+    if not changed:
+        return ()
+    code = Code.INERTIA_BALANCED if taken else Code.INERTIA_NOT_BALANCED
+    numbers = {
+        key: value
+        for name, (old, new) in changed.items()
+        for key, value in ((f"{name}_fitted", old), (f"{name}_balanced", new))
+    }
+    numbers["error"] = float(np.sqrt(loss))
+    level: Level = "info" if taken else "warning"
+    return (Finding(code, level, "moments of inertia", numbers, tuple(changed)),)

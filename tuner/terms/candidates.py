@@ -1,0 +1,138 @@
+"""Which groups of coefficients a fit may add, and its problem with all of them in it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import jax.numpy as jnp
+
+from tuner.config import JobFile
+from tuner.objective.criterion import Point
+from tuner.objective.normal import Objective
+from tuner.vehicle import COEFFICIENTS, VehicleFile, conditions, term_groups, values_of
+from tuner.vehicle.space import Space, extended
+
+Groups = Mapping[str, tuple[str, ...]]
+"""Group -> its coefficients."""
+
+PRESENT = 0.5
+"""Probability a priori that a vehicle has an effect in a size that flights could tell."""
+STANDS_IN = 0.1
+"""That it has what one group describes as a whole and others, candidates beside it, one by one."""
+
+
+def candidate_groups(vehicle: VehicleFile, space: Space, job: JobFile) -> Groups:
+    """Return the groups that may be added: no coefficient of theirs is given, free or fixed."""
+    given, groups = values_of(vehicle), term_groups()
+    taken = {*space.free, *job.fixed}
+    return {
+        group: names
+        for group, names in groups.items()
+        if not taken.intersection(names)
+        and all(given.get(name) in (None, COEFFICIENTS[name].neutral) for name in names)
+    }
+
+
+def groups_around(objective: Objective, *, closed_loop: bool) -> Groups:
+    """Return the groups of what may surround each flight, that a fit may add.
+
+    They are nuisances with a value for each flight: the wind of flights that are flown whole in
+    their closed loop (over a window, the start explains as much), and there the decline of a
+    battery where no voltage was recorded.
+    """
+    if not closed_loop:
+        return {}
+    groups: dict[str, tuple[str, ...]] = {"wind": ("wind_x", "wind_y")}
+    if objective.segments.log_voltage is None:
+        groups["battery_decline"] = ("battery_decline",)
+    return {
+        group: names
+        for group, names in groups.items()
+        if not set(names).intersection(objective.conditions)
+    }
+
+
+def groups_in(space: Space, others: Collection[str]) -> Groups:
+    """Return the groups of terms that are wholly free, but for others."""
+    return {
+        group: names
+        for group, names in term_groups().items()
+        if group not in others and set(names) <= set(space.free)
+    }
+
+
+def names_in(groups: Groups) -> tuple[str, ...]:
+    """Return all that some groups hold: coefficients, and what surrounds each flight."""
+    return tuple(name for names in groups.values() for name in names)
+
+
+def coefficients_in(groups: Groups) -> tuple[str, ...]:
+    """Return the coefficients of some groups."""
+    return tuple(n for names in groups.values() for n in names if n not in conditions())
+
+
+def conditions_in(groups: Groups) -> tuple[str, ...]:
+    """Return what of some groups surrounds each flight."""
+    return tuple(n for names in groups.values() for n in names if n in conditions())
+
+
+def groups_named(terms: Sequence[str], space: Space) -> Groups:
+    """Return the groups, or coefficients, that a job file names and that are not free yet.
+
+    What surrounds a flight is none of them: it is estimated from the start of the search on.
+    """
+    groups = term_groups()
+    named: dict[str, tuple[str, ...]] = {}
+    taken = {*space.free, *conditions()}
+    for term in terms:
+        members = groups.get(term, (term,) if term in COEFFICIENTS else ())
+        names = tuple(name for name in members if name not in taken)
+        if names:
+            named[term] = names
+            taken.update(names)
+    return named
+
+
+def is_stand_in(group: str) -> bool:
+    """Return whether a group describes as a whole what other terms do one by one."""
+    return any(COEFFICIENTS[name].stands_in for name in term_groups().get(group, ()))
+
+
+def presence_of(names: Collection[str]) -> float:
+    """Return the probability a priori that a vehicle has a group of these coefficients.
+
+    In a size that flights could tell: from what is as good as absent on.
+    """
+    stands_in = any(name in COEFFICIENTS and COEFFICIENTS[name].stands_in for name in names)
+    return STANDS_IN if stands_in else PRESENT
+
+
+def reads_recording(group: str) -> bool:
+    """Return whether a group's law reads a recorded signal, which gusts do not shape."""
+    return any(COEFFICIENTS[name].reads for name in term_groups().get(group, ()))
+
+
+def start_of(names: Sequence[str]) -> dict[str, float]:
+    """Return the neutral value of each coefficient of a term."""
+    values = {}
+    for name in names:
+        neutral = COEFFICIENTS[name].neutral
+        assert neutral is not None, "a term's coefficient has a neutral value"
+        values[name] = neutral
+    return values
+
+
+def with_terms(
+    objective: Objective, point: Point, names: Sequence[str], job: JobFile
+) -> tuple[Objective, Point]:
+    """Return a problem with more coefficients free, and its point with them at neutral values."""
+    if not names:
+        return objective, point
+    space = extended(objective.space, names, job, start_of(names))
+    return replace(objective, space=space), Point(
+        jnp.concatenate(
+            [jnp.asarray(point.coefficients), jnp.asarray(space.initial[-len(names) :])]
+        ),
+        point.offsets,
+    )

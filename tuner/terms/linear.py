@@ -1,0 +1,348 @@
+"""A fit in linear approximation about a point: what adding, freeing or leaving out would change.
+
+The loss of each stretch of time is a quadratic in the coefficients, from one Jacobian:
+``L(x + δ) = L(x) + sᵀδ + ½ δᵀHδ`` in the scaled coordinates, each segment's start and each flight's
+offsets eliminated. A group of coefficients is added by letting its δ move; one in the model is
+taken away by the δ that leads back to its neutral value. What surrounds each flight, as its wind
+does, has a column for each flight, which no other flight sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.numerics import scaled_solve
+from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
+from tuner.objective.flight_batches import portion, portions
+from tuner.objective.normal import Objective
+from tuner.uncertainty.information import BLOCK, FisherInformation, information_from_jacobian
+from tuner.uncertainty.stretches import Stretches
+from tuner.vehicle import REGISTRY
+from tuner.vehicle.space import Parameter, Space
+
+Array = NDArray[np.float64]
+Columns = NDArray[np.intp]
+
+SECTIONS = 3
+"""Into how many sections in time flights are cut, where sections are left out."""
+COLUMNS = 16
+"""Parameters to differentiate by at a time, whatever the number in the model: one program."""
+RIDGE = 1e-12
+"""Added to a Hessian of unit diagonal: what it lets move is what nothing determines."""
+
+
+@dataclass(frozen=True)
+class Linear:
+    """The loss about a point, stretch by stretch; P columns, S stretches that see L of them each.
+
+    Attributes
+    ----------
+    scaled
+        (P,) the point.
+    hessian, score
+        (S, L, L) and (S, L).
+    prior, pull
+        (P, P) information of all priors, and (P,) gradient of those of the coefficients.
+    prior_sd
+        (P,) of each coefficient's own prior.
+    flight, section
+        (S,) where each stretch belongs.
+    loss
+        Half the robust sum of squares of all flights.
+    seen
+        (S, L) which columns each stretch sees; None where all see all.
+    around
+        How many of the last columns say what surrounds one flight each.
+    """
+
+    scaled: Array
+    hessian: Array
+    score: Array
+    prior: Array
+    pull: Array
+    prior_sd: Array
+    flight: NDArray[np.intp]
+    section: NDArray[np.intp]
+    loss: float
+    seen: NDArray[np.intp] | None = None
+    around: int = 0
+
+    @property
+    def flights(self) -> int:
+        """How many flights there are."""
+        return len(np.unique(self.flight))
+
+    @property
+    def columns(self) -> NDArray[np.intp]:
+        """Which columns (S, L) each stretch sees."""
+        if self.seen is not None:
+            return self.seen
+        return np.broadcast_to(np.arange(len(self.scaled)), self.score.shape)
+
+    def sees_alike(self, group: Columns) -> bool:
+        """Return whether a group is of the vehicle: every flight's stretches see its columns."""
+        if self.flights == 1:
+            return bool((group < len(self.scaled) - self.around).all())
+        return self.seen is None or bool(np.isin(group, np.intersect1d(*self.seen[[0, -1]])).all())
+
+    def information(self, inside: NDArray[np.bool_] | None = None) -> Array:
+        """Return the information (P, P) of some stretches (S,), of all by default."""
+        total = np.zeros((len(self.scaled), len(self.scaled)))
+        inside = np.ones(len(self.flight), bool) if inside is None else inside
+        for number in np.unique(self.flight[inside]):
+            of_flight = inside & (self.flight == number)
+            seen = self.columns[np.argmax(of_flight)]
+            total[np.ix_(seen, seen)] += self.hessian[of_flight].sum(axis=0)
+        return total
+
+    def slopes(self, change: Array) -> Array:
+        """Return the gradient (S, P) of each stretch's loss after a change (P,)."""
+        local = self.score + np.einsum("spq,sq->sp", self.hessian, change[self.columns])
+        return self._spread(local)
+
+    @property
+    def diagonals(self) -> Array:
+        """The information (S, P) of each stretch about each column by itself."""
+        return self._spread(np.einsum("spp->sp", self.hessian))
+
+    def stretches(self, columns: Columns, change: Array, seconds: float) -> Stretches:
+        """Return what longer stretches say of some columns after a change (P,).
+
+        Each flight is cut into stretches alike, as close to so many seconds as they can be.
+        """
+        slopes, information, score = self.slopes(change), [], []
+        for number in np.unique(self.flight):
+            of_flight = np.flatnonzero(self.flight == number)
+            seen = self.columns[of_flight[0]]
+            mine = np.flatnonzero(np.isin(columns, seen))
+            local = np.searchsorted(seen, columns[mine])
+            for part in np.array_split(of_flight, max(round(len(of_flight) * BLOCK / seconds), 1)):
+                square = np.zeros((len(columns), len(columns)))
+                square[np.ix_(mine, mine)] = self.hessian[part].sum(axis=0)[np.ix_(local, local)]
+                information.append(square)
+                score.append(slopes[part].sum(axis=0)[columns])
+        return Stretches(np.stack(information), np.stack(score))
+
+    def _spread(self, local: Array) -> Array:
+        """Return rows (S, L) of what stretches see as rows (S, P), zero where they see nothing."""
+        rows = np.zeros((len(local), len(self.scaled)))
+        np.put_along_axis(rows, self.columns, local, axis=1)
+        return rows
+
+    def step(
+        self, free: Columns, *, inside: NDArray[np.bool_], from_: Array | None = None
+    ) -> Array:
+        """Return the change (P,) that minimises the loss of some stretches.
+
+        Parameters
+        ----------
+        free
+            What may move.
+        inside
+            (S,) which stretches are fitted.
+        from_
+            (P,) change that is made anyway; none by default.
+        """
+        change = np.zeros(len(self.scaled)) if from_ is None else from_.copy()
+        hessian = self.information(inside) + self.prior
+        score = self._spread(self.score)[inside].sum(axis=0)
+        slope = score + self.pull + hessian @ change
+        square = hessian[np.ix_(free, free)]
+        change[free] -= scaled_solve(square, slope[free], RIDGE)
+        return change
+
+    def change_of_loss(self, change: Array) -> Array:
+        """Return by how much each stretch's loss (S,) changes."""
+        local = change[self.columns]
+        quadratic = np.einsum("sp,spq,sq->s", local, self.hessian, local, optimize=True)
+        return np.asarray((self.score * local).sum(axis=1) + 0.5 * quadratic)
+
+    def folds(self, by: NDArray[np.intp]) -> Iterator[NDArray[np.bool_]]:
+        """Return which stretches (S,) each fold leaves out."""
+        for number in np.unique(by):
+            yield by == number
+
+
+def linear_at(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    *,
+    offsets_fitted: NDArray[np.bool_],
+    around: Sequence[str] = (),
+) -> Linear:
+    """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
+
+    Flights whose Jacobian would not fit half of the objective's memory take turns: its columns are
+    put in another order, which copies them.
+
+    Parameters
+    ----------
+    objective, point, criterion
+        The fit. Its last conditions are those of ``around``.
+    offsets_fitted
+        (offsets, N) which offsets move with the others.
+    around
+        Conditions to have columns for, behind those of the coefficients: N for each of them.
+    """
+    parts, loss = [], 0.0
+    for flights in portions(replace(objective, memory=objective.memory // 2), point, criterion):
+        batch = portion(objective, point, criterion, flights)
+        jacobian = batch[0].jacobian(*batch[1:])
+        fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
+        parts.append(
+            information_from_jacobian(
+                *_with_coefficients_around(*batch, jacobian, around), offsets_fitted=fitted
+            )
+        )
+        loss += _loss_of(batch[0], batch[2], jacobian)
+    information = FisherInformation.joined(parts)
+    rows = np.asarray(point.offsets)[len(point.offsets) - len(around) :]
+    scaled = np.concatenate(
+        [
+            np.asarray(objective.space.scaled(jnp.asarray(point.coefficients))),
+            (rows * units_of(around)[:, None]).ravel(),
+        ]
+    )
+    mean = np.concatenate([objective.space.prior_mean, np.zeros(rows.size)])
+    return linear_of(information, scaled, mean, loss, around=len(around))
+
+
+def _with_coefficients_around(
+    objective: Objective,
+    point: Point,
+    criterion: Criterion,
+    jacobian: Jacobian,
+    around: Sequence[str],
+) -> tuple[Objective, Point, Criterion, Jacobian]:
+    """Return a problem in which some conditions count as coefficients, and its Jacobian.
+
+    Only the columns' order and scale are that of such a problem: it is not to be simulated.
+    """
+    if not around:
+        return objective, point, criterion, jacobian
+    count, offsets = len(objective.space), len(point.offsets)
+    left = offsets - len(around)
+    some = next(iter(jacobian.columns.values()))
+    order = np.concatenate(
+        [
+            np.arange(count),
+            np.arange(count + left, count + offsets),
+            np.arange(count, count + left),
+            np.arange(count + offsets, len(some)),
+        ]
+    )
+    beside = [_condition(name, unit) for name, unit in zip(around, units_of(around), strict=True)]
+    space = Space((*objective.space.parameters, *beside), objective.space.fixed)
+    return (
+        replace(objective, space=space, conditions=objective.conditions[: -len(around)]),
+        Point(
+            jnp.concatenate([jnp.asarray(point.coefficients), jnp.zeros(len(around))]),
+            point.offsets[:left],
+        ),
+        criterion,
+        replace(
+            jacobian,
+            columns={name: np.asarray(c)[order] for name, c in jacobian.columns.items()},
+        ),
+    )
+
+
+def _condition(name: str, unit: float) -> Parameter:
+    """Return a condition as a parameter that moves by a unit, its number in a point's rows."""
+    row = REGISTRY[name]
+    return Parameter(
+        name=name,
+        ratios={name: 1.0},
+        initial=0.0,
+        lower=-row.prior_sd,
+        upper=row.prior_sd,
+        scale="linear",
+        prior_mean=0.0,
+        prior_sd=row.prior_sd,
+        prior_given=False,
+        unit_step=unit,
+    )
+
+
+def linear_of(
+    information: FisherInformation, scaled: Array, mean: Array, loss: float, *, around: int = 0
+) -> Linear:
+    """Return the linear approximation from the information at a point and its loss.
+
+    Parameters
+    ----------
+    information
+        The last ``around`` of its coefficients are conditions.
+    scaled, mean
+        (P,) the point, and the mean of the priors: of K coefficients, then of each condition for
+        each flight.
+    loss
+        Half the robust sum of squares.
+    around
+        How many conditions.
+    """
+    size = information.score.shape[-1]
+    count, flights = size - around, int(information.flight.max()) + 1
+    hessian, score, flight, number = _stretches(information)
+    section = np.minimum(number * SECTIONS // (number.max() + 1), SECTIONS - 1)
+    flown = np.einsum("spp->s", hessian) > 0
+    flight = flight[flown]
+    of_prior = np.diag(information.prior)
+    own = np.concatenate([of_prior[:count], np.repeat(of_prior[count:], flights)])
+    prior = np.diag(own)
+    prior[:count, :count] += information.nuisance_prior[:count, :count]
+    seen = np.hstack(
+        [
+            np.tile(np.arange(count), (len(flight), 1)),
+            count + flights * np.arange(around) + flight[:, None],
+        ]
+    )
+    return Linear(
+        scaled=scaled,
+        hessian=hessian[flown],
+        score=score[flown],
+        prior=prior,
+        pull=own * (scaled - mean),
+        prior_sd=1.0 / np.sqrt(own),
+        flight=flight,
+        section=section[flown],
+        loss=loss,
+        seen=seen if around else None,
+        around=around * flights,
+    )
+
+
+def _stretches(
+    information: FisherInformation,
+) -> tuple[Array, Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Return Hessian (S, L, L), score (S, L), flight (S,) and number in it of every `BLOCK` s.
+
+    Windows that begin in the same stretch are one: their residuals are no more independent than
+    those of a flight that is flown whole.
+    """
+    size, blocks = information.score.shape[-1], information.blocks.shape[2]
+    begins = information.begins[:, None] / BLOCK + np.arange(blocks)
+    numbers = np.floor(begins + 1e-9).astype(np.intp).ravel()
+    keys = np.stack([np.repeat(information.flight, blocks), numbers], axis=-1)
+    found, member = np.unique(keys, axis=0, return_inverse=True)
+    hessian, score = np.zeros((len(found), size, size)), np.zeros((len(found), size))
+    np.add.at(hessian, member, information.blocks.sum(axis=0).reshape(-1, size, size))
+    np.add.at(score, member, information.score.sum(axis=0).reshape(-1, size))
+    return hessian, score, found[:, 0], found[:, 1]
+
+
+def _loss_of(objective: Objective, criterion: Criterion, jacobian: Jacobian) -> float:
+    """Return half the robust sum of squares, as the search counts it."""
+    flight, limit, total = np.asarray(objective.segments.flight), float(criterion.huber), 0.0
+    for channel, residuals in jacobian.residuals.items():
+        size = np.abs(np.asarray(residuals) / np.asarray(criterion.scale[channel])[flight])
+        with np.errstate(invalid="ignore"):
+            squares = np.where(size > limit, 2.0 * limit * size - limit**2, size**2)
+        total += 0.5 * float(squares.sum())
+    return total

@@ -1,0 +1,400 @@
+"""Which terms beyond the base model a job's fit holds, and the fit with them.
+
+One Jacobian scores all candidate groups at the fitted point. If one of them gains by more than
+chance all are fitted together, from where the search began; backward elimination takes away those
+that do not hold their places beside the others. The rest stays if each flight, predicted by a fit
+to the others, is then met better by more than the scatter.
+
+What surrounds each flight (its wind, the decline of its battery) has a column for each flight.
+Other flights cannot predict it, sections of its own can; a flight that is left out keeps it, as it
+keeps its clocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from tuner.job.findings import findings_at
+from tuner.objective.criterion import Point, units_of
+from tuner.objective.normal import Objective, with_conditions
+from tuner.search.estimation import OnProgress, free_offsets
+from tuner.search.extension import with_groups
+from tuner.search.fitted import Fitted
+from tuner.search.loop import loop_of, with_loop
+from tuner.search.optimiser import Free
+from tuner.search.polish import polished, searched_again
+from tuner.search.problem import Job
+from tuner.search.progress import Progress
+from tuner.terms.candidates import (
+    Groups,
+    coefficients_in,
+    conditions_in,
+    groups_in,
+    is_stand_in,
+    names_in,
+    presence_of,
+    reads_recording,
+    start_of,
+    with_terms,
+)
+from tuner.terms.doubt import in_doubt
+from tuner.terms.held_out_score import predicted_losses, vector_after
+from tuner.terms.linear import linear_at
+from tuner.terms.rows import row_of
+from tuner.terms.score import Score, score, surviving
+from tuner.terms.selection_state import Selected, Standing, offsets_of
+from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.model import with_coefficients
+from tuner.wording.phrases import listed
+
+MAX_ROUNDS = 4
+"""Of additions; each round adds all that gain by more than chance, and prunes."""
+FILLED_UP_TO = 8
+"""A space is filled up to a multiple of so many coefficients, so that programs are shared."""
+WORTH_FITTING = (
+    SelectionCode.PREDICTS_FLIGHTS,
+    SelectionCode.PREDICTS_SECTIONS,
+    SelectionCode.NOT_PREDICTED,
+)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A selection among some groups, each round pruned backwards.
+
+    Base model and all candidates make up one space, and all terms are computed whichever are in
+    the model, and all that may surround the flights: fits with different terms then share their
+    compiled programs.
+    """
+
+    job: Job
+    fitted: Fitted
+    candidates: Groups
+    on_progress: OnProgress
+    on_message: Callable[[str], None]
+
+    def run(self) -> Selected:
+        """Add groups until none earns its place."""
+        state = self.seen(self.fitted, {})
+        dropped: dict[str, SelectionCode] = {}
+        if self._worth_fitting(state, dropped):
+            state = self._with_all(state) or state
+        for _ in range(MAX_ROUNDS):
+            wanted = self._wanted(state, dropped)
+            if not wanted:
+                break
+            grown = self._grown(state, wanted, dropped)
+            if grown is None:
+                continue
+            if set(grown.added) <= set(state.added):
+                break
+            state = grown
+        base = self.job, self.fitted
+        job, fitted = with_groups(
+            base, state.added, state.fitted, state.vector, said=findings_at(*base)
+        )
+        rows = self._rows(state, dropped)
+        selected = Selected(job, fitted if state.added else self.fitted, rows, base=base)
+        return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
+
+    def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:
+        """Return how far each coefficient of the model would move with what is not in it."""
+        names = [*self.job.space.names, *names_in(state.added)]
+        outside = [(self._columns(group), presence_of(group)) for group in groups]
+        moves = in_doubt(state.linear, self._columns(names), outside)
+        coefficients = [name for name in names if name not in conditions_in(self.candidates)]
+        return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
+
+    def _wanted(self, state: Standing, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
+        """Return the groups to fit next: all that gain by more than chance, if one predicts.
+
+        As long as terms are missing, those that are there stand in for them and even what is true
+        may seem not to predict; fitted with all others, each has to.
+        """
+        scores = self._worth_fitting(state, dropped)
+        return scores if any(found.earns_place for found in scores.values()) else {}
+
+    def _worth_fitting(
+        self, state: Standing, dropped: Mapping[str, SelectionCode]
+    ) -> dict[str, Score]:
+        """Return the groups that gain by more than chance in the fit, whatever they predict."""
+        return {
+            group: found
+            for group in self.candidates
+            if group not in state.added and group not in dropped
+            if (found := self._score(state, group)).reason in WORTH_FITTING
+        }
+
+    def _with_all(self, base: Standing) -> Standing | None:
+        """Return what backward elimination leaves of all groups, if it predicts better.
+
+        Where something is missing the base fit lies anywhere, and what little it shows of the
+        missing terms picks those that stand in for them, or lets none of them predict by itself. So
+        the search begins again where it began, with every candidate in the model but those that
+        describe as a whole what others do one by one: beside them nothing else would seem needed,
+        and noise would choose. They are added if something is left to explain.
+        """
+        groups = {
+            group: names for group, names in self.candidates.items() if not is_stand_in(group)
+        }
+        self.on_message(
+            f"The flights call for more than the base model: searching again with all "
+            f"{len(groups)} groups of terms, to see which can go."
+        )
+        rough = self._refitted(base, groups, anew=True)
+        trial = self._pruned(rough)
+        if trial is rough:
+            trial = self._refitted(rough, rough.added)
+        if trial.added and self._predicts_better(trial, base, by_flight=True):
+            return trial
+        return None
+
+    def _grown(
+        self, state: Standing, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
+    ) -> Standing | None:
+        """Return the fit with the groups that hold their places in it, if it predicts better."""
+        best = max(wanted, key=lambda name: wanted[name].gain_holdout)
+        for names in dict.fromkeys([tuple(wanted), (best,)]):
+            self.on_message(f"Fitting again with {listed(names)}.")
+            groups = {**state.added, **{name: self.candidates[name] for name in names}}
+            trial = self._pruned(self._refitted(state, groups))
+            by_flight = wanted[best].reason is SelectionCode.PREDICTS_FLIGHTS
+            if trial.added and self._predicts_better(trial, state, by_flight=by_flight):
+                return trial
+        dropped[best] = SelectionCode.WORSE_AFTER_REFIT
+        return None
+
+    def _pruned(self, state: Standing) -> Standing:
+        """Return the fit without the groups that do not hold their places beside the others."""
+        kept, taken = surviving(
+            state.linear,
+            self._columns(self.job.space.names),
+            {group: self._columns(names) for group, names in state.added.items()},
+            candidates=len(self.candidates),
+            neutral=self._neutral,
+            stand_ins=[group for group in state.added if is_stand_in(group)],
+            no_gusts=[group for group in state.added if _no_gust(state, group)],
+        )
+        if not taken or not kept:
+            return state if kept else replace(state, added={})
+        self.on_message(f"Fitting again without {listed(tuple(taken))}.")
+        groups = {name: self.candidates[name] for name in kept}
+        return self._pruned(self._refitted(self._without(state, taken), groups))
+
+    def _without(self, state: Standing, taken: Collection[str]) -> Standing:
+        """Return a fit moved to where, to first order, the others end without some groups.
+
+        They have to make up for what is taken away: from where they are, whole flights would lead
+        them astray.
+        """
+        space, linear = state.fitted.objective.space, state.linear
+        gone = self._columns(names_in({name: self.candidates[name] for name in taken}))
+        kept = {name: names for name, names in state.added.items() if name not in taken}
+        away = np.zeros(len(linear.scaled))
+        away[gone] = (self._neutral - linear.scaled)[gone]
+        free = self._columns([*self.job.space.names, *names_in(kept)])
+        change = linear.step(free, inside=np.ones(len(linear.flight), bool), from_=away)
+        of_flight, offsets = state.fitted.objective.of_flight, np.array(state.fitted.point.offsets)
+        for name, unit in zip(of_flight, units_of(of_flight), strict=True):
+            if name in conditions_in(kept):
+                offsets[of_flight.index(name)] += change[self._columns([name])] / unit
+        moved = vector_after(
+            space, state.fitted.point.coefficients, change[self._columns(space.names)]
+        )
+        point = Point(jnp.asarray(moved), jnp.asarray(offsets))
+        return replace(state, fitted=replace(state.fitted, point=point))
+
+    def _refitted(self, state: Standing, groups: Groups, *, anew: bool = False) -> Standing:
+        """Return the fit with exactly these groups, from where the last one ended or anew."""
+        wanted, around = coefficients_in(groups), conditions_in(self.candidates)
+        idle = tuple(name for name in around if name not in conditions_in(groups))
+        spare = [name for name in coefficients_in(self.candidates) if name not in wanted]
+        free = [*self.job.space.names, *wanted]
+        filled = [*wanted, *spare[: -len(free) % FILLED_UP_TO]]
+        objective, point = with_terms(
+            self._objective_of(state.fitted), self.fitted.point, filled, self.job.settings.job
+        )
+        objective, _ = with_conditions(objective, point, around)
+        start, names = np.array(point.coefficients), objective.space.names
+        vector = [
+            state.vector.get(name, start[i]) if name in free else start[i]
+            for i, name in enumerate(names)
+        ]
+        new = [group for group in groups if group not in state.added]
+        from_here = replace(
+            state.fitted,
+            objective=objective,
+            point=Point(jnp.asarray(vector), offsets_of(state.fitted, objective, gone=idle)),
+        )
+        offsets = free_offsets(self.job)
+        moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
+        free_ones = Free(
+            np.array([name in free for name in names]),
+            np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
+        )
+        title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
+
+        def on_progress(progress: Progress) -> None:
+            self.on_progress(replace(self.job, space=objective.space), progress)
+
+        if anew:
+            start[: len(self.job.space)] = self.job.space.initial
+            fitted = searched_again(
+                self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
+            )
+        else:
+            fitted = polished(
+                self.job, from_here, free=free_ones, title=title, on_progress=on_progress
+            )
+        return self.seen(fitted, groups)
+
+    def seen(self, fitted: Fitted, added: Groups) -> Standing:
+        """Return a fit as all candidates see it."""
+        objective, point = with_terms(
+            self._objective_of(fitted),
+            self.fitted.point,
+            coefficients_in(self.candidates),
+            self.job.settings.job,
+        )
+        around = conditions_in(self.candidates)
+        objective, _ = with_conditions(objective, point, around)
+        own = dict(
+            zip(fitted.objective.space.names, np.asarray(fitted.point.coefficients), strict=True)
+        )
+        start = np.asarray(point.coefficients)
+        vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
+        at = Point(jnp.asarray(vector), offsets_of(fitted, objective))
+        linear = linear_at(
+            objective,
+            at,
+            fitted.criterion,
+            offsets_fitted=np.asarray(at.offsets) != 0.0,
+            around=around,
+        )
+        return Standing(fitted, added, linear)
+
+    def _objective_of(self, fitted: Fitted) -> Objective:
+        """Return a fit's base problem with all candidates in the model, at their neutral values."""
+        objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
+        neutral = start_of(coefficients_in(self.candidates))
+        values = {name: jnp.asarray(value) for name, value in neutral.items()}
+        return replace(objective, model=with_coefficients(objective.model, values))
+
+    @property
+    def _space(self) -> tuple[str, ...]:
+        """The coefficients of every `Linear`, one for each flight of what surrounds it."""
+        around = conditions_in(self.candidates)
+        return (
+            *self.job.space.names,
+            *coefficients_in(self.candidates),
+            *(f"{name} {flight}" for name in around for flight in self._flights),
+        )
+
+    @property
+    def _flights(self) -> range:
+        return range(self.fitted.objective.flights)
+
+    @property
+    def _neutral(self) -> NDArray[np.float64]:
+        """Scaled neutral values (P,) of the candidates; zero for the base model's coefficients."""
+        neutral = start_of(coefficients_in(self.candidates))
+        scales = [COEFFICIENTS[name].scale for name in neutral]
+        scaled = [
+            np.log(value) if scale == "log" else value
+            for value, scale in zip(neutral.values(), scales, strict=True)
+        ]
+        around = len(conditions_in(self.candidates)) * len(self._flights)
+        return np.array([0.0] * len(self.job.space) + scaled + [0.0] * around)
+
+    def _columns(self, names: Sequence[str]) -> NDArray[np.intp]:
+        around = conditions_in(self.candidates)
+        wanted = [
+            f"{name} {flight}" if name in around else name
+            for name in names
+            for flight in (self._flights if name in around else range(1))
+        ]
+        return np.array([self._space.index(name) for name in wanted], np.intp)
+
+    def _score(self, state: Standing, group: str) -> Score:
+        """Return what a group is worth beside the others in the model."""
+        others = {name: names for name, names in state.added.items() if name != group}
+        return score(
+            state.linear,
+            self._columns([*self.job.space.names, *names_in(others)]),
+            self._columns(self.candidates[group]),
+            candidates=len(self.candidates),
+            neutral=self._neutral if group in state.added else None,
+            no_gust=_no_gust(state, group),
+        )
+
+    def _rows(
+        self, state: Standing, dropped: Mapping[str, SelectionCode]
+    ) -> tuple[SelectionRow, ...]:
+        """Return the table: what is in the model first, by what it predicts."""
+        groups = dict.fromkeys([*state.added, *self.candidates])
+        scores = {group: self._score(state, group) for group in groups}
+        rows = [
+            row_of(group, self.candidates[group], found, kept=True)
+            if group in state.added
+            else row_of(group, self.candidates[group], found, dropped.get(group), kept=False)
+            for group, found in scores.items()
+        ]
+        free = groups_in(self.job.space, self.job.first_terms)
+        rows += self._rows_of(state, free, SelectionCode.OPEN_LOOP)
+        rows += self._rows_of(state, self.job.first_terms, SelectionCode.HOVERS_TILTED)
+        return tuple(sorted(rows, key=lambda row: (not row.kept, -(row.gain_holdout or 0.0))))
+
+    def rows_of_named(self) -> tuple[SelectionRow, ...]:
+        """Return the rows of the terms that the job names, with what each is worth in the fit."""
+        state = self.seen(self.fitted, {})
+        return tuple(self._rows_of(state, self.job.first_terms, SelectionCode.ASKED_FOR))
+
+    def _rows_of(
+        self, state: Standing, groups: Groups, reason: SelectionCode
+    ) -> list[SelectionRow]:
+        """Return the rows of groups of the base model."""
+        return [
+            row_of(group, names, self._worth(state, names), reason, kept=True)
+            for group, names in groups.items()
+        ]
+
+    def _worth(self, state: Standing, names: Sequence[str]) -> Score:
+        """Return what a group of the base model is worth beside all else in the model."""
+        others = [name for name in self.job.space.names if name not in names]
+        return score(
+            state.linear,
+            self._columns([*others, *names_in(state.added)]),
+            self._columns(names),
+            candidates=len(self.candidates),
+            neutral=self._neutral,
+        )
+
+    def _predicts_better(self, trial: Standing, state: Standing, *, by_flight: bool) -> bool:
+        """Return whether a refit predicts flights left out better than the fit before it.
+
+        By more than the standard error over the flights, or, where only sections of flights can
+        show it, not worse by as much.
+        """
+        scale = state.fitted.criterion.scale
+        gains = self._predicted(state, scale) - self._predicted(trial, scale)
+        if len(gains) < 2:
+            return bool(gains.sum() > 0.0)
+        scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
+        return bool(gains.sum() > (scatter if by_flight else -scatter))
+
+    def _predicted(self, state: Standing, scale: Mapping[str, Array]) -> NDArray[np.float64]:
+        model = self._columns([*self.job.space.names, *names_in(state.added)])
+        own = self._columns(state.fitted.objective.space.names)
+        return predicted_losses(state.fitted, state.linear, model, own, scale)
+
+
+def _no_gust(state: Standing, group: str) -> bool:
+    """Return whether no gust can pass for a group: it reads a recording, or noise alone is left."""
+    return reads_recording(group) or state.fitted.leaves_noise_alone

@@ -1,0 +1,168 @@
+"""Everything that follows from one Jacobian at the end of a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.numerics import scaled_solve
+from tuner.disturbances.information import with_hidden, with_strengths
+from tuner.disturbances.predictor import Predictor
+from tuner.objective.criterion import Point
+from tuner.objective.flight_batches import portion, portions
+from tuner.objective.normal import Objective
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
+from tuner.uncertainty.full_problem import FullProblem, full_problem_of
+from tuner.uncertainty.information import FisherInformation, information_from_jacobian
+from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
+from tuner.uncertainty.residual import Residual
+from tuner.uncertainty.whiteness import whiteness
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Examination:
+    """Uncertainty and sensitivity of every coefficient, the fixed ones too.
+
+    Attributes
+    ----------
+    uncertainty
+        Of the fitted ones.
+    freed
+        Fixed coefficient -> the uncertainty had it been fitted beside the others; it is the last
+        parameter there.
+    bias
+        (L, K): percent by which each fitted coefficient is wrong for each percent by which a fixed
+        one is; the fixed ones in the order of ``freed``, the fitted in that of ``uncertainty``.
+    sensitivity
+        Of the flights to all, the fitted first.
+    residuals
+        Of every flight and channel.
+    full_problem, information
+        The problem in all coefficients, the fitted first, and the information about them.
+    """
+
+    uncertainty: Uncertainty
+    freed: Mapping[str, Uncertainty]
+    bias: Array
+    sensitivity: LocalSensitivity
+    residuals: tuple[Residual, ...]
+    full_problem: FullProblem
+    information: FisherInformation
+
+    @property
+    def known(self) -> Array:
+        """The information (K, K) about the fitted coefficients, priors included."""
+        count = len(self.full_problem.fitted)
+        return np.asarray(self.information.total[:count, :count])
+
+
+def examine(
+    fitted: Fitted,
+    *,
+    names: Sequence[str] | None = None,
+    otherwise: Mapping[str, Objective] = MappingProxyType({}),
+    in_doubt: Mapping[str, float] = MappingProxyType({}),
+    predictor: Predictor | None = None,
+    at_minimum: bool = True,
+) -> Examination:
+    """Examine a fit, or a point where nothing was fitted.
+
+    Flights whose Jacobian would not fit the objective's memory take turns.
+
+    Parameters
+    ----------
+    fitted
+        A search's result.
+    names
+        Of the fitted flights in the order of the objective; those of ``fitted.scales`` by default.
+    otherwise
+        What might be simulated differently -> the problem so simulated, for the parts of errors.
+    in_doubt
+        Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
+        out of the model; empty where none was tried.
+    predictor
+        Whose innovations say how well coefficients are known, rather than residuals.
+    at_minimum
+        Whether a search led to the point: how far it is from the minimum is then part of the error.
+    """
+    names = tuple(fitted.scales) if names is None else tuple(names)
+    full_problem = full_problem_of(fitted.objective, fitted.point)
+    objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
+    reference = references(objective.space, np.asarray(point.coefficients))
+    informations, sensitivities, predicted = [], [], []
+    slopes = None
+    if predictor is not None:
+        slopes = predictor.slopes(objective, Point(point.coefficients, predictor.feed.offsets))
+    residuals: list[Residual] = []
+    for flights in portions(objective, point, criterion):
+        batch = portion(objective, point, criterion, flights)
+        jacobian = batch[0].jacobian(*batch[1:])
+        flight_names = [names[number] for number in flights]
+        others = {
+            name: portion(replace(other, space=objective.space), point, criterion, flights)[0]
+            for name, other in otherwise.items()
+        }
+        moved = {name: other.residuals(*batch[1:]) for name, other in others.items()}
+        if predictor is not None and slopes is not None:
+            of_flights = predictor.among(flights)
+            by_strengths = slopes.moved[..., flights]
+            predicted.append(of_flights.information(*batch, others, by_strengths))
+        compared = jacobian if predictor is None else jacobian.of(predictor.rows)
+        informations.append(information_from_jacobian(*batch, compared, otherwise=moved))
+        sensitivities.append(
+            local_sensitivity(*batch, jacobian, reference=reference, flights=flight_names)
+        )
+        residuals.extend(whiteness(batch[0], jacobian, batch[2], flight_names))
+    information = FisherInformation.joined(informations)
+    if predictor is not None and slopes is not None:
+        information = with_hidden(
+            with_strengths(
+                FisherInformation.joined(predicted), slopes.information, predictor.strengths
+            ),
+            information,
+            objective.space.names,
+            len(full_problem.fitted),
+        )
+    if in_doubt:
+        moves = [in_doubt.get(name, 0.0) for name in objective.space.names]
+        information = replace(information, in_doubt=np.array(moves))
+    searched = set(full_problem.fitted) - set(fitted.held.values()) if at_minimum else set[str]()
+    information = information.resting(at_rest(objective.space, point, searched))
+    return Examination(
+        uncertainty=_uncertainty_of(full_problem, information, full_problem.fitted, names),
+        freed={
+            name: _uncertainty_of(full_problem, information, (*full_problem.fitted, name), names)
+            for name in full_problem.fixed
+        },
+        bias=_bias(full_problem, information, reference),
+        sensitivity=LocalSensitivity.joined(sensitivities),
+        residuals=tuple(residuals),
+        full_problem=full_problem,
+        information=information,
+    )
+
+
+def _uncertainty_of(
+    full_problem: FullProblem,
+    information: FisherInformation,
+    names: tuple[str, ...],
+    flights: Sequence[str],
+) -> Uncertainty:
+    space, indices = full_problem.subspace(names)
+    vector = np.asarray(full_problem.point.coefficients)[indices]
+    return uncertainty_at(space, vector, information.about(indices), flights)
+
+
+def _bias(full_problem: FullProblem, information: FisherInformation, reference: Array) -> Array:
+    """Return how the fitted coefficients follow the fixed ones, relative to both references."""
+    count = len(full_problem.fitted)
+    total, data = information.total[:count, :count], information.data[:count, count:]
+    follow = -scaled_solve(total, data).T
+    return np.asarray(follow * reference[count:, None] / reference[:count])

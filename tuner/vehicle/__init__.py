@@ -1,0 +1,49 @@
+"""The registry of coefficients, the files that hold their values, and the model made of them."""
+
+from __future__ import annotations
+
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
+from tuner.vehicle.registry import (
+    COEFFICIENTS,
+    REGISTRY,
+    conditions,
+    of_scope,
+    recording_offsets,
+    scale_group,
+    term_groups,
+)
+
+from tuner.vehicle.controller import ControllerFile, read_controller  # isort: skip
+from tuner.vehicle.vehicle import (  # isort: skip
+    VehicleFile,
+    check_mixer,
+    read_vehicle,
+    vehicle_text,
+    write_vehicle,
+)
+from tuner.vehicle.values import check_names, initial_values, values_of, with_values  # isort: skip
+
+__all__ = [
+    "COEFFICIENTS",
+    "EFFECTS",
+    "REGISTRY",
+    "Coefficient",
+    "ControllerFile",
+    "NotCarried",
+    "VehicleFile",
+    "Written",
+    "check_mixer",
+    "check_names",
+    "conditions",
+    "initial_values",
+    "of_scope",
+    "read_controller",
+    "read_vehicle",
+    "recording_offsets",
+    "scale_group",
+    "term_groups",
+    "values_of",
+    "vehicle_text",
+    "with_values",
+    "write_vehicle",
+]

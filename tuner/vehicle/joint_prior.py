@@ -1,0 +1,76 @@
+"""What ground measurements say of several coefficients together, as residuals of a search."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.core.errors import ConfigError
+from tuner.core.numerics import symmetric_eigen, unit_diagonal
+from tuner.vehicle.registry import COEFFICIENTS
+
+if TYPE_CHECKING:
+    from tuner.vehicle.space import Parameter
+
+UNKNOWN = 1e-12
+"""Share of the best-known direction's information below which a direction is not measured."""
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """A normal distribution over N coefficients' scaled coordinates (logarithm or number).
+
+    Attributes
+    ----------
+    names
+        The coefficients.
+    mean
+        (N,) scaled coordinates.
+    information
+        (N, N) inverse covariance; singular where a combination was not measured.
+    """
+
+    names: tuple[str, ...]
+    mean: NDArray[np.float64]
+    information: NDArray[np.float64]
+
+    def rows(
+        self, parameters: Sequence[Parameter], fixed: Mapping[str, float]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return A (N, K) and b (N,): half of ``|A x + b|²`` is the prior's loss.
+
+        x are the parameters' K scaled coordinates. A fixed coefficient stays at its value, which
+        the prior then says something about the others with.
+
+        Raises
+        ------
+        ConfigError
+            The job changes the scale of a measured coefficient.
+        """
+        count = len(parameters)
+        design, offset = np.zeros((len(self.names), count)), -self.mean.copy()
+        for place, name in enumerate(self.names):
+            log = COEFFICIENTS[name].scale == "log"
+            for index, parameter in enumerate(parameters):
+                if name not in parameter.ratios:
+                    continue
+                if parameter.scale != COEFFICIENTS[name].scale:
+                    remedy = "leave its scale out of the job file"
+                    raise ConfigError(name, "was measured on the ground in another scale", remedy)
+                design[place, index] = 1.0 if log else parameter.ratios[name]
+                offset[place] += math.log(parameter.ratios[name]) if log else 0.0
+                break
+            else:
+                value = fixed.get(name, COEFFICIENTS[name].neutral or 0.0)
+                known = not log or value > 0
+                offset[place] += (math.log(value) if log else value) if known else self.mean[place]
+        unit = unit_diagonal(self.information)
+        values, vectors = symmetric_eigen(self.information * np.outer(unit, unit))
+        values = np.where(values > UNKNOWN * values.max(), values, 0.0)
+        root = np.sqrt(values)[:, None] * vectors.T / unit
+        return root @ design, root @ offset

@@ -1,0 +1,145 @@
+"""A starting vehicle from what anyone can read off it: scaling laws, their sources, their errors.
+
+The laws are crude, and say by how much: each coefficient comes with the standard deviation of its
+logarithm. They hold for quadrotors from a palm's size to a metre.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from tuner.core.numerics import GRAVITY
+
+AIR = 1.225
+"""kg/m³."""
+INCH = 0.0254
+"""m."""
+HOVER_THROTTLE = 0.5
+"""Command in hover where neither a log nor kV says it: what vehicles are designed for."""
+IDLE = 0.15
+"""Rotor speed at zero command over the speed gained from there to full command."""
+CELL = 3.7
+"""V of a cell under load."""
+
+
+@dataclass(frozen=True)
+class Airframe:
+    """What can be read off a quadrotor.
+
+    Attributes
+    ----------
+    mass
+        kg, ready to fly.
+    wheelbase
+        m between opposite motors.
+    diameter, pitch
+        Of the propeller, m.
+    cells
+        In series; one is taken for a vehicle with brushed, coreless motors. None if not known.
+    motor_kv
+        rad/s per V, unloaded; None if not known.
+    hover_throttle
+        Command in hover, 0..1; None if not known.
+    rotor_height
+        m of the rotors above the centre of mass.
+    """
+
+    mass: float
+    wheelbase: float
+    diameter: float
+    pitch: float
+    cells: int | None = None
+    motor_kv: float | None = None
+    hover_throttle: float | None = None
+    rotor_height: float = 0.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A coefficient by a law: its value, the standard deviation of its logarithm, its source."""
+
+    value: float
+    error: float
+    source: str
+
+
+KNOWN: Mapping[str, Airframe] = {
+    "hovergames": Airframe(2.243, 0.5, 11 * INCH, 4.7 * INCH, 4, 920 * math.pi / 30, 0.54, 0.06),
+    "crazyflie": Airframe(0.030, 0.092, 1.85 * INCH, 1.0 * INCH, 1, 14000 * math.pi / 30, 0.86),
+}
+"""Vehicles whose coefficients are known, by the name of their shipped file."""
+
+
+def coefficients_of(airframe: Airframe) -> dict[str, Estimate]:
+    """Return name -> estimate of the coefficients that the laws know."""
+    arm, radius = 0.5 * airframe.wheelbase, 0.5 * airframe.diameter
+    ratio = airframe.pitch / airframe.diameter
+    thrust = 0.05 + 0.14 * ratio
+    power = 0.0135 + 0.115 * ratio
+    motor_constant = thrust * AIR * airframe.diameter**4 / (2 * math.pi) ** 2
+    moment_constant = power * airframe.diameter / (2 * math.pi * thrust)
+    scaling, scaling_error, scaling_source = _input_scaling(airframe, motor_constant)
+    gyration = airframe.mass * arm**2
+    tables = "line through static tables of slow propellers (UIUC propeller data site)"
+    mass_law = "a third of the mass at the motors, the rest near the centre"
+    lag = "between a palm-sized coreless motor (0.05 s) and an 11 inch brushless one"
+    flapping = "the thrust tilts by the advance ratio v/(ΩR): k/R"
+    return {
+        "inertia_xx": Estimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
+        "inertia_yy": Estimate(0.19 * gyration, 0.4, f"0.19 m r²: {mass_law}"),
+        "inertia_zz": Estimate(0.33 * gyration, 0.4, f"0.33 m r²: {mass_law}"),
+        "input_scaling": Estimate(scaling, scaling_error, scaling_source),
+        "zero_position_armed": Estimate(IDLE * scaling, 0.6, f"{IDLE:g} of input_scaling, idling"),
+        "time_constant_up": Estimate(0.025, 0.7, lag),
+        "time_constant_down": Estimate(0.035, 0.7, lag),
+        "motor_constant": Estimate(
+            motor_constant, 0.4, f"C_T ρ D⁴/(2π)² with C_T = 0.05 + 0.14 pitch/diameter: {tables}"
+        ),
+        "moment_constant": Estimate(
+            moment_constant, 0.5, "C_P D/(2π C_T) with C_P = 0.0135 + 0.115 pitch/diameter: the "
+            "same tables, a third higher as on vehicles",
+        ),
+        "rotor_drag_coefficient": Estimate(motor_constant / radius, 0.7, flapping),
+        "rolling_moment_coefficient": Estimate(
+            0.05 * motor_constant, 1.5, "0.05 of the motor constant, as of the HoverGames quad"
+        ),
+    }  # fmt: skip
+
+
+def anchored(airframe: Airframe, like: str, known: Mapping[str, float]) -> dict[str, Estimate]:
+    """Return the laws' estimates, scaled so that they hold for a vehicle whose values are known.
+
+    Parameters
+    ----------
+    airframe
+        The vehicle.
+    like
+        One of `KNOWN`, similar to it.
+    known
+        Coefficient -> value of that one.
+    """
+    there = coefficients_of(KNOWN[like])
+    return {
+        name: Estimate(
+            estimate.value * known[name] / there[name].value,
+            estimate.error / math.sqrt(2),
+            f"{like}'s, scaled by: {estimate.source}",
+        )
+        for name, estimate in coefficients_of(airframe).items()
+    }
+
+
+def _input_scaling(airframe: Airframe, motor_constant: float) -> tuple[float, float, str]:
+    """Return rad/s per unit of command, the error of its logarithm, and the source."""
+    hover = math.sqrt(airframe.mass * GRAVITY / (4 * motor_constant))
+    if airframe.hover_throttle is None and airframe.motor_kv and airframe.cells:
+        loaded = 0.45 if airframe.cells == 1 else 0.75
+        top = loaded * airframe.motor_kv * CELL * airframe.cells
+        source = f"{loaded:g} of the unloaded speed at {CELL:g} V a cell, from kV and cells"
+        return top / (1 + IDLE), 0.35, source
+    throttle = airframe.hover_throttle or HOVER_THROTTLE
+    error = 0.25 if airframe.hover_throttle else 0.4
+    source = f"weight and motor_constant give the hover's speed at a command of {throttle:g}"
+    return hover / (throttle + IDLE), error, source

@@ -1,0 +1,353 @@
+"""Which coefficients are free, how far they may go, and the vector that the search moves."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, nn
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+
+from tuner.config import JobFile
+from tuner.core.errors import ConfigError
+from tuner.vehicle import ControllerFile, VehicleFile, initial_values
+from tuner.vehicle.joint_prior import JointPrior
+from tuner.vehicle.registry import COEFFICIENTS
+from tuner.vehicle.size import Size, size_of, sized
+
+AS_TABLED = Size()
+OFF_BOUND = 0.05
+"""A start on a bound is moved inside by this share of the range."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One coordinate of the search: a coefficient, or several that are tied to it.
+
+    Attributes
+    ----------
+    name
+        The coefficient; for a tie, the first of the group.
+    ratios
+        Coefficient -> multiple of this parameter's value (1 for itself).
+    initial, lower, upper
+        In the coefficient's unit; the initial value is strictly inside.
+    scale
+        ``log`` or ``linear``.
+    prior_mean, prior_sd
+        In the scaled coordinate (logarithm or number).
+    prior_given
+        Whether the user gave the prior, or it is the weak default that only steadies the search.
+    unit_step
+        The change of the scaled coordinate that is one in the search's coordinate, mid-range.
+    usual
+        Of a linear coefficient, how large it usually is for such a vehicle; zero for others.
+    moved
+        Set where the start lay on or outside a bound and was moved: the value that it had.
+    """
+
+    name: str
+    ratios: Mapping[str, float]
+    initial: float
+    lower: float
+    upper: float
+    scale: Literal["log", "linear"]
+    prior_mean: float
+    prior_sd: float
+    prior_given: bool
+    unit_step: float
+    usual: float = 0.0
+    moved: float | None = None
+
+    def scaled(self, value: float) -> float:
+        """Return the scaled coordinate of a value."""
+        return float(np.log(value)) if self.scale == "log" else value
+
+
+class Coordinates(eqx.Module):
+    """The map from the search's z to numbers, itself in numbers: one program serves every space.
+
+    The scaled coordinate x (logarithm or number) of each parameter lies between its bounds by a
+    logistic map of z, so that no step can leave them.
+
+    Attributes
+    ----------
+    lower, width
+        (K,) lower bound and the bounds' distance, scaled.
+    stretch
+        (K,) of the logistic map.
+    is_log
+        (K,) whose scaled coordinate is the logarithm.
+    prior_mean, prior_sd
+        (K,) scaled.
+    joint_rows, joint_offset
+        (N, K) and (N,) of ground measurements, see `tuner.vehicle.joint_prior`; None without.
+    """
+
+    lower: Float[Array, " K"]
+    width: Float[Array, " K"]
+    stretch: Float[Array, " K"]
+    is_log: Bool[Array, " K"]
+    prior_mean: Float[Array, " K"]
+    prior_sd: Float[Array, " K"]
+    joint_rows: Float[Array, "N K"] | None = None
+    joint_offset: Float[Array, " N"] | None = None
+
+    def __len__(self) -> int:
+        return int(self.lower.shape[0])
+
+    def scaled(self, vector: Array) -> Array:
+        """Return the scaled coordinates (K,) of a search vector; traceable."""
+        scaled: Array = self.lower + self.width * nn.sigmoid(vector / self.stretch)
+        return scaled
+
+    def numbers(self, vector: Array) -> Array:
+        """Return the parameters' values (K,); traceable."""
+        scaled = self.scaled(vector)
+        return jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, scaled, 0.0)), scaled)
+
+
+class Space:
+    """The free coefficients and the map between them and an unbounded vector."""
+
+    def __init__(
+        self,
+        parameters: Sequence[Parameter],
+        fixed: Mapping[str, float],
+        joint_prior: JointPrior | None = None,
+        size: Size = AS_TABLED,
+    ) -> None:
+        self.size = size
+        self.parameters = tuple(parameters)
+        self.fixed = dict(fixed)
+        self.names = tuple(parameter.name for parameter in self.parameters)
+        self.lower = np.array([p.scaled(p.lower) for p in self.parameters])
+        self.width = np.array([p.scaled(p.upper) for p in self.parameters]) - self.lower
+        self.stretch = self.width / 4.0 / np.array([p.unit_step for p in self.parameters])
+        self.is_log = np.array([p.scale == "log" for p in self.parameters], bool)
+        self.prior_mean = np.array([p.prior_mean for p in self.parameters])
+        self.prior_sd = np.array([p.prior_sd for p in self.parameters])
+        self.joint_prior = joint_prior
+        self.joint_rows: NDArray[np.float64] | None = None
+        self.joint_offset: NDArray[np.float64] | None = None
+        if joint_prior is not None:
+            self.joint_rows, self.joint_offset = joint_prior.rows(self.parameters, self.fixed)
+
+    @property
+    def coordinates(self) -> Coordinates:
+        """What compiled functions need of it."""
+        return Coordinates(
+            lower=jnp.asarray(self.lower),
+            width=jnp.asarray(self.width),
+            stretch=jnp.asarray(self.stretch),
+            is_log=jnp.asarray(self.is_log),
+            prior_mean=jnp.asarray(self.prior_mean),
+            prior_sd=jnp.asarray(self.prior_sd),
+            joint_rows=None if self.joint_rows is None else jnp.asarray(self.joint_rows),
+            joint_offset=None if self.joint_offset is None else jnp.asarray(self.joint_offset),
+        )
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """The coefficients that the search moves, tied ones too."""
+        return tuple(name for parameter in self.parameters for name in parameter.ratios)
+
+    @property
+    def initial(self) -> NDArray[np.float64]:
+        """The start as a search vector, shape (K,)."""
+        return self.vector_of({p.name: p.initial for p in self.parameters})
+
+    def vector_of(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Return the search vector (K,) of coefficient values, clipped just inside the bounds."""
+        scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
+        return self.at_share((scaled - self.lower) / self.width)
+
+    def scaled(self, vector: Array) -> Array:
+        """Return the scaled coordinates (K,) of a search vector; traceable."""
+        return self.coordinates.scaled(vector)
+
+    def values(self, vector: Array) -> dict[str, Array]:
+        """Return every free coefficient's value, tied ones too; traceable."""
+        numbers = self.coordinates.numbers(vector)
+        return {
+            name: numbers[index] * ratio
+            for index, parameter in enumerate(self.parameters)
+            for name, ratio in parameter.ratios.items()
+        }
+
+    def numbers(self, vector: ArrayLike) -> dict[str, float]:
+        """Return what `values` does, as plain numbers."""
+        return {name: float(value) for name, value in self.values(jnp.asarray(vector)).items()}
+
+    def share(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
+        return np.asarray(1.0 / (1.0 + np.exp(-vector / self.stretch)))
+
+    def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the search vector (K,) that lies so far between the bounds, just inside them."""
+        inside = np.clip(share, 1e-6, 1 - 1e-6)
+        return np.asarray(np.log(inside / (1 - inside)) * self.stretch)
+
+    def from_scaled(self, index: int, scaled: float) -> float:
+        """Return a parameter's value from its scaled coordinate."""
+        return float(np.exp(scaled)) if self.is_log[index] else float(scaled)
+
+    def slope(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return dx/dz, the scaled coordinate's change with the search vector, shape (K,)."""
+        share = self.share(vector)
+        return np.asarray(self.width * share * (1 - share) / self.stretch)
+
+
+def space_of(
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    job: JobFile,
+    joint_prior: JointPrior | None = None,
+    *,
+    bypassed: Collection[str] = (),
+    freed: Collection[str] = (),
+) -> Space:
+    """Return what a job fits.
+
+    Parameters
+    ----------
+    vehicle, controller
+        Where the coefficients start.
+    job
+        Which are free, between which bounds, with which priors and ties.
+    joint_prior
+        What ground measurements say.
+    bypassed
+        Coefficients that do not act on the job's flights: they stay as they are.
+    freed
+        Coefficients that are free besides the usual ones.
+
+    Raises
+    ------
+    ConfigError
+        Nothing is free, bounds exclude or pin the start, a tie names a fixed coefficient, or a free
+        coefficient belongs to something that does not fly.
+    """
+    free = _free_names(job, bypassed, freed)
+    values = initial_values(vehicle, controller, free)
+    for name in free:
+        if name not in values:
+            section, key = COEFFICIENTS[name].place
+            raise ConfigError(
+                name,
+                "is free, but what it belongs to does not fly",
+                f"give {section}.{key} in the vehicle file, or fix it",
+            )
+    groups: dict[str, tuple[str, ...]] = {name: (name,) for name in free}
+    for ties in job.ties:
+        group = tuple(name for name in ties if name not in bypassed)
+        tied = [name for name in group if name in free]
+        if not tied:
+            continue
+        if len(tied) < len(group):
+            missing = next(name for name in group if name not in free)
+            raise ConfigError(
+                "ties", f"'{missing}' is tied to a free coefficient but fixed", "free it"
+            )
+        for name in group[1:]:
+            groups.pop(name)
+        groups[group[0]] = tuple(group)
+    size = size_of(vehicle)
+    parameters = [parameter_of(names, values, job, size) for names in groups.values()]
+    fixed = {n: v for n, v in values.items() if n not in free}
+    return Space(parameters, fixed, joint_prior, size)
+
+
+def _free_names(job: JobFile, bypassed: Collection[str], freed: Collection[str]) -> tuple[str, ...]:
+    wanted = {n for n, row in COEFFICIENTS.items() if row.free or n in freed} - set(job.fixed)
+    wanted = wanted if job.free is None else set(job.free)
+    free = tuple(name for name in COEFFICIENTS if name in wanted and name not in bypassed)
+    if not free:
+        key = "fixed" if job.free is None else "free"
+        what = "leaves no coefficient that acts on these flights free"
+        raise ConfigError(key, what, "free at least one")
+    return free
+
+
+def extended(
+    space: Space, names: Sequence[str], job: JobFile, values: Mapping[str, float]
+) -> Space:
+    """Return a space with more coefficients free, after those that it has.
+
+    Parameters
+    ----------
+    space
+        Where they are fixed, or act in no term.
+    names
+        Of the coefficients.
+    job
+        Their bounds and priors.
+    values
+        Coefficient -> where it starts; of all in ``names``.
+    """
+    added = (parameter_of((name,), values, job, space.size) for name in names)
+    fixed = {n: v for n, v in space.fixed.items() if n not in names}
+    return Space((*space.parameters, *added), fixed, space.joint_prior, space.size)
+
+
+def parameter_of(
+    names: tuple[str, ...], values: Mapping[str, float], job: JobFile, size: Size
+) -> Parameter:
+    """Return the coordinate of a coefficient and of those tied to it, as a job has it."""
+    name = names[0]
+    row, given, start = sized(COEFFICIENTS[name], size), job.coefficients.get(name), values[name]
+    scale = given.scale if given is not None and given.scale is not None else row.scale
+    bounded = given is not None and given.lower is not None and given.upper is not None
+    if row.scale == "log" and start <= 0 and not (scale == "linear" and bounded):
+        raise ConfigError(
+            name, f"starts at {start:g}, which has no logarithm", "give bounds and scale: linear"
+        )
+    lower, upper = row.limits(start)
+    lower = given.lower if given is not None and given.lower is not None else lower
+    upper = given.upper if given is not None and given.upper is not None else upper
+    if scale == "log" and lower <= 0:
+        raise ConfigError(name, f"lower bound {lower:g} has no logarithm", "use scale: linear")
+    if lower >= upper:
+        raise ConfigError(
+            name, f"its lower bound {lower:g} is not below its upper bound {upper:g}", "widen them"
+        )
+
+    def scaled(value: float) -> float:
+        return float(np.log(value)) if scale == "log" else value
+
+    moved, initial = None, start
+    margin = OFF_BOUND * (scaled(upper) - scaled(lower))
+    nearest = scaled(max(start, 1e-300))
+    inner = float(np.clip(nearest, scaled(lower) + margin, scaled(upper) - margin))
+    if not lower * (1 + 1e-9) < start < upper * (1 - 1e-9):
+        moved, initial = start, float(np.exp(inner)) if scale == "log" else inner
+    mean, sd, prior_given = scaled(initial), row.prior_sd, False
+    if scale != row.scale:
+        sd = row.prior_sd * (1.0 / abs(initial) if scale == "log" else abs(initial))
+    if given is not None and given.prior is not None:
+        mean = scaled(given.prior.mean)
+        sd = given.prior.sd / given.prior.mean if scale == "log" else given.prior.sd
+        prior_given = True
+    return Parameter(
+        name=name,
+        ratios={other: values[other] / start if start else 1.0 for other in names},
+        initial=initial,
+        lower=lower,
+        upper=upper,
+        scale=scale,
+        prior_mean=mean,
+        prior_sd=sd,
+        prior_given=prior_given,
+        unit_step=row.step if scale == row.scale else (upper - lower) / 4,
+        usual=row.prior_sd if row.scale == "linear" else 0.0,
+        moved=moved,
+    )

@@ -1,0 +1,290 @@
+"""The registry's rows of the terms beyond Gazebo's motor model, which a vehicle may lack.
+
+Each is read by a term of `sim_jax.terms`, by the motors' lag or by the battery; absent, or at its
+neutral value, it does not act and costs nothing. Coefficients of one group are chosen together.
+"""
+
+from __future__ import annotations
+
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
+
+_AXES = {"x": "forward", "y": "left", "z": "up"}
+_CENTRED = {"x": 0.01, "y": 0.01, "z": 0.03}
+"""m by which the centre of mass is usually elsewhere: builders balance a vehicle about its rotors,
+but how far below them its battery hangs is rarely measured."""
+
+
+def _effect(
+    name: str,
+    unit: str,
+    meaning: str,
+    source: str,
+    *,
+    group: str,
+    limit: float,
+    prior_sd: float,
+    step: float,
+    gazebo: str | Written = "Gazebo's motor model has no such term",
+    px4: str | Written = "the SIH model has no such term",
+    mass_exponent: int = 0,
+    length_exponent: float = 0.0,
+    informed_by: str | None = None,
+    stands_in: bool = False,
+    reads: str = "",
+) -> Coefficient:
+    """Return the row of an effect that vanishes at zero and is searched between ±limit.
+
+    ``gazebo`` and ``px4`` are where SDF and PX4 hold it, or why they do not.
+    """
+    held = {
+        target: entry if isinstance(entry, Written) else NotCarried(entry, 0.0)
+        for target, entry in (("sdf", gazebo), ("px4", px4))
+    }
+    return Coefficient(
+        name=name,
+        unit=unit,
+        meaning=meaning,
+        source=source,
+        place=(EFFECTS, name),
+        scale="linear",
+        bounds=(-limit, limit),
+        prior_sd=prior_sd,
+        step=step,
+        mass_exponent=mass_exponent,
+        length_exponent=length_exponent,
+        neutral=0.0,
+        group=group,
+        stands_in=stands_in,
+        reads=reads,
+        exported_as=held,
+        informed_by=informed_by,
+    )
+
+
+def _ratio(
+    name: str,
+    meaning: str,
+    source: str,
+    *,
+    group: str,
+    bounds: float,
+    prior_sd: float,
+    sdf: Written | None = None,
+) -> Coefficient:
+    """Return the row of a ratio that does nothing at one and is searched by its logarithm."""
+    return Coefficient(
+        name=name,
+        unit="",
+        meaning=meaning,
+        source=source,
+        place=(EFFECTS, name),
+        bounds=bounds,
+        prior_sd=prior_sd,
+        step=0.5 * prior_sd,
+        neutral=1.0,
+        group=group,
+        exported_as={
+            "sdf": sdf or NotCarried("Gazebo's motor model has no such ratio", 1.0),
+            "px4": NotCarried("the SIH model has no such ratio", 1.0),
+        },
+    )
+
+
+EFFECT_ROWS = (
+    _effect(
+        "battery_exponent",
+        "",
+        "power of the battery's voltage with which rotor speeds go",
+        "thesis 10.4: speed × (V/V_ref)^γ",
+        group="battery",
+        limit=3.0,
+        prior_sd=0.5,
+        step=0.2,
+        reads="battery_voltage",
+        gazebo="the motor plugins know no battery",
+        px4="the SIH model's thrust does not depend on the battery",
+    ),
+    _ratio(
+        "rotor_drag_ratio_y",
+        "rotor drag along left over that along forward",
+        "thesis 10.4, drag that differs between axes",
+        group="rotor_drag_ratio",
+        bounds=5.0,
+        prior_sd=0.4,
+    ),
+    *(
+        _effect(
+            f"linear_drag_{axis}",
+            "N s/m",
+            f"drag of the body along {direction} per air velocity",
+            "Faessler, Franchi and Scaramuzza 2018: -c·v",
+            group="linear_drag",
+            limit=2.0,
+            prior_sd=0.2,
+            step=0.1,
+            mass_exponent=1,
+            length_exponent=-0.5,
+            stands_in=True,
+            px4=Written("SIH_KDV"),
+        )
+        for axis, direction in _AXES.items()
+    ),
+    _effect(
+        "fuselage_drag",
+        "N s²/m²",
+        "drag of the body per squared air velocity, opposite to it",
+        "quadratic drag of a bluff body, F = -d‖v‖v",
+        group="fuselage_drag",
+        limit=0.5,
+        prior_sd=0.05,
+        step=0.02,
+        mass_exponent=1,
+        length_exponent=-1.0,
+        gazebo="the motor plugins know no drag of the body",
+        px4="the SIH model's drag is linear in the velocity",
+        informed_by="speed",
+    ),
+    _effect(
+        "thrust_inflow_coefficient",
+        "N s²/(rad m)",
+        "thrust lost per rotor speed and axial air velocity, signed",
+        "blade element theory, advance ratio (thesis 6): T = kΩ² - k_v·Ω·v∥",
+        group="thrust_inflow",
+        limit=5e-3,
+        prior_sd=2e-4,
+        step=1e-4,
+        mass_exponent=1,
+        gazebo="the motor plugins' thrust falls with the length of the axial airspeed, unsigned",
+    ),
+    *(
+        _effect(
+            f"center_of_mass_{axis}",
+            "m",
+            f"centre of mass towards {direction}, from where rotor positions count",
+            "a battery is never quite in the middle",
+            group="center_of_mass",
+            limit=0.1,
+            prior_sd=_CENTRED[axis],
+            step=0.005,
+            length_exponent=1.0,
+            gazebo=Written("pose", "centre"),
+            px4="the control allocation is left as it flew",
+        )
+        for axis, direction in _AXES.items()
+    ),
+    *(
+        _ratio(
+            f"rotor_thrust_scale_{number}",
+            f"thrust and torque of rotor {number} over the motor constant's; their product is 1",
+            "motors and propellers differ by some percent",
+            group="rotor_thrust_scale" if number < 4 else "",
+            bounds=1.5,
+            prior_sd=0.03,
+            sdf=Written("motorConstant", "rotor"),
+        )
+        for number in range(1, 5)
+    ),
+    *(
+        _effect(
+            f"torque_trim_{axis}",
+            "N m",
+            f"steady moment about {direction}",
+            "blades and motors that are mounted unevenly",
+            group="torque_trim",
+            limit=0.5,
+            prior_sd=0.02,
+            step=0.005,
+            mass_exponent=1,
+            length_exponent=1.0,
+            stands_in=True,
+        )
+        for axis, direction in _AXES.items()
+    ),
+    _effect(
+        "rotor_inertia",
+        "kg m²",
+        "moment of inertia of one rotor about its axis",
+        "Euler's equations of a body with rotors: -ω × h - dh/dt",
+        group="rotor_inertia",
+        limit=1e-2,
+        prior_sd=5e-5,
+        step=2e-5,
+        mass_exponent=1,
+        length_exponent=2.0,
+        gazebo="the rotor links' inertia turns no body in the motor model's moment",
+    ),
+    _effect(
+        "time_constant_slope",
+        "",
+        "relative growth of the time constants per relative rotor speed above hover",
+        "thesis 5: bench and flight disagree",
+        group="time_constant_slope",
+        limit=3.0,
+        prior_sd=0.5,
+        step=0.2,
+    ),
+    _effect(
+        "flapping_moment_coefficient",
+        "N s²/rad",
+        "moment across the velocity per rotor speed and in-plane air velocity",
+        "Mahony, Kumar and Corke 2012; Prouty: k·Ω·(e_z × v⊥)",
+        group="flapping_moment",
+        limit=1e-3,
+        prior_sd=2e-5,
+        step=5e-6,
+        mass_exponent=1,
+        length_exponent=1.0,
+    ),
+    _effect(
+        "ground_effect",
+        "",
+        "gain of thrust near the ground over Cheeseman and Bennett's",
+        "Cheeseman and Bennett 1955: T/(1 - g·(R/4h)²)",
+        group="ground_effect",
+        limit=8.0,
+        prior_sd=1.0,
+        step=0.5,
+    ),
+    *(
+        _effect(
+            f"angular_drag_{axis}",
+            "N m s/rad",
+            f"damping of rotation about {_AXES[axis]}",
+            source,
+            group="angular_drag",
+            limit=0.5,
+            prior_sd=usual,
+            step=0.5 * usual,
+            mass_exponent=1,
+            length_exponent=1.5,
+            stands_in=True,
+            px4=Written("SIH_KDW"),
+        )
+        for axis, usual, source in (
+            ("x", 0.01, "what is left of inflow and flapping: -c·ω"),
+            ("y", 0.01, "what is left of inflow and flapping: -c·ω"),
+            # where inflow and flapping take nothing
+            ("z", 0.003, "blades that turn against the air, not the body: -c·ω, c = 2·k_m·k_f·ΣΩ"),
+        )
+    ),
+    *(
+        Coefficient(
+            name=f"torque_gain_{axis}",
+            unit="",
+            meaning=f"share of the angular acceleration about {direction} that predicts turning",
+            source="Ljung, System Identification, 13.4: inputs that answer unseen disturbances",
+            place=(EFFECTS, f"torque_gain_{axis}"),
+            bounds=50.0,
+            prior_sd=0.7,
+            step=0.2,
+            neutral=1.0,
+            exported_as={
+                target: NotCarried(
+                    "a simulated loop's rotors answer what it simulates, and no more"
+                )
+                for target in ("sdf", "px4")
+            },
+        )
+        for axis, direction in _AXES.items()
+    ),
+)

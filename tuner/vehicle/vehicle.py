@@ -1,0 +1,311 @@
+"""The vehicle file: the coefficients of one multirotor, under the names that Gazebo users know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, JsonValue, model_validator
+
+from tuner.core.disk import write_text
+from tuner.core.errors import ConfigError, did_you_mean
+from tuner.core.yaml_document import commented, dump_yaml
+from tuner.core.yaml_section import (
+    NonNegative,
+    Number,
+    Positive,
+    Section,
+    Vector,
+    read_model,
+    refuse,
+)
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.motor_orders import MotorOrder
+
+#: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
+QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))
+
+
+ROTOR_COUNTS = (4, 6, 8)
+UNIT_COLUMN = 44
+#: Of numbers that are not fitted.
+_OTHER_UNITS = {
+    ("", "rotors"): "positions in m from the centre of mass: forward, left, up",
+    ("motor", "max_rotor_velocity"): "rad/s",
+    ("battery", "reference_voltage"): "V",
+}
+
+
+class Inertia(Section):
+    """Principal moments of inertia about the centre of mass, kg m², body axes forward-left-up."""
+
+    xx: Positive
+    yy: Positive
+    zz: Positive
+
+    @model_validator(mode="after")
+    def _belongs_to_a_body(self) -> Self:
+        for name, value in self:
+            others = self.xx + self.yy + self.zz - value
+            if value > others * (1 + 1e-9):
+                raise refuse(
+                    f"inertia.{name} is {value!r}, more than the other two together ({others:.6g})",
+                    "no rigid body has such moments, correct one of them",
+                )
+        return self
+
+
+class Rotor(Section):
+    """Where a rotor sits (body frame forward-left-up, m, from the centre of mass) and how it turns.
+
+    The spin is seen from above.
+    """
+
+    position: Vector
+    spin: Literal["ccw", "cw"]
+
+
+class Motor(Section):
+    """From command to rotor speed.
+
+    With ``v = u + input_offset``, the speed that a command u in 0..1 asks for is
+    ``min(v·input_scaling + v²·quadratic + zero_position_armed, max_rotor_velocity)``; the rotor
+    follows with one of two first-order lags.
+
+    Attributes
+    ----------
+    input_scaling
+        rad/s per unit of command.
+    zero_position_armed
+        rad/s at zero command.
+    max_rotor_velocity
+        rad/s.
+    time_constant_up, time_constant_down
+        s, while speeding up and while slowing down.
+    input_offset
+        Added to the command, 0..1.
+    quadratic
+        rad/s per squared unit of command; negative bends the curve down.
+    """
+
+    input_scaling: Positive
+    zero_position_armed: NonNegative
+    max_rotor_velocity: Positive
+    time_constant_up: Positive
+    time_constant_down: Positive
+    input_offset: Number = 0.0
+    quadratic: Number = 0.0
+
+
+class Aerodynamics(Section):
+    """From rotor speed and air velocity to force and moment.
+
+    Attributes
+    ----------
+    motor_constant
+        N s²/rad²: thrust per squared rotor speed.
+    moment_constant
+        m: drag torque per thrust.
+    rotor_drag_coefficient
+        N s²/(rad m).
+    rolling_moment_coefficient
+        N s²/rad.
+    max_relative_airspeed
+        m/s along the rotor axis, at which thrust vanishes.
+    reaction_torque
+        Whether the drag torque acts about the body's z axis or, as one simulator has it, the
+        world's.
+    thrust_law
+        ``linear`` for a simulator whose thrust goes with the rotor speed itself (motor_constant in
+        N s/rad); left out, it goes with the square.
+    """
+
+    motor_constant: Positive
+    moment_constant: NonNegative
+    rotor_drag_coefficient: NonNegative
+    rolling_moment_coefficient: NonNegative
+    max_relative_airspeed: Positive = 25.0
+    reaction_torque: Literal["body", "world"] = "body"
+    thrust_law: Literal["linear"] | None = None
+
+
+class Setup(Section):
+    """What the set-up adds to the vehicle.
+
+    Attributes
+    ----------
+    estimate_latency
+        s by which the state that the controllers see is old.
+    actuator_latency
+        s from a motor command to its effect.
+    gyro_cutoff
+        Hz of the gyro's low-pass filter; None where the controller file's holds.
+    """
+
+    estimate_latency: NonNegative = 0.0
+    actuator_latency: NonNegative = 0.0
+    gyro_cutoff: Positive | None = None
+
+
+class Battery(Section):
+    """What the motors are fed by.
+
+    Attributes
+    ----------
+    reference_voltage
+        V at which a command asks for the speed of `Motor`; with ``battery_exponent``, it asks for
+        less as the recorded voltage falls below. None takes that of the fullest battery without
+        load.
+    """
+
+    reference_voltage: Positive | None = None
+
+
+def _of_the_registry(effects: dict[str, float]) -> dict[str, float]:
+    known = [name for name, coefficient in COEFFICIENTS.items() if coefficient.is_effect]
+    for name in effects:
+        if name not in known:
+            raise refuse(f"unknown key 'effects.{name}'", did_you_mean(name, known))
+    return effects
+
+
+class VehicleFile(Section):
+    """One multirotor.
+
+    Attributes
+    ----------
+    name
+        What reports call it.
+    mass
+        kg, take-off mass.
+    inertia
+        Principal moments of inertia.
+    rotors
+        Four in PX4's motor order (front right, rear left, front left, rear right), or six or eight
+        in any order.
+    motor_order
+        In which its recordings list the motors: ``px4``, ``ardupilot``, ``betaflight``,
+        ``crazyflie`` or the recorded motor, from 1, of each rotor; a topic map that says so wins.
+    motor, aerodynamics, setup, battery
+        See there.
+    effects
+        Coefficients of terms beyond Gazebo's motor model, name -> value in the unit of the
+        registry (`tuner.vehicle`). A term whose coefficients are left out does not act.
+    source
+        Where the numbers come from: free text and numbers, kept as they are.
+    """
+
+    name: str
+    mass: Positive
+    inertia: Inertia
+    rotors: tuple[Rotor, ...]
+    motor_order: MotorOrder | None = None
+    motor: Motor
+    aerodynamics: Aerodynamics
+    setup: Setup = Setup()
+    battery: Battery = Battery()
+    effects: Annotated[dict[str, Number], AfterValidator(_of_the_registry)] = Field(
+        default_factory=dict
+    )
+    source: dict[str, JsonValue] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _has_rotors_in_order(self) -> Self:
+        if len(self.rotors) not in ROTOR_COUNTS:
+            counts = ", ".join(map(str, ROTOR_COUNTS[:-1]))
+            raise refuse(
+                f"rotors are {len(self.rotors)}", f"list {counts} or {ROTOR_COUNTS[-1]} rotors"
+            )
+        if not self.is_quad:
+            return self
+        for index, (rotor, expected) in enumerate(zip(self.rotors, QUAD_X, strict=True)):
+            sign_x, sign_y, spin = expected
+            if rotor.position[0] * sign_x <= 0 or rotor.position[1] * sign_y <= 0:
+                raise refuse(
+                    f"rotors[{index}] sits at {list(rotor.position)}",
+                    "list the rotors in PX4's order: front right, rear left, front left, rear "
+                    "right (x forward, y left)",
+                )
+            if rotor.spin != spin:
+                raise refuse(
+                    f"rotors[{index}] turns {rotor.spin}",
+                    "the quad-X mixer needs the first two rotors ccw and the last two cw",
+                )
+        return self
+
+    @property
+    def is_quad(self) -> bool:
+        """Whether it has four rotors, as the simulated mixer needs."""
+        return len(self.rotors) == len(QUAD_X)
+
+
+def check_mixer(vehicle: VehicleFile) -> None:
+    """Refuse a vehicle that the simulated mixer, which is the quad X's, cannot fly.
+
+    Raises
+    ------
+    ConfigError
+        It has more than four rotors.
+    """
+    if not vehicle.is_quad:
+        raise ConfigError(
+            vehicle.name,
+            f"has {len(vehicle.rotors)} rotors, and the simulated mixer flies four only",
+            "fit it through the inlet actuator or rotor_speed, which need no mixer",
+        )
+
+
+def read_vehicle(path: str | Path) -> VehicleFile:
+    """Read a vehicle file.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the file, the key, its value, what it should be.
+    """
+    return read_model(VehicleFile, path)
+
+
+def write_vehicle(vehicle: VehicleFile, path: str | Path, *, header: str = "") -> None:
+    """Write a vehicle file that `read_vehicle` reads back to an equal vehicle.
+
+    Parameters
+    ----------
+    vehicle
+        What to write.
+    path
+        The file to make or replace; it appears whole.
+    header
+        Comment lines for the top of the file.
+
+    Raises
+    ------
+    ConfigError
+        The file cannot be written.
+    """
+    write_text(Path(path), vehicle_text(vehicle, header=header))
+
+
+def vehicle_text(vehicle: VehicleFile, *, header: str = "") -> str:
+    """Return the text of a vehicle file, as `write_vehicle` writes it."""
+    data = vehicle.model_dump(mode="json", exclude_none=True)
+    for section in ("battery", "effects", "source"):
+        if not data[section]:
+            del data[section]
+    return commented(header) + _with_units(dump_yaml(data))
+
+
+def _with_units(text: str) -> str:
+    """Put a number's unit behind its line."""
+    units = {coefficient.place: coefficient.unit for coefficient in COEFFICIENTS.values()}
+    units |= _OTHER_UNITS
+    section = ""
+    lines = []
+    for line in text.splitlines():
+        key = line.partition(":")[0]
+        inside = line.startswith("  ")
+        if not inside:
+            section = key
+        unit = units.get((section if inside else "", key.strip()))
+        lines.append(f"{line + '  ':<{UNIT_COLUMN}}# {unit}" if unit else line)
+    return "\n".join(lines) + "\n"

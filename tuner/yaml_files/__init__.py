@@ -1,1 +1,0 @@
-"""YAML files of settings: bounded reading, validated sections, and those that ship."""
