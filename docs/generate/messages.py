@@ -66,6 +66,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "position and attitude controllers that see that frame, or with controllers that see the "
     "centre of mass and the body's axes, other than the controller file has it; it was simulated "
     "so. Set sensing.sees_markers in the controller file.",
+    Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
+    "same speed than before: the flight is used up to there. Look at its propeller, motor and "
+    "mount before you fly again.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
     "vehicle may differ.",

@@ -62,6 +62,7 @@ class Code(StrEnum):
     INERTIA_BALANCED = "inertia_balanced"  # error, NAME_fitted, NAME_balanced; names: NAMEs
     INERTIA_NOT_BALANCED = "inertia_not_balanced"  # likewise
     DISTURBANCES_FOLLOWED = "disturbances_followed"  # gust, thrust (shares), both _seconds
+    ROTOR_CHANGED = "rotor_changed"  # seconds, rotor (from 1), loss (share); names: its place
     INPUT_LATE = "input_late"  # seconds
     GYRO_OFFSET = "gyro_offset"  # rate (rad/s); names: the axis
     FLIGHT_UNMATCHED = "flight_unmatched"  # channel -> multiple of the noise

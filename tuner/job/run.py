@@ -21,6 +21,7 @@ from tuner.core.spans import span
 from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
 from tuner.disturbances.estimation import Examined, examined
+from tuner.equation_error.change import used_up_to_changes
 from tuner.evaluate.best_fit import vehicle_fitted
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.cross_validation import cross_validate, jackknife_errors
@@ -225,10 +226,11 @@ def _prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
     with span("reading"):
         recordings, left_out = read_usable(settings)
     with span("check"):
+        recordings, changed = used_up_to_changes(recordings, settings.vehicle)
         recordings = with_inputs_on_time(recordings, settings.vehicle)
         job, said = with_accelerations(job_of(settings, recordings))
         job = with_first_terms(job)
-        return job, (*left_out, *inputs_late(job), *said, *check_recordings(job))
+        return job, (*left_out, *changed, *inputs_late(job), *said, *check_recordings(job))
 
 
 def _fitted(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -153,6 +153,16 @@ class Flight:
     def spins_freely(self) -> bool:
         """Whether it is a yaw spin in which nothing holds position, roll and pitch."""
         return self.yaw_rate_setpoint is not None and not self.level_held
+
+    def until(self, seconds: float) -> Flight:
+        """Return the flight up to a time in s since its start."""
+        inside = self.time <= seconds
+        return replace(
+            self,
+            time=self.time[inside],
+            signals={name: rows[inside] for name, rows in self.signals.items()},
+            series={name: rows.between(-np.inf, seconds) for name, rows in self.series.items()},
+        )
 
     def has(self, signal: str) -> bool:
         """Return whether any sample of a signal was recorded."""

@@ -143,6 +143,17 @@ def disturbances_followed(finding: Finding) -> str:
     )
 
 
+def rotor_changed(finding: Finding) -> str:
+    """Return which rotor changed within a flight, when, and by how much."""
+    loss, (place,) = finding.numbers["loss"], finding.names
+    change = f"{100.0 * abs(loss):.0f} % {'less' if loss > 0.0 else 'more'}"
+    seconds = finding.numbers["seconds"]
+    return (
+        f"From t = {seconds:.1f} s of this flight rotor {finding.numbers['rotor']:.0f} ({place}) "
+        f"gives {change} thrust at the same speed than before: the flight is used up to there."
+    )
+
+
 def flight_unmatched(finding: Finding) -> str:
     """Return by how much each channel of a flight is missed."""
     multiples = ", ".join(

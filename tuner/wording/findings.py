@@ -359,6 +359,10 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         composed.inertia_balanced,
         "Take these inertias for effective ones, and measure them on the ground (tune bench).",
     ),
+    Code.ROTOR_CHANGED: (
+        composed.rotor_changed,
+        "Look at its propeller, motor and mount before you fly again.",
+    ),
     Code.SETPOINTS_SCALED: (composed.setpoints_scaled, composed.setpoints_remedy),
     Code.SETPOINTS_FOREIGN: (
         composed.setpoints_foreign,

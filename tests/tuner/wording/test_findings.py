@@ -166,6 +166,13 @@ MADE = {
     ),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
+    Code.ROTOR_CHANGED: Finding(
+        Code.ROTOR_CHANGED,
+        "warning",
+        "a",
+        {"seconds": 22.0, "rotor": 1, "loss": 0.05},
+        ("front right",),
+    ),
     Code.FLIGHT_UNMATCHED: Finding(
         Code.FLIGHT_UNMATCHED, "warning", "a", {"position": 90.0, "body_rate": 12.0}
     ),
