@@ -19,8 +19,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from benchmarks.table import Section
 from tuner.recordings.formats import open_recording
-from tuner.recordings.locate import choose_map, locate
 from tuner.recordings.recording import Request
+from tuner.recordings.sources import choose_map, locate
 from tuner.recordings.topics import shipped_maps
 
 CIRCLE = Path(__file__).parents[1] / "reference_flights" / "circle_3mps.bag"

@@ -22,7 +22,7 @@ from tuner.evaluate.predict import Predictions, predict
 from tuner.inertial.job import fit_without_pose, without_pose
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inertial import InertialFlight
-from tuner.recordings.initial import initial_state
+from tuner.recordings.states import initial_state
 from tuner.result import BEST_FIT_FILE
 from tuner.vehicle import ControllerFile, read_vehicle
 

@@ -10,7 +10,7 @@ from tuner.config import Options
 from tuner.config.job import Method
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
-from tuner.recordings.load import load_flight
+from tuner.recordings.loader import load_flight
 from tuner.result import Run, read_run
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle_api import Named, export, simulate, text_of

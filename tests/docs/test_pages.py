@@ -21,8 +21,7 @@ from tuner.config import read_job
 from tuner.core.findings import Code
 from tuner.engine.cluster_file import read_cluster
 from tuner.ground.plan import read_bench
-from tuner.recordings.sidecar import read_sidecar
-from tuner.recordings.topics import load_topic_map
+from tuner.recordings.topics import load_topic_map, read_sidecar
 from tuner.result import RunResult
 from tuner.vehicle import read_controller, read_vehicle
 

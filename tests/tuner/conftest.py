@@ -40,7 +40,7 @@ def full_bag(updated, tmp_path_factory):
 @pytest.fixture(scope="session")
 def full_flight(full_bag):
     """The same, read."""
-    from tuner.recordings.load import load_flight  # noqa: PLC0415
+    from tuner.recordings.loader import load_flight  # noqa: PLC0415
 
     return load_flight(full_bag)
 
@@ -48,6 +48,6 @@ def full_flight(full_bag):
 @pytest.fixture(scope="session")
 def flight(bag):
     """The same, read."""
-    from tuner.recordings.load import load_flight  # noqa: PLC0415
+    from tuner.recordings.loader import load_flight  # noqa: PLC0415
 
     return load_flight(bag)

@@ -31,7 +31,7 @@ def inspect(
         from pathlib import Path
 
         from tuner.core.recording_paths import find_flights
-        from tuner.recordings.suggest import suggested_map
+        from tuner.recordings.suggestion import suggested_map
 
         for path in find_flights(flights):
             sys.stdout.write(suggested_map(Path(path)))
@@ -53,7 +53,7 @@ def inspect(
         print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
     else:
         from tuner.cli.tables import console
-        from tuner.recordings.inspection_table import render
+        from tuner.recordings.inspection import render
 
         words = {path: in_words(verdict) for path, verdict in verdicts.items()}
         console().print(render(inspections, words))

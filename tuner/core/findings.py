@@ -21,7 +21,7 @@ class Code(StrEnum):
     """What was noticed; the comment after each names its numbers and its names."""
 
     RECORDING = "recording"  # count and numbers, names: code, topic and names of the `Note`
-    SALVAGED = "salvaged"  # those of `tuner.recordings.damage.Damage`; names: its cause and subject
+    SALVAGED = "salvaged"  # those of `tuner.recordings.notes.Damage`; names: its cause and subject
     LEFT_OUT = "left_out"  # names: what the flight lacks, what to do
     FLIGHT_WORSE = "flight_worse"  # before, after; names: position or attitude, its unit
     FLIGHT_CRASHES = "flight_crashes"  # seconds

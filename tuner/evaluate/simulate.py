@@ -28,7 +28,7 @@ from tuner.evaluate.forces import Forces, forces_of
 from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
 from tuner.objective.trajectory import Published, published
 from tuner.recordings.flight import Array, Series
-from tuner.recordings.resample import resample
+from tuner.recordings.interpolation import resample
 from tuner.vehicle import ControllerFile, VehicleFile, check_mixer
 from tuner.vehicle.model import Model, model_of, schedule_of, with_coefficients
 

@@ -11,7 +11,7 @@ from tuner.core.errors import RecordingError
 from tuner.ground.measurement import Array, Curve
 from tuner.ground.plateaus import levels_of, without_outliers
 from tuner.recordings.content import Content, Settings, given_map, read_content
-from tuner.recordings.sidecar import read_sidecar
+from tuner.recordings.topics import read_sidecar
 
 SHORTEST = 3.0
 """s of steady flight without which there is no mean."""

@@ -13,8 +13,8 @@ from typing import Any
 from tuner.config import Options, Settings, settle
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.inspection import Inspection
-from tuner.recordings.px4_logging import Advice, advice_of, settings_in_words
-from tuner.recordings.sidecar import read_sidecar
+from tuner.recordings.px4 import Advice, advice_of, settings_in_words
+from tuner.recordings.topics import read_sidecar
 from tuner.recordings.ulog import parameters_of
 from tuner.wording.phrases import listed
 

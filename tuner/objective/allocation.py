@@ -12,8 +12,8 @@ import numpy as np
 
 from tuner.objective.explained import levers
 from tuner.recordings.flight import Array, Flight, Series
+from tuner.recordings.interpolation import resample
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.resample import resample
 from tuner.vehicle import VehicleFile
 
 WRENCH = ("commanded_thrust", "commanded_torque")

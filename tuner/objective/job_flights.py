@@ -23,11 +23,11 @@ from tuner.objective.motor_order import flight_in_rotor_order
 from tuner.objective.speed_unit import with_speeds_in_si
 from tuner.objective.trajectory import with_named_reference
 from tuner.objective.windows import require_windows
-from tuner.recordings.contradiction import noted_contradiction
+from tuner.recordings.defects import is_stale
 from tuner.recordings.flight import Flight
-from tuner.recordings.load import load_flights
+from tuner.recordings.frames import noted_contradiction
+from tuner.recordings.loader import load_flights
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.stale import is_stale
 from tuner.recordings.ulog import parameters_of
 from tuner.vehicle import check_mixer
 from tuner.vehicle.px4_parameters import PLACES, with_parameters

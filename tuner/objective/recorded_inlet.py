@@ -15,7 +15,7 @@ from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
 from tuner.objective.recorded_inputs import linear_interpolation, sparse, zero_order_hold
 from tuner.recordings.flight import Flight
-from tuner.recordings.resample import without_gaps
+from tuner.recordings.interpolation import without_gaps
 
 
 class RecordedInlet(ABC):

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.recordings.flight import SIGNALS, Array, Flight, Series
-from tuner.recordings.motion import body_rate_from
+from tuner.recordings.interpolation import body_rate_from
 
 MISSED = 1.5
 """Periods of a loop between two samples beyond which its output was not recorded in full."""

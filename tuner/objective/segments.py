@@ -26,7 +26,7 @@ from tuner.objective.start import recent_command, rests, start_of
 from tuner.objective.wander import wander_of
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.initial import position_error
+from tuner.recordings.states import position_error
 from tuner.vehicle import recording_offsets
 
 #: Clocks of a recording: motion capture stamps poses, the flight controller everything else.

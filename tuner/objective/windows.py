@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import Flight, InitialState, Series
-from tuner.recordings.initial import initial_state
-from tuner.recordings.states import states_at
+from tuner.recordings.states import initial_state, states_at
 
 BEFORE = 1.2
 """s of a recording before a window that may help to estimate its start."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tuner.recordings.flight import SIGNALS, Flight, InitialState, Series
     from tuner.recordings.inspection import Inspection, inspect_recordings
-    from tuner.recordings.load import load_flight, load_flights
+    from tuner.recordings.loader import load_flight, load_flights
     from tuner.recordings.notes import Note
 
 __all__ = [
@@ -30,8 +30,8 @@ __all__ = [
 _HOMES = {
     "Inspection": "inspection",
     "inspect_recordings": "inspection",
-    "load_flight": "load",
-    "load_flights": "load",
+    "load_flight": "loader",
+    "load_flights": "loader",
     "Note": "notes",
 }
 

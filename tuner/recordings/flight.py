@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.recordings.damage import Damage
-from tuner.recordings.notes import Note
+from tuner.recordings.notes import Damage, Note
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,11 @@ from pathlib import Path
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
-from tuner.recordings.csv_layout import is_table
 from tuner.recordings.recording import Recording
+from tuner.recordings.table import is_table
+
+NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
+"""Suffixes of recordings that no text has."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +89,6 @@ def _open_micro_sd(path: Path, _: tuple[Path, ...]) -> Recording:
     return MicroSdRecording(path)
 
 
-NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
-"""Suffixes of recordings that no text has."""
-
-
 def _is_table(head: Head) -> bool:
     """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
     if head.start.startswith(b"PAR1"):
@@ -113,7 +112,6 @@ def _open_matlab(path: Path, _: tuple[Path, ...]) -> Recording:
     return MatlabTable(path)
 
 
-#: The first that matches reads a recording.
 READERS: tuple[Reader, ...] = (
     Reader("ros", "ROS 1 .bag, ROS 2 folders, .db3 and .mcap", _is_ros, _open_ros),
     Reader("ulog", "PX4 .ulg", lambda head: head.start.startswith(b"ULog"), _open_ulog),
@@ -121,6 +119,7 @@ READERS: tuple[Reader, ...] = (
     Reader("table", "MATLAB .mat", _is_matlab, _open_matlab, tabular=True),
     Reader("table", ".csv and .parquet", _is_table, _open_table, tabular=True),
 )
+"""The first that matches reads a recording."""
 
 
 def is_tabular(name: object) -> bool:

@@ -18,12 +18,12 @@ from tuner.core.errors import RecordingError
 from tuner.recordings.content import Settings, Signals, given_map, read_signals
 from tuner.recordings.flight import Series
 from tuner.recordings.formats import is_tabular
-from tuner.recordings.load import load_flights
-from tuner.recordings.locate import require_pose
-from tuner.recordings.mission import IDLE, stretches
+from tuner.recordings.loader import load_flights
+from tuner.recordings.missions import IDLE, stretches
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.ranges import FASTEST_TURN
-from tuner.recordings.sidecar import read_sidecar
+from tuner.recordings.sources import require_pose
+from tuner.recordings.topics import read_sidecar
+from tuner.recordings.unit_detection import FASTEST_TURN
 
 #: What a recording must hold.
 NEEDS = ("body_rate", "acceleration", "command")

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import NANOSECONDS, Contents, Request, Samples, Topic, Usual
 
 MAGIC = 0xBC
@@ -44,6 +44,8 @@ TYPES = {
     "d": "<f8",
 }
 _STAMPS = {1: ("<u4", NANOSECONDS["ms"]), 2: ("<u8", NANOSECONDS["us"])}
+#: Fields of every record that are no variables; a space is in no variable's name.
+_NUMBER, _STAMP = " number", " stamp"
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,6 @@ class MicroSdRecording:
         return Samples(time, time, fields)
 
 
-#: Fields of every record that are no variables; a space is in no variable's name.
-_NUMBER, _STAMP = " number", " stamp"
 _OWN = {_NUMBER, _STAMP}
 
 

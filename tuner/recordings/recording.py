@@ -14,11 +14,14 @@ from pydantic import model_validator
 
 from tuner.core.errors import RecordingError
 from tuner.core.yaml_section import Section
-from tuner.recordings.damage import Damage
 from tuner.recordings.flight import Array
-from tuner.recordings.notes import Note
+from tuner.recordings.notes import Damage, Note
 
 Nanoseconds = NDArray[np.int64]
+#: Unit of time -> nanoseconds.
+NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+#: The one topic of a table.
+ROWS = ""
 
 
 @dataclass(frozen=True)
@@ -53,10 +56,6 @@ class Clock(Section):
     @classmethod
     def _from_name(cls, value: Any) -> Any:
         return {"field": value} if isinstance(value, str) else value
-
-
-#: Unit of time -> nanoseconds.
-NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 
 
 @dataclass(frozen=True)
@@ -161,10 +160,6 @@ class Recording(Protocol):
             A topic has no such field, or nothing can be read.
         """
         ...
-
-
-#: The one topic of a table.
-ROWS = ""
 
 
 class TabularRecording:

@@ -1,4 +1,8 @@
-"""The topic map: which recorded field becomes which signal, read from ``configs/topics``."""
+"""What users state of recordings: topic maps (``configs/topics``) and side-cars.
+
+A topic map says which recorded field becomes which signal; a side-car is what a lab notes about one
+recording, in a YAML file of the same name beside it.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from pydantic import BeforeValidator, model_validator
 
 from tuner.core.errors import ConfigError, did_you_mean
 from tuner.core.shipped import configs_folder, find_config
-from tuner.core.yaml_section import Section, Whole, read_model, refuse
+from tuner.core.yaml_section import Number, Section, Whole, read_model, refuse
 from tuner.recordings import formats as recording_formats
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
@@ -202,3 +206,50 @@ def shipped_maps() -> tuple[TopicMap, ...]:
     """Return every map in ``configs/topics``, by file name."""
     files = sorted((configs_folder() / "topics").glob("*.yaml"))
     return tuple(load_topic_map(file) for file in files)
+
+
+class Sidecar(Section):
+    """What the file beside a recording states about it.
+
+    Attributes
+    ----------
+    trajectory
+        What was flown, for recordings without the reference: name and numbers as in a
+        `TrajectorySettings`, which are checked where the simulator's shapes are known.
+    start, end
+        Seconds since the first pose between which the mission lies, instead of those found.
+    missions
+        Numbers, from 1, of those missions that are fitted, of a recording that holds several; None
+        for all, or of a long one for those that show most.
+    topics
+        The topic map of this recording: a file beside it, or a shipped map's name.
+    namespace
+        Prefix of its topics.
+    motor_order
+        In which its motors were recorded, as in a topic map.
+    """
+
+    trajectory: Mapping[str, str | Number] | None = None
+    start: Number | None = None
+    end: Number | None = None
+    missions: tuple[Whole, ...] | None = None
+    topics: str | None = None
+    namespace: str = ""
+    motor_order: MotorOrder | None = None
+
+
+def sidecar_path(recording: Path) -> Path:
+    """Return where the side-car of a recording lies, if there is one."""
+    return recording / "flight.yaml" if recording.is_dir() else recording.with_suffix(".yaml")
+
+
+def read_sidecar(recording: Path) -> Sidecar:
+    """Read the side-car of a recording; an empty one where there is none.
+
+    Raises
+    ------
+    ConfigError
+        It is no valid side-car.
+    """
+    path = sidecar_path(recording)
+    return read_model(Sidecar, path) if path.is_file() else Sidecar()

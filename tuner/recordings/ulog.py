@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.px4 import USUAL
 from tuner.recordings.recording import NANOSECONDS, Clock, Contents, Request, Samples, Topic, Usual
 

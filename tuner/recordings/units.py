@@ -1,9 +1,10 @@
-"""Recorded numbers into the units and frames of a `Flight`: SI, ENU, FLU, (w, x, y, z)."""
+"""Recorded numbers into the units, axes and orders of a `Flight`: SI, ENU, FLU, (w, x, y, z)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -77,3 +78,28 @@ def quaternion_of(angles: Array) -> Array:
             cr * cp * sy - sr * sp * cy,
         ]
     )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another way to read recorded numbers, and its name in a sentence."""
+
+    name: str
+    read: Callable[[Array], Array]
+
+
+def _scalar_last(q: Array) -> Array:
+    return q[:, [3, 0, 1, 2]]
+
+
+def _inverse(q: Array) -> Array:
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
+
+
+#: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
+ATTITUDE_READINGS = (
+    Reading("scalar-last", _scalar_last),
+    Reading("world to body", _inverse),
+    Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
+    Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+)

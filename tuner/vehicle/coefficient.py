@@ -101,7 +101,7 @@ class Coefficient:
     exported_as
         Export target -> where the coefficient stands in it, or why it does not.
     informed_by
-        The rule of `tuner.recordings.informs` that decides whether a recording can show it.
+        The rule of `tuner.recordings.inspector` that decides whether a recording can show it.
     plausible
         Values outside this range are reported as improbable.
     fallback

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from tuner.core.findings import Code, Finding
-from tuner.recordings.damage import Cause, Damage
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import Cause, Damage, Note, NoteCode
 from tuner.wording.notes import damage_sentence, note_in_words
 from tuner.wording.phrases import as_sentence, listed
 from tuner.wording.result import PREDICTED

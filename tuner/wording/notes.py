@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from tuner.recordings.damage import Cause, Damage
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import Cause, Damage, Note, NoteCode
 from tuner.wording.phrases import listed
 
 #: Code -> text with the note's count and numbers in braces; ``first`` and ``second`` for one of its

@@ -12,7 +12,7 @@ from tuner.evaluate.input_lag import input_lag, with_inputs_on_time
 from tuner.objective.job_flights import Recording
 from tuner.objective.motor_order import order_findings
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.initial import initial_state
+from tuner.recordings.states import initial_state
 
 RATE = 500.0
 

@@ -10,7 +10,7 @@ from tuner.core.shipped import find_config
 from tuner.evaluate.comparison import Comparison
 from tuner.objective.job_flights import Recording
 from tuner.objective.noise import noise_of
-from tuner.recordings.load import load_flight
+from tuner.recordings.loader import load_flight
 from tuner.vehicle import ControllerFile, read_vehicle, with_values
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

@@ -9,7 +9,7 @@ from tuner.core.errors import InputError
 from tuner.evaluate.plan import fly, grid_of
 from tuner.evaluate.simulation_table import roll_pitch_yaw, write_csv
 from tuner.evaluate.write import summary_of, write_flights
-from tuner.recordings.load import load_flight
+from tuner.recordings.loader import load_flight
 
 COLUMNS = [
     *("time", "x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz", "roll", "pitch", "yaw"),

@@ -20,8 +20,8 @@ from tuner.core.findings import Code
 from tuner.evaluate.comparison import Comparison
 from tuner.job.run import run
 from tuner.objective.job_flights import Recording
-from tuner.recordings.damage import Cause
-from tuner.recordings.load import load_flight
+from tuner.recordings.loader import load_flight
+from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.record import SearchRecord
 from tuner.result import read_run

@@ -19,9 +19,9 @@ from tuner.objective.inlets import INLETS, bypassed_by, freed_by
 from tuner.objective.job_flights import read_usable, recordings_of
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
+from tuner.recordings.defects import HONEST, sticking_out
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.outliers import HONEST, sticking_out
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.space import space_of
 

@@ -29,7 +29,7 @@ from tuner.objective.initial_conditions import (
     whole,
 )
 from tuner.objective.segments import segments_of
-from tuner.recordings.load import load_flight
+from tuner.recordings.loader import load_flight
 from tuner.vehicle.model import model_of
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -11,7 +11,7 @@ from tuner.core.errors import RecordingError
 from tuner.objective.choice import inlet_for
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
-from tuner.recordings.informs import inlets
+from tuner.recordings.inspector import inlets
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():

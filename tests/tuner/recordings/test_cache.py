@@ -11,7 +11,7 @@ import pytest
 
 from tests.tuner.recordings import making
 from tuner.recordings import Flight, load_flight
-from tuner.recordings import load as loading
+from tuner.recordings import loader as loading
 from tuner.recordings.cache import digest, own_folder
 
 

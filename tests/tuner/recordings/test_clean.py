@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.recordings.clean import clean
+from tuner.recordings.defects import clean
 from tuner.recordings.notes import NoteCode
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.recordings.clock import fit_grid
+from tuner.recordings.clocks import fit_grid
 
 
 def _late(count: int, rate: float, seed: int = 0) -> np.ndarray:

@@ -19,9 +19,9 @@ from tuner.core.errors import RecordingError
 from tuner.core.findings import Code
 from tuner.objective.job_flights import read_usable
 from tuner.recordings import inspect_recordings, load_flights
-from tuner.recordings.contradiction import contradiction, noted_contradiction
 from tuner.recordings.flight import Series
-from tuner.recordings.mission import Mission
+from tuner.recordings.frames import contradiction, noted_contradiction
+from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.wording.findings import one_line
 

@@ -15,10 +15,9 @@ from tuner.config.trajectory_settings import TrajectorySettings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_section import build
 from tuner.recordings import Flight, load_flight, load_flights
-from tuner.recordings.damage import Cause
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import correct_frames
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import Cause, Note, NoteCode
 from tuner.wording.notes import damage_sentence
 
 POSE = "/optitrack/pose"

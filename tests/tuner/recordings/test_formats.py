@@ -11,8 +11,8 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from tests.tuner.recordings import making
 from tuner.core.errors import RecordingError
 from tuner.recordings import Flight, load_flight
-from tuner.recordings.damage import Cause
 from tuner.recordings.formats import open_recording
+from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request
 
 SLOW = pytest.mark.slow

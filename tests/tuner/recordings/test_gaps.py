@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tuner.recordings.flight import Series
-from tuner.recordings.load import gaps_in
-from tuner.recordings.resample import GAP, without_gaps
+from tuner.recordings.interpolation import GAP, without_gaps
+from tuner.recordings.loader import gaps_in
 
 TIME = np.arange(0.0, 6.0, 0.01)
 

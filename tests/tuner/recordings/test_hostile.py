@@ -21,10 +21,9 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from tests.tuner.recordings import fuzz, making
 from tuner.core.errors import InputError, RecordingError
 from tuner.recordings import inspect_recordings, load_flight
-from tuner.recordings.damage import Cause
-from tuner.recordings.notes import NoteCode
+from tuner.recordings.notes import Cause, NoteCode
 from tuner.recordings.ros.container import DamagedError, unpack, zstd
-from tuner.recordings.ros.definitions import Definitions
+from tuner.recordings.ros.messages import Definitions
 from tuner.recordings.ros.wire import UnknownFieldError, plan
 
 

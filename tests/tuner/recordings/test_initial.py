@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.recordings.flight import Series
-from tuner.recordings.initial import in_hover, initial_state, position_error
+from tuner.recordings.states import in_hover, initial_state, position_error
 
 
 def _flight(speed: float, turn: float, seed: int = 0) -> dict[str, Series]:

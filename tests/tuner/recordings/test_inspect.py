@@ -14,9 +14,8 @@ from rich.console import Console
 
 from tests.tuner.recordings import making
 from tuner.recordings import Inspection, inspect_recordings
-from tuner.recordings.informs import inlets
-from tuner.recordings.inspection import as_json
-from tuner.recordings.inspection_table import render
+from tuner.recordings.inspection import as_json, render
+from tuner.recordings.inspector import inlets
 from tuner.vehicle import COEFFICIENTS
 
 

@@ -22,7 +22,7 @@ IMAGE = "sensor_msgs/msg/Image"
 MEASURE = """
 import json, pathlib, sys, time
 from tuner.recordings.content import Settings, read_content
-from tuner.recordings.sidecar import Sidecar
+from tuner.recordings.topics import Sidecar
 def read():
     lines = pathlib.Path("/proc/self/io").read_text().split()
     return int(lines[lines.index("rchar:") + 1])

@@ -13,8 +13,7 @@ from tuner.core.findings import Code
 from tuner.objective.job_flights import read_usable
 from tuner.recordings import inspect_recordings, load_flights
 from tuner.recordings.flight import Series
-from tuner.recordings.manoeuvres import FITTED, PIECE, manoeuvres
-from tuner.recordings.mission import Mission
+from tuner.recordings.missions import FITTED, PIECE, Mission, manoeuvres
 
 TIME = np.arange(0.0, 1000.0, 0.02)
 

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from tests.tuner.recordings.micro_sd import log_of, write_micro_sd
 from tuner.core.errors import RecordingError
 from tuner.recordings import inspect_recordings, load_flight
-from tuner.recordings.damage import Cause
 from tuner.recordings.formats import open_recording
+from tuner.recordings.interpolation import alike, body_rate_of, smooth
 from tuner.recordings.micro_sd import MicroSdRecording
-from tuner.recordings.motion import alike, body_rate_of, smooth
+from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tuner.recordings.flight import Series
-from tuner.recordings.mission import YawSpin, airborne, find_missions, yaw_spin
+from tuner.recordings.missions import YawSpin, airborne, find_missions, yaw_spin
 
 TIME = np.arange(0, 40, 0.01)
 

@@ -10,7 +10,7 @@ import pytest
 
 from tuner.core.shipped import find_config
 from tuner.recordings import Flight, inspect_recordings, load_flight
-from tuner.recordings.motion import alike, body_rate_of, smooth
+from tuner.recordings.interpolation import alike, body_rate_of, smooth
 from tuner.vehicle import read_vehicle
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))

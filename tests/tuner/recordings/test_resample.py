@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from tuner.recordings.flight import Series
-from tuner.recordings.resample import resample
+from tuner.recordings.interpolation import resample
 
 CLOCK = np.arange(0, 1.001, 0.01)
 

@@ -7,11 +7,11 @@ from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
 from tuner.objective.job_flights import recordings_of
 from tuner.recordings import inspect_recordings
+from tuner.recordings.defects import is_stale, without_stale
 from tuner.recordings.flight import Series
-from tuner.recordings.load import load_flight
-from tuner.recordings.mission import find_missions
+from tuner.recordings.loader import load_flight
+from tuner.recordings.missions import find_missions
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.stale import is_stale, without_stale
 
 TIME = np.arange(0, 10, 0.01)
 

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import configs_folder
 from tuner.recordings import SIGNALS
-from tuner.recordings.sidecar import read_sidecar
-from tuner.recordings.topics import load_topic_map, shipped_maps
+from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.units import UNITS, to_enu_flu
 
 

@@ -23,7 +23,7 @@ from tuner.recordings.flight import Series
 from tuner.recordings.inertial import read_inertial
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.suggest import suggested_map
+from tuner.recordings.suggestion import suggested_map
 from tuner.vehicle import read_vehicle, with_values
 from tuner.wording.findings import one_line
 from tuner.wording.notes import note_in_words

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 from rosbags.interfaces import MessageDefinition
 
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.wire import Block, Bytes, Index
 
 #: The largest chunk that is unpacked: cameras and lidars stay far below it.

@@ -19,7 +19,7 @@ from urllib.parse import quote
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import LARGEST_CHUNK, Connection, joined
 from tuner.recordings.ros.wire import Block
 

@@ -13,7 +13,7 @@ from typing import Any
 from tuner.core.disk import file_name
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_document import read_yaml
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import (
     LARGEST_CHUNK,
     Connection,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
 from tuner.recordings import px4
-from tuner.recordings.damage import Cause, Damage
+from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
     Clock,
     Contents,
@@ -24,9 +24,8 @@ from tuner.recordings.recording import (
 )
 from tuner.recordings.ros.bag1 import Bag1
 from tuner.recordings.ros.container import Connection, Container
-from tuner.recordings.ros.definitions import Definitions
 from tuner.recordings.ros.folder import Folder, open_file
-from tuner.recordings.ros.usual import USUAL
+from tuner.recordings.ros.messages import USUAL, Definitions
 from tuner.recordings.ros.wire import UnknownFieldError, Walk, decode, missing_fields, plan
 
 _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"

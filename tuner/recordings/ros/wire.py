@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 
-from tuner.recordings.ros.definitions import Definitions
+from tuner.recordings.ros.messages import Definitions
 
 Bytes = NDArray[np.uint8]
 Index = NDArray[np.int64]

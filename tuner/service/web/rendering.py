@@ -9,8 +9,7 @@ from functools import cache
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
-from tuner.recordings.damage import Cause, Damage
-from tuner.recordings.notes import Note
+from tuner.recordings.notes import Cause, Damage, Note
 from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso

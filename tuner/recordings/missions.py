@@ -1,9 +1,14 @@
-"""The missions in a recording: where each starts and ends, and whether it is a yaw spin."""
+"""The missions in a recording: where each starts and ends, how it spins, and what is fitted.
+
+Half an hour in the air is mostly hover, from which little is learnt, and too much to simulate in
+one piece: long missions are taken as their manoeuvres, those that show most are fitted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,29 +16,43 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from tuner.recordings.flight import Array, Series
 
-#: Reference motion below this, in m or m/s, is a reference at rest.
 AT_REST = 1e-5
-#: Set-points that pause for longer, in s, begin another mission.
+"""Reference motion below this, in m or m/s, is a reference at rest."""
 PAUSE = 1.0
-#: A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer.
+"""Set-points that pause for longer, in s, begin another mission."""
 MOMENT = 0.2
-#: A shorter stretch, in s, is no mission.
+"""A flight that leaves the air for less, in s, only seems to: a bounce at landing takes longer."""
 SHORTEST = 2.0
-#: A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
-#: not above `CARRIES` of what carries the vehicle in the air, nor below what is off.
+"""A shorter stretch, in s, is no mission."""
 IDLE = 0.12
 IDLE_SPEED = 80.0
 CARRIES = 0.5
 OFF = 0.02
 OFF_SPEED = 20.0
-#: Higher above the ground than this, in m, the vehicle flies.
+"""A mean motor command or thrust below this is idle, and a rotor speed below that, in rad/s; but
+not above `CARRIES` of what carries the vehicle in the air, nor below what is off."""
 CLEAR = 0.12
-#: What stays within this, in m, for a second rests.
+"""Higher above the ground than this, in m, the vehicle flies."""
 RESTS = 0.01
-#: s of which one mean position is taken.
+"""What stays within this, in m, for a second rests."""
 BIN = 0.1
-#: Set-points that begin this soon after the pose, in s, ran all the time.
+"""s of which one mean position is taken."""
 FROM_THE_START = 0.5
+"""Set-points that begin this soon after the pose, in s, ran all the time."""
+LONG = 120.0
+"""s beyond which a mission is taken apart."""
+PIECE = 60.0
+"""s of a manoeuvre, at most."""
+FITTED = 180.0
+"""s of a long recording that are fitted, at most."""
+SHORTEST_MANOEUVRE = 5.0
+"""s of a manoeuvre, at least."""
+HOVER_PAUSE = 3.0
+"""s of hover that end a manoeuvre."""
+HOVER_BEFORE = 1.0
+"""s of hover before it that belong to it: what is simulated begins at rest."""
+MOVES, TURNS = 0.3, 0.3
+"""m/s and rad/s above which a vehicle does more than hover."""
 
 
 @dataclass(frozen=True)
@@ -274,3 +293,75 @@ def yaw_spin(rate_setpoint: Series | None, start: float, end: float) -> YawSpin 
 
 def _nearly_always(flags: NDArray[np.bool_]) -> bool:
     return float(flags.mean()) > 0.95
+
+
+def manoeuvres(series: Mapping[str, Series], missions: Sequence[Mission]) -> tuple[Mission, ...]:
+    """Return missions, the long ones as manoeuvres, those that show most marked as fitted.
+
+    Parameters
+    ----------
+    series
+        Signals; position among them.
+    missions
+        In the order of flight.
+    """
+    if all(mission.end - mission.start <= LONG for mission in missions):
+        return tuple(missions)
+    time, moving, turning = _motion(series)
+    active = np.asarray((moving > MOVES) | (turning > TURNS), dtype=np.bool_)
+    parts: list[Mission] = []
+    for mission in missions:
+        parts += [mission] if mission.end - mission.start <= LONG else _parts(mission, time, active)
+    vivid = moving**2 + turning**2
+
+    def shown(part: Mission) -> float:
+        return float(vivid[(time >= part.start) & (time <= part.end)].sum())
+
+    left, chosen = FITTED, set[int]()
+    for number in sorted(range(len(parts)), key=lambda i: -shown(parts[i])):
+        if parts[number].end - parts[number].start <= left:
+            left -= parts[number].end - parts[number].start
+            chosen.add(number)
+    return tuple(replace(part, fitted=number in chosen) for number, part in enumerate(parts))
+
+
+def _parts(mission: Mission, time: Array, active: NDArray[np.bool_]) -> list[Mission]:
+    """Return the manoeuvres of a mission; its beginning where there are none."""
+    inside = active & (time >= mission.start) & (time <= mission.end)
+    parts = []
+    for first, last in stretches(time, inside, bridged=HOVER_PAUSE):
+        begin = max(mission.start, first - HOVER_BEFORE)
+        count = int(np.ceil((last - begin) / PIECE - 1e-9))
+        edges = np.linspace(begin, last, max(1, count) + 1)
+        parts += [
+            Mission(float(a), float(b), "a manoeuvre")
+            for a, b in pairwise(edges)
+            if b - a >= SHORTEST_MANOEUVRE
+        ]
+    whole = replace(mission, end=mission.start + PIECE)
+    return parts or [whole]
+
+
+def _motion(series: Mapping[str, Series]) -> tuple[Array, Array, Array]:
+    """Return (n,) bins' times, speeds in m/s and turn rates in rad/s."""
+    position = series["position"]
+    time = np.arange(position.time[0], position.time[-1], BIN) + 0.5 * BIN
+    places = np.column_stack([_means(position, time, column) for column in range(3)])
+    speed = np.linalg.norm(np.gradient(places, BIN, axis=0), axis=1)
+    rates = series.get("body_rate")
+    if rates is None:
+        return time, speed, np.zeros(len(time))
+    turning = np.column_stack([_means(rates, time, column) for column in range(3)])
+    return time, speed, np.linalg.norm(turning, axis=1)
+
+
+def _means(samples: Series, time: Array, column: int) -> Array:
+    """Return (n,) means of a column over bins, between those where there is none."""
+    bins = ((samples.time - time[0]) / BIN + 0.5).astype(np.int64)
+    there = (bins >= 0) & (bins < len(time)) & np.isfinite(samples.values[:, column])
+    count = np.bincount(bins[there], minlength=len(time))
+    total = np.bincount(bins[there], samples.values[there, column], minlength=len(time))
+    held = count > 0
+    if not held.any():
+        return np.zeros(len(time))
+    return np.interp(time, time[held], total[held] / count[held])

@@ -12,10 +12,9 @@ from tuner.recordings.columns import recognised
 from tuner.recordings.content import Settings, read_content
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular, open_recording
-from tuner.recordings.locate import choose_map, locate
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.sidecar import Sidecar
-from tuner.recordings.topics import Source, shipped_maps
+from tuner.recordings.sources import choose_map, locate
+from tuner.recordings.topics import Sidecar, Source, shipped_maps
 
 LACKING = "position", "attitude", "command", "rotor_speed", "body_rate"
 """Signals that are asked for where no column seems to hold them."""

@@ -1,0 +1,285 @@
+"""Clocks of a recording: which stamps to believe, the mission's ticks, the pose's offset.
+
+A stamp says when something was measured, its arrival when it was recorded. A loop that publishes
+regularly shows the ticks of the mission's uniform clock. Where pose and gyro are stamped by
+different clocks, their correlation shows by how much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from tuner.recordings.flight import Array, Series
+from tuner.recordings.interpolation import RATE, alike, body_rate_of, on_clock, rms, smooth, stretch
+from tuner.recordings.notes import Kind, Note, NoteCode
+from tuner.recordings.recording import Nanoseconds, Samples
+
+SECOND = 1_000_000_000
+#: A stamp that leaves its neighbours by more than this, while its arrival does not, has jumped.
+JUMP = SECOND // 10
+#: Topics whose stamps differ by more than this from the others' are on a clock of their own.
+APART = SECOND // 2
+#: A stamp this part of a period off its tick still belongs to that tick.
+ON_TICK = 0.2
+#: No clock drifts faster, in s/s: such stamps have another rate.
+FASTEST_DRIFT = 0.01
+#: A smaller offset, in s, is left to the fit, which has a time offset and latencies to find.
+WORTH_MOVING = 0.02
+#: Seconds within which an offset is looked for.
+REACH = 0.6
+#: How much less unlike the signals must be at the offset than without it.
+SHARPER = 0.8
+#: Turning below this, in rad/s, or a correlation below that is no evidence.
+ENOUGH_TURNING = 0.1
+ALIKE = 0.6
+#: Seconds over which both are averaged against noise.
+WINDOW = 0.1
+
+
+def believe(
+    samples: Mapping[str, Samples],
+    receive_only: Collection[str] = (),
+    unhurried: Collection[str] = (),
+) -> tuple[dict[str, Nanoseconds], tuple[Note, ...]]:
+    """Return the times of every topic's messages, all on one clock.
+
+    Header stamps are when something was measured; the time of recording is later by a varying
+    delay. So stamps are used, once single wrong ones and jumps of a clock that was set while it
+    ran are repaired by the times of recording. A topic stamped by a clock that is not the others'
+    is moved onto theirs, as far as the times of recording show.
+
+    Parameters
+    ----------
+    samples
+        Topic -> messages.
+    receive_only
+        Topics whose stamps are not to be used.
+    unhurried
+        Topics for which the time of recording is as good as a stamp.
+    """
+    notes: list[Note] = []
+    unset: list[str] = []
+    times: dict[str, Nanoseconds] = {}
+    offsets: dict[str, int] = {}
+    for topic, of in samples.items():
+        if of.stamp is None or topic in receive_only or not len(of.stamp):
+            continue
+        if _unset(of.stamp, of.receive):
+            unset.append(topic)
+            continue
+        stamp, repaired = _repair(topic, of.stamp, of.receive)
+        notes.extend(repaired)
+        times[topic] = stamp
+        offsets[topic] = int(np.median(stamp - of.receive))
+    common = int(np.median(list(offsets.values()))) if offsets else 0
+    for topic, offset in offsets.items():
+        if abs(offset - common) > APART:
+            times[topic] = times[topic] - (offset - common)
+            off = {"seconds": (offset - common) / SECOND}
+            count = len(times[topic])
+            notes.append(Note(NoteCode.OTHER_CLOCK, topic=topic, count=count, numbers=off))
+    for topic, of in samples.items():
+        if topic not in times:
+            # Where all stamps count from a start-up, arrivals are moved to count from there too.
+            times[topic] = of.receive + (common if abs(common) > SECOND else 0)
+            if topic in unset:
+                notes.append(Note(NoteCode.STAMPS_UNSET, topic=topic, count=len(of.receive)))
+            elif topic not in receive_only:
+                kind: Kind = "info" if topic in unhurried else "warning"
+                notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(of.receive)))
+    return times, tuple(notes)
+
+
+def _unset(stamp: Nanoseconds, receive: Nanoseconds) -> bool:
+    """Return whether stamps do not go on as their arrivals do."""
+    passed = np.quantile(receive, 0.9) - np.quantile(receive, 0.1)
+    went_on = np.quantile(stamp, 0.9) - np.quantile(stamp, 0.1)
+    return bool(passed > SECOND and went_on < passed / 2)
+
+
+def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanoseconds, list[Note]]:
+    """Undo jumps of a stamp that the time of recording did not make."""
+    if len(stamp) < 3:
+        return stamp, []
+    step, arrival = np.diff(stamp), np.diff(receive)
+    usual = int(np.median(step))
+    extra = step - arrival
+    # A recorder that stalls delays arrivals while stamps go on as usual: that is no jump.
+    jumped = np.flatnonzero((np.abs(extra) > JUMP) & (np.abs(step - usual) > JUMP))
+    if len(jumped) == 0:
+        return stamp, []
+    fixed = stamp.copy()
+    notes = []
+    wrong = 0
+    steps = []
+    i = 0
+    while i < len(jumped):
+        here = int(jumped[i])
+        back = int(jumped[i + 1]) if i + 1 < len(jumped) else -1
+        if back - here in (1, 2, 3) and abs(int(extra[here] + extra[back])) < JUMP:
+            rows = np.arange(here + 1, back + 1)
+            fixed[rows] = receive[rows] + (stamp[here] - receive[here])
+            wrong += len(rows)
+            i += 2
+        elif here == 0 or here == len(step) - 1:
+            row = 0 if here == 0 else len(stamp) - 1
+            near = 1 if here == 0 else len(stamp) - 2
+            fixed[row] = receive[row] + (stamp[near] - receive[near])
+            wrong += 1
+            i += 1
+        else:
+            steps.append(here)
+            i += 1
+    if wrong:
+        notes.append(Note(NoteCode.STAMPS_REPLACED, topic=topic, count=wrong))
+    if steps:
+        bounds = [0, *(at + 1 for at in steps), len(stamp)]
+        parts = list(pairwise(bounds))
+        level = [int(np.median(fixed[a:b] - receive[a:b])) for a, b in parts]
+        longest = max(range(len(parts)), key=lambda k: parts[k][1] - parts[k][0])
+        for (a, b), offset in zip(parts, level, strict=True):
+            fixed[a:b] -= offset - level[longest]
+        largest = max(abs(offset - level[longest]) for offset in level) / SECOND
+        jump = {"seconds": largest}
+        notes.append(Note(NoteCode.CLOCK_JUMPED, topic=topic, count=len(steps), numbers=jump))
+    return fixed, notes
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Ticks at `origin` + k / `rate`.
+
+    Attributes
+    ----------
+    origin
+        s, the time of one tick.
+    rate
+        Hz; the wanted clock's, or a multiple of it that the publisher keeps.
+    drift
+        Seconds per second by which the publisher's clock runs slower than its stamps.
+    spread
+        s, the 95th percentile of how late stamps are on their ticks.
+    """
+
+    origin: float
+    rate: float
+    drift: float = 0.0
+    spread: float = 0.0
+
+    def tick_nearest(self, time: float) -> float:
+        """Return the time of the tick nearest to a time."""
+        return self.origin + round((time - self.origin) * self.rate) / self.rate
+
+    def snap(self, time: Array) -> Array:
+        """Return (n,) stamps moved to their ticks, or unchanged where they follow no ticks.
+
+        A loop that publishes on every tick stamps a fraction of a millisecond late. Held on the
+        uniform clock as it stands, such a sample would be read one whole tick late.
+        """
+        phase = (time - self.origin) * self.rate
+        on_drifting = phase * (1 - self.drift)
+        tick = np.rint(on_drifting)
+        if np.quantile(np.abs(on_drifting - tick), 0.99) > ON_TICK:
+            return time
+        snapped = self.origin + tick / self.rate
+        return snapped if np.all(np.diff(snapped) > 0) else time
+
+
+def fit_grid(time: Array, rate: float) -> Grid | None:
+    """Fit ticks of a known rate, or a multiple, to (n,) increasing stamps that come a little late.
+
+    A publisher's timer fires on the tick and the stamp is written a little later, never earlier,
+    so that the ticks are the lower envelope of the stamps: the first percentile of how late they
+    are, once a steady drift of the clock is taken away. None if the stamps follow no such ticks.
+    """
+    if len(time) < 20:
+        return None
+    period = np.median(np.diff(time))
+    if period * rate < 1 - ON_TICK:  # published more often than the wanted clock ticks
+        rate *= max(1, round(1 / (period * rate)))
+    stride = round(period * rate)
+    if stride < 1 or abs(period * rate - stride) > ON_TICK:
+        return None
+    tick = np.cumsum(np.concatenate([[0], np.rint(np.diff(time) * rate)]))
+    late = time - time[0] - tick / rate
+    blocks = np.array_split(np.arange(len(time)), min(20, len(time) // 10))
+    middle = np.array([np.median(tick[block]) for block in blocks]) / rate
+    low = np.array([np.quantile(late[block], 0.1) for block in blocks])
+    drift = float(np.polyfit(middle, low, 1)[0]) if len(blocks) > 2 else 0.0
+    if abs(drift) > FASTEST_DRIFT:
+        return None
+    if abs(drift) * (time[-1] - time[0]) < 1e-3:
+        drift = 0.0
+    steady = late - drift * tick / rate
+    origin = float(np.quantile(steady, 0.01))
+    spread = float(np.quantile(steady - origin, 0.95))
+    if spread > ON_TICK / rate:
+        return None
+    return Grid(float(time[0]) + origin, rate, drift, spread)
+
+
+def pose_offset(series: Mapping[str, Series]) -> float | None:
+    """Return by how many seconds the attitude's stamps are late against the gyro's.
+
+    None where one is missing or the vehicle turns too little.
+    """
+    if "attitude" not in series or "body_rate" not in series:
+        return None
+    clock = stretch(series)
+    if len(clock) < 3 * REACH * RATE:
+        return None
+    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)), WINDOW)
+    gyro = smooth(on_clock(series, "body_rate", clock), WINDOW)
+    if rms(gyro) < ENOUGH_TURNING:
+        return None
+    # The best whole lag first, then a parabola through the three highest points.
+    most = round(REACH * RATE)
+    lags = np.arange(-most, most + 1)
+    score = np.array([_shifted(turning, gyro, int(lag)) for lag in lags])
+    best = int(np.argmax(score))
+    unlike = 1 - score
+    if score[best] < ALIKE or best in (0, len(lags) - 1) or unlike[best] > SHARPER * unlike[most]:
+        return 0.0 if score[most] > ALIKE else None
+    left, peak, right = score[best - 1 : best + 2]
+    bend = left - 2 * peak + right
+    fine = 0.5 * (left - right) / bend if bend < 0 else 0.0
+    return float((lags[best] + fine) / RATE)
+
+
+def _shifted(late: Array, early: Array, lag: int) -> float:
+    """Return how alike two signals are when the first is moved back by some samples."""
+    n = len(late)
+    return alike(late[max(0, lag) : n + min(0, lag)], early[max(0, -lag) : n - max(0, lag)])
+
+
+def align_pose(
+    series: Mapping[str, Series], topics: Mapping[str, str]
+) -> tuple[dict[str, Series], tuple[Note, ...]]:
+    """Move the pose onto the clock of the gyro where they are visibly apart.
+
+    Parameters
+    ----------
+    series
+        Signals in seconds.
+    topics
+        Signal -> topic; what shares the attitude's topic is moved with it.
+    """
+    aligned = dict(series)
+    topic = topics.get("attitude", "")
+    if topic == topics.get("body_rate"):
+        return aligned, ()
+    offset = pose_offset(series)
+    if offset is None:
+        return aligned, ()
+    if abs(offset) < WORTH_MOVING:
+        return aligned, (Note(NoteCode.POSE_ON_TIME, "info", topic, numbers={"seconds": offset}),)
+    for signal, samples in series.items():
+        if topics.get(signal) == topic:
+            aligned[signal] = Series(samples.time - offset, samples.values)
+    count = len(series["attitude"].time)
+    moved = Note(NoteCode.POSE_MOVED, topic=topic, count=count, numbers={"seconds": offset})
+    return aligned, (moved,)

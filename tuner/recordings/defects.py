@@ -1,0 +1,369 @@
+"""Defects of a signal: order, duplicates, NaN, quaternions, outliers, stale ends; all are counted.
+
+A controller that gives up, after a crash say, leaves its variables as they were, and a logger that
+reads variables goes on writing them; motion capture that has lost its markers may send its last
+pose for good. At the end of such a recording a signal repeats itself to the bit although the
+vehicle moves on, as its position shows or its gyro. One at rest repeats itself too, and is left
+alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuner.recordings.flight import Array, Series
+from tuner.recordings.notes import Kind, Note, NoteCode
+
+RANGES: Mapping[str, tuple[float, float]] = {
+    "position": (-1e5, 1e5),
+    "velocity": (-1e3, 1e3),
+    "attitude": (-1e3, 1e3),
+    "body_rate": (-1e4, 1e4),
+    "acceleration": (-1e4, 1e4),
+    "reference_position": (-1e5, 1e5),
+    "reference_velocity": (-1e3, 1e3),
+    "reference_acceleration": (-1e4, 1e4),
+    "rate_setpoint": (-1e4, 1e4),
+    "attitude_setpoint": (-1e3, 1e3),
+    "lap": (-1e6, 1e6),
+    "command": (-0.02, 1.02),
+    "thrust_setpoint": (-0.02, 1.02),
+    "commanded_thrust": (-1e4, 1e4),
+    "commanded_torque": (-1e4, 1e4),
+    "rotor_speed": (0.0, 100_000.0),  # in revolutions a minute, if nothing says the unit
+    "battery_voltage": (1.0, 100.0),  # nothing flies on less: a meter that was not read
+}
+"""Signals that cannot leave a range; a value beyond it is a corrupt sample."""
+
+WHOLLY = 0.5
+"""Share of samples out of range above which a signal is in another unit rather than corrupt."""
+
+LONGEST = 43_200.0
+"""No recording lasts longer, in s, to either side of its middle."""
+THRESHOLD = 6.0
+"""Multiples of how far samples stick out nearby that make an outlier."""
+AWAY = 1.0
+"""Seconds after which a pose that jumped away is not expected back."""
+LASTS = 1.0
+"""s for which a signal must not have changed."""
+MOVED = 0.05
+"""m by which the vehicle must have moved meanwhile."""
+TURNED = 0.2
+"""rad/s of its gyro, root mean square, that show the same."""
+MADE = ("attitude", "body_rate")
+"""Signals that change whenever a vehicle moves."""
+
+
+def clean(
+    signal: str, topic: str, time: Array, values: Array
+) -> tuple[Array, Array, tuple[Note, ...]]:
+    """Return the trustworthy samples of a signal in strictly increasing time.
+
+    Parameters
+    ----------
+    signal
+        Name in `SIGNALS`; decides which tests apply.
+    topic
+        Named in the notes.
+    time
+        (n,) seconds, any order.
+    values
+        (n, k).
+
+    Returns
+    -------
+    tuple
+        Time (m,), values (m, k) with m <= n, and what was dropped or repaired.
+    """
+    notes = []
+
+    def note(count: int, code: NoteCode, kind: Kind = "info", **numbers: float) -> None:
+        if count:
+            notes.append(Note(code, kind, topic, int(count), numbers, (signal,)))
+
+    low, high = RANGES.get(signal, (-np.inf, np.inf))
+    beyond: NDArray[np.bool_] = np.asarray((values < low) | (values > high), dtype=np.bool_)
+    dropped = int(beyond.any(axis=1).sum())
+    if dropped > WHOLLY * len(values):
+        median = float(np.nanmedian(values))
+        note(dropped, NoteCode.UNIT_UNKNOWN, "warning", lower=low, upper=high, median=median)
+    else:
+        note(dropped, NoteCode.OUT_OF_RANGE, lower=low, upper=high)
+    values = np.where(beyond, np.nan, values)
+    if signal in {"command", "thrust_setpoint"}:
+        values = np.clip(values, 0.0, 1.0)
+
+    one_per_row = signal == "rotor_speed"
+    empty = np.isnan(values).all(axis=1) if one_per_row else np.isnan(values).any(axis=1)
+    empty |= ~np.isfinite(time)
+    counted = np.asarray(beyond.any(axis=1))
+    note(int((empty & ~counted).sum()), NoteCode.NOT_A_NUMBER)
+    usable = np.logical_not(empty)
+    time, values = time[usable], values[usable]
+
+    late = int((np.diff(time) < 0).sum())
+    note(late, NoteCode.OUT_OF_ORDER)
+    order = np.argsort(time, kind="stable")
+    time, values = time[order], values[order]
+    apart = np.abs(time - np.median(time)) > LONGEST if len(time) else np.zeros(0, dtype=np.bool_)
+    note(int(apart.sum()), NoteCode.FAR_IN_TIME)
+    time, values = time[~apart], values[~apart]
+    time, values, doubles = _merge_equal_times(time, values)
+    note(doubles, NoteCode.STAMPED_TWICE)
+    note(0 if signal == "lap" else _missing(time), NoteCode.SAMPLES_MISSING)
+
+    if signal == "attitude":
+        time, values, odd = _unit_quaternions(time, values)
+        note(odd, NoteCode.NO_UNIT_QUATERNION)
+
+    if signal in HONEST:
+        time, values = _without_outliers(signal, time, values, note)
+    return time, values, tuple(notes)
+
+
+def _without_outliers(
+    signal: str, time: Array, values: Array, note: Callable[..., None]
+) -> tuple[Array, Array]:
+    """Drop what cannot be true, and note it."""
+    honest = HONEST[signal]
+    if signal in ("position", "attitude"):
+        stuck = frozen(time, values, honest)
+        note(int(stuck.sum()), NoteCode.REPEATED)
+        away, lasting = excursions(time[~stuck], values[~stuck], honest)
+        note(int(away.sum()), NoteCode.AWAY_AND_BACK)
+        note(lasting, NoteCode.AWAY_FOR_GOOD, "warning")
+        time, values = time[~stuck][~away], values[~stuck][~away]
+    outlier = np.zeros(values.shape, dtype=np.bool_)
+    for column in range(values.shape[1]):
+        measured = np.flatnonzero(np.isfinite(values[:, column]))
+        outlier[measured, column] = sticking_out(time[measured], values[measured, column], honest)
+    note(int(outlier.any(axis=1).sum()), NoteCode.OUTLIERS)
+    if signal == "rotor_speed":
+        values = np.where(outlier, np.nan, values)
+        keep = np.isfinite(values).any(axis=1)
+    else:
+        keep = np.asarray(~outlier.any(axis=1))
+    return time[keep], values[keep]
+
+
+def _missing(time: Array) -> int:
+    """Return how many samples a steady publisher lost; 0 where the rate is not steady."""
+    if len(time) < 20:
+        return 0
+    steps = np.diff(time)
+    usual = np.median(steps)
+    near = np.abs(steps - usual) < 0.5 * usual
+    if near.mean() < 0.75:
+        return 0
+    return int(np.sum(np.rint(steps[~near] / usual) - 1, where=steps[~near] > usual))
+
+
+def _merge_equal_times(time: Array, values: Array) -> tuple[Array, Array, int]:
+    """Keep one row of each time; the columns that a row lacks are filled from its twins."""
+    if len(time) < 2 or np.all(np.diff(time) > 0):
+        return time, values, 0
+    kept, start = np.unique(time, return_index=True)
+    merged = values[start]
+    filled = 0
+    for row, (first, last) in enumerate(zip(start, [*start[1:], len(time)], strict=True)):
+        for twin in range(first + 1, last):
+            lacking = np.isnan(merged[row]) & np.isfinite(values[twin])
+            merged[row, lacking] = values[twin, lacking]
+            filled += bool(lacking.any())
+    return kept, merged, len(time) - len(kept) - filled
+
+
+def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
+    """Normalise, drop what has no direction, and let the sign follow the sample before."""
+    norm = np.linalg.norm(values, axis=1)
+    usable = norm > 0.5
+    odd = int((np.abs(norm - 1) > 0.01).sum())
+    time, unit = time[usable], values[usable] / norm[usable, None]
+    if len(unit) > 1:
+        flips = np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        unit = unit * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
+    if len(unit) and unit[0, 0] < 0:
+        unit = -unit
+    return time, unit, odd
+
+
+@dataclass(frozen=True)
+class Honest:
+    """How far noise and honest motion take a sample from its neighbours.
+
+    Attributes
+    ----------
+    floor
+        In the signal's unit.
+    share
+        Share of the column's median that the floor is at least: small rotors turn, and change,
+        several times faster than large ones.
+    curvature
+        Largest second derivative in time of honest motion, unit/s^2.
+    jump
+        Smallest leap from one sample to the next that nothing honest makes.
+    """
+
+    floor: float
+    share: float = 0.0
+    curvature: float = 0.0
+    jump: float = np.inf
+
+    def floor_of(self, values: Array) -> float:
+        """Return the floor for (n,) values of one column."""
+        level = float(np.median(np.abs(values))) if self.share and len(values) else 0.0
+        return max(self.floor, self.share * level)
+
+
+HONEST: Mapping[str, Honest] = {
+    "position": Honest(floor=0.02, curvature=30.0, jump=0.08),
+    "attitude": Honest(floor=0.03, curvature=100.0, jump=0.15),
+    "rotor_speed": Honest(floor=30.0, share=0.05),
+}
+"""Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the angular
+acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back."""
+
+
+def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
+    """Return which samples of a signal stick out on one side of all that surrounds them.
+
+    A sample is compared with the medians of the three samples before and the three after it. Ramps
+    and steps lie between the two, so that fast motion and a motor's jump are kept; one or two
+    samples that leave and come back are not. The bound adapts to the signal's own roughness.
+
+    Parameters
+    ----------
+    time
+        (n,) s, strictly increasing.
+    values
+        (n,) one column.
+    honest
+        What the signal may do by itself.
+    """
+    if len(values) < 7:
+        return np.zeros(len(values), dtype=bool)
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(values, 3, mode="reflect", reflect_type="odd"), 7
+    )
+    before = _middle(*windows[:, :3].T)
+    after = _middle(*windows[:, 4:].T)
+    low, high = np.minimum(before, after), np.maximum(before, after)
+    excess = np.maximum(np.maximum(low - values, values - high), 0.0)
+    rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
+    apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
+    bound = honest.floor_of(values) + 2 * honest.curvature * apart**2
+    usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
+    return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
+
+
+def _middle(a: Array, b: Array, c: Array) -> Array:
+    """Return the median of three, element by element."""
+    return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
+
+
+def frozen(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
+    """Return which samples of (n, k) values repeat the one before although the vehicle moved on.
+
+    Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
+    simulator repeats itself too, but does not leap when it starts to move.
+    """
+    stuck = np.zeros(len(values), dtype=np.bool_)
+    if len(values) < 4:
+        return stuck
+    same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    for first, behind in zip(edges[::2], edges[1::2], strict=True):
+        if behind - first < 3 or behind >= len(values):
+            continue
+        leap = np.abs(values[behind] - values[behind - 1]).max()
+        usual = honest.floor / 4 + honest.curvature * (time[behind] - time[behind - 1]) ** 2
+        stuck[first:behind] = leap > usual
+    return stuck
+
+
+def excursions(time: Array, values: Array, honest: Honest) -> tuple[NDArray[np.bool_], int]:
+    """Return which samples of (n, k) values lie between a leap away and the leap back.
+
+    Returns
+    -------
+    tuple
+        (n,) which samples, and how many leaps did not come back within `AWAY`.
+    """
+    away = np.zeros(len(values), dtype=np.bool_)
+    if len(values) < 12:
+        return away, 0
+    span = np.diff(time)
+    speed = np.diff(values, axis=0) / span[:, None]
+    if np.abs(np.diff(speed, axis=0) * span[1:, None]).max() < honest.jump / 4:
+        return away, 0  # nothing leaps at all, and running medians take their time
+    windows = np.lib.stride_tricks.sliding_window_view(
+        np.pad(speed, ((5, 5), (0, 0)), mode="edge"), 11, axis=0
+    )
+    leap = np.diff(values, axis=0) - np.median(windows, axis=2) * span[:, None]
+    size = np.sqrt((leap**2).sum(axis=1))
+    at = np.flatnonzero(size > honest.jump + honest.curvature * span**2)
+    lasting = 0
+    i = 0
+    while i < len(at):
+        back = next(
+            (
+                j
+                for j in range(i + 1, min(len(at), i + 40))
+                if time[at[j]] - time[at[i]] < AWAY
+                and np.linalg.norm(leap[at[i]] + leap[at[j]]) < 0.3 * size[at[i]] + honest.floor
+            ),
+            None,
+        )
+        if back is None:
+            lasting += 1
+            i += 1
+        else:
+            away[at[i] + 1 : at[back] + 1] = True
+            i = back + 1
+    return away, lasting
+
+
+def without_stale(series: Mapping[str, Series]) -> tuple[dict[str, Series], list[Note]]:
+    """Return the signals without what repeats itself at their end while the vehicle moves."""
+    kept, notes = dict(series), []
+    for name in MADE:
+        if name not in series:
+            continue
+        time, values = series[name].time, series[name].values
+        changes = np.flatnonzero((values[1:] != values[:-1]).any(axis=1))
+        last = int(changes[-1]) + 1 if len(changes) else 0
+        if not last or time[-1] - time[last] < LASTS or not _moves(series, name, time[last]):
+            continue
+        kept[name] = Series(time[: last + 1], values[: last + 1])
+        numbers = {"seconds": float(time[-1] - time[last])}
+        notes.append(
+            Note(NoteCode.STALE, count=len(time) - last - 1, numbers=numbers, names=(name,))
+        )
+    return kept, notes
+
+
+def _moves(series: Mapping[str, Series], stuck: str, since: float) -> bool:
+    """Return whether the vehicle is seen to move, by its position or, if not stuck, its gyro."""
+    places = _known(series["position"], since)
+    if len(places) and np.ptp(places, axis=0).max() >= MOVED:
+        return True
+    if stuck == "body_rate" or "body_rate" not in series:
+        return False
+    rates = _known(series["body_rate"], since)
+    return len(rates) > 0 and bool(np.sqrt(np.mean(rates**2)) >= TURNED)
+
+
+def _known(samples: Series, since: float) -> Array:
+    """Return the samples (n, k) after a time all of whose columns are known."""
+    return samples.values[(samples.time >= since) & np.isfinite(samples.values).all(axis=1)]
+
+
+def is_stale(series: Mapping[str, Series], notes: Sequence[Note]) -> bool:
+    """Return whether a recorded attitude repeats itself at its end while the vehicle moves."""
+    last = series["attitude"].values[-2:]
+    noted = any(n.code is NoteCode.STALE and "attitude" in n.names for n in notes)
+    return noted and bool((last[-1] == last[0]).all())
