@@ -272,6 +272,43 @@ class RunResult(ResultFile):
     sources: dict[str, Sources] = Field(default_factory=dict)
 
 
+class GateRecord(Part):
+    """A condition of an export: what it is, what stood against it, and whether it was looked at."""
+
+    name: str
+    objections: tuple[str, ...] = ()
+    ran: bool = True
+
+
+class ExportRecord(Part):
+    """An export of a run.
+
+    Attributes
+    ----------
+    format
+        Name of its target.
+    file
+        Inside the result folder; empty where it was refused.
+    gates
+        Conditions that were checked.
+    refused
+        Why it was not written; empty where it was.
+    """
+
+    format: str
+    file: str = ""
+    gates: tuple[GateRecord, ...] = ()
+    refused: str = ""
+
+
+class ExportRecords(ResultFile):
+    """The content of ``exports.json``: what was exported into the result folder, by format."""
+
+    FILE = "exports.json"
+
+    exports: dict[str, ExportRecord] = Field(default_factory=dict)
+
+
 class Run(BaseModel):
     """A result folder that was read: its result, and the vehicle with the best coefficients.
 

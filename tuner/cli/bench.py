@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.cli.options import TYPED, Quiet
+from tuner.cli.options import TYPED, Quiet, Verbose
 
 
-def bench(file: Path, /, *, out: Path | None = None, quiet: Quiet = False) -> None:
+def bench(
+    file: Path, /, *, out: Path | None = None, quiet: Quiet = False, verbose: Verbose = False
+) -> None:
     """Estimate coefficients from ground measurements, combine them and test whether they agree.
 
     Parameters
@@ -23,4 +25,4 @@ def bench(file: Path, /, *, out: Path | None = None, quiet: Quiet = False) -> No
     if not quiet:
         from tuner.cli.results import print_bench
 
-        print_bench(result)
+        print_bench(result, verbose=verbose)

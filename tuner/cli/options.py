@@ -79,6 +79,9 @@ Cluster = Annotated[
     ),
 ]
 Quiet = Annotated[bool, Parameter(help="Print nothing but errors.", negative=())]
+Verbose = Annotated[
+    bool, Parameter(help="Print all that the report says, and each message.", negative=())
+]
 Method = Annotated[
     Literal["auto", "gradient", "cma", "hybrid"] | None,
     Parameter(help="Search with this method. Default: the job file's, else auto."),

@@ -5,18 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tuner.cli.tables import console, print_settings
+from tuner.cli.tables import console
 from tuner.core.spans import watching
 from tuner.wording.phrases import as_sentence
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
+    from tuner.config import Settings
     from tuner.search.iteration import Iteration
     from tuner.search.listener import Listener
     from tuner.search.point_estimate import PointEstimate
@@ -53,8 +54,8 @@ DOING = {
 
 
 @contextmanager
-def listening(*, quiet: bool) -> Iterator[Listener]:
-    """Yield a listener that shows a run on the terminal, or nothing."""
+def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
+    """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
     from tuner.cli.results import estimates_table, folds_table
     from tuner.search.listener import SILENT, Listener
 
@@ -64,19 +65,32 @@ def listening(*, quiet: bool) -> Iterator[Listener]:
     screen = console()
     search = _MovingLine(screen) if screen.is_terminal else _StageLines(screen)
 
+    def say(text: str) -> None:
+        search.line(text)
+
     def show_estimates(estimates: Sequence[PointEstimate]) -> None:
         search.table(estimates_table(estimates))
-        search.message(SEARCHED)
+        say(SEARCHED)
 
+    def show_settings(settings: Settings) -> None:
+        for name, origin in settings.origin.items():
+            say(f"{name}: {origin}")
+
+    def on_iteration(iteration: Iteration, _left: float) -> None:
+        search.show(iteration)
+
+    shown = Listener(on_iteration=on_iteration, on_stop=say)
+    if verbose:
+        shown = replace(
+            shown,
+            on_settings=show_settings,
+            on_estimates=show_estimates,
+            on_message=say,
+            on_folds=lambda folds: search.table(folds_table(folds)),
+        )
     try:
         with watching(search.stage):
-            yield Listener(
-                on_settings=lambda settings: print_settings(settings, screen),
-                on_iteration=search.show,
-                on_estimates=show_estimates,
-                on_message=search.message,
-                on_folds=lambda folds: search.table(folds_table(folds)),
-            )
+            yield shown
     finally:
         search.close()
 
@@ -100,13 +114,13 @@ class _MovingLine:
     def stage(self, name: str) -> None:
         self._doing = DOING.get(name, as_sentence(name)) if name else STARTING
 
-    def show(self, iteration: Iteration, _left: float) -> None:
+    def show(self, iteration: Iteration) -> None:
         self._doing = _iteration(iteration)
 
-    def message(self, text: str) -> None:
+    def line(self, text: str) -> None:
         self._screen.print(text, markup=False)
 
-    def table(self, table: Table) -> None:
+    def table(self, table: object) -> None:
         self._screen.print(table)
 
     def close(self) -> None:
@@ -114,35 +128,36 @@ class _MovingLine:
 
 
 class _StageLines:
-    """One line for each stage of the search, printed when the stage has ended."""
+    """One line for each stage: printed as it begins, that of a search with its last iteration."""
 
     def __init__(self, screen: Console) -> None:
         self._began = time.perf_counter()
         self._screen = screen
+        self._named: set[str] = set()
         self._last: Iteration | None = None
 
-    def stage(self, _name: str) -> None:
-        """Nothing: what is done next is a message, and a stage is printed at its end."""
+    def stage(self, name: str) -> None:
+        if not name or name in self._named:
+            return
+        self._named.add(name)
+        self.line(DOING.get(name, as_sentence(name)))
 
-    def show(self, iteration: Iteration, _left: float) -> None:
-        if self._last is not None and self._last.stage != iteration.stage:
-            self.close()
+    def show(self, iteration: Iteration) -> None:
         self._last = iteration
 
-    def message(self, text: str) -> None:
+    def line(self, text: str) -> None:
         self.close()
-        self._screen.print(text, markup=False, soft_wrap=True)
+        seconds = time.perf_counter() - self._began
+        self._screen.print(f"{seconds:5.0f} s  {text}", markup=False, soft_wrap=True)
 
-    def table(self, table: Table) -> None:
+    def table(self, table: object) -> None:
         self.close()
         self._screen.print(table)
 
     def close(self) -> None:
-        if self._last is not None:
-            seconds = time.perf_counter() - self._began
-            line = f"{_iteration(self._last)}, {seconds:.0f} s so far"
-            self._screen.print(line, markup=False, soft_wrap=True)
-        self._last = None
+        last, self._last = self._last, None
+        if last is not None:
+            self.line(f"Searched: {_iteration(last)}")
 
 
 def _iteration(iteration: Iteration) -> str:

@@ -1,256 +1,266 @@
-"""The results of a run, or of an examination, as tables on the terminal."""
+"""The results of a run, or of an examination, on the terminal."""
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.text import Text
+
 from tuner.cli.tables import columns_of, console
-from tuner.result import RMSE_UNITS
+from tuner.report.section import Cell, Section, Table
+from tuner.wording.phrases import listed_within, shorten
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from tuner.evaluate.cross_validation import Fold
     from tuner.ground.job import BenchResult
     from tuner.job.sensitivity import SensitivityResult
-    from tuner.result import AxesRmse, EffectiveResult, RunResult
+    from tuner.result import RunResult
     from tuner.search.point_estimate import PointEstimate
 
-RMSE_COLUMNS = [f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()]
-NOT_SIMULATED = "–"
-"""Of what a simulation follows as it was recorded, or nobody recorded."""
+WIDTH, LINES = 100, 30
+"""What a finished job takes of a terminal at most, without --verbose."""
+MOST_FLIGHTS, MOST_WARNINGS, LEAST_COEFFICIENTS = 4, 6, 6
+DEFAULT = "default"
+STYLES = {"well": "green", "weak": "yellow", "not": "red", "worse": "red", "failure": "red"}
 
 
-def print_run(folder: Path, result: RunResult) -> None:
-    """Print the coefficients, the RMSE before and after, what to log, and where everything lies."""
-    from tuner.wording.proposals import next_log_in_words
-    from tuner.wording.result import ending_sentence, refits_in_words, starts_in_words
+def print_run(
+    folder: Path, result: RunResult, *, seconds: float | None = None, verbose: bool = False
+) -> None:
+    """Print what a run came to, in no more than `LINES` lines; all of it where that is asked.
+
+    Parameters
+    ----------
+    folder, result
+        Of the run.
+    seconds
+        That it took in all, where that is known.
+    verbose
+        Also print what the page's sections say.
+    """
+    from tuner.report.contents import read_contents
+
+    contents = read_contents(folder)
+    if verbose:
+        print_sections(folder)
+    screen = console(WIDTH)
+    for line in _summary(folder, result, contents.exports, seconds):
+        if isinstance(line, Table):
+            screen.print(_drawn(line))
+        else:
+            screen.print(line, soft_wrap=True)
+
+
+def _summary(
+    folder: Path, result: RunResult, exports: Sequence[object], seconds: float | None
+) -> list[Text | Table]:
+    """Return the lines and tables of a finished job."""
+    from tuner.report.outcome import flights_table, next_step, outcome
+
+    found = outcome(result)
+    lines: list[Text | Table] = [
+        Text(
+            shorten(f"{found.standing.capitalize()}. {found.what}", WIDTH),
+            f"bold {STYLES[found.look]}",
+        ),
+        *(Text(line) for line in _origins(result)),
+    ]
+    if found.checks:
+        lines.append(flights_table(found.checks[:MOST_FLIGHTS]))
+    lines += _warnings(result)
+    end = [Text(line) for line in (*_rest(result), *_written(folder, exports, seconds))]
+    words, command = next_step(result, found, folder)
+    end.append(Text(f"Next: {words} {command}"))
+    taken = sum(1 + len(line.rows) if isinstance(line, Table) else 1 for line in (*lines, *end))
+    return [*lines, *_coefficients(result, max(LINES - taken - 1, LEAST_COEFFICIENTS)), *end]
+
+
+def _origins(result: RunResult) -> list[str]:
+    """Return from where the settings come, in a line."""
+    origin = result.settings.get("origin")
+    by_place: dict[str, list[str]] = {}
+    for name, place in (origin if isinstance(origin, dict) else {}).items():
+        _, _, behind = str(place).partition("(")
+        is_default = str(place).startswith(DEFAULT)
+        by_place.setdefault(DEFAULT if is_default else behind.rstrip(")") or str(place), []).append(
+            name
+        )
+    given = [f"{', '.join(n)} by {p}" for p, n in by_place.items() if p != DEFAULT]
+    parts = [*given, "all else by default" if given else "all by default"]
+    return [shorten(f"Settings: {'; '.join(parts)}.", WIDTH)] if by_place else []
+
+
+def _warnings(result: RunResult) -> list[Text]:
+    from tuner.report.outcome import by_weight
+    from tuner.wording.findings import brief
+
+    found = by_weight(result.findings)
+    lines = [Text(f"! {brief(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]]
+    if len(found) > MOST_WARNINGS:
+        more = f"! {len(found) - MOST_WARNINGS} more warnings are in the report."
+        lines.append(Text(more, "yellow"))
+    return lines
+
+
+def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
+    """Return the fitted coefficients, those least known first where they do not fit."""
+    from tuner.uncertainty.verdict import Verdict
+    from tuner.wording.verdicts import half_width_in_words, verdict_in_words
+
+    fitted = {name: row for name, row in result.coefficients.items() if row.fitted}
+    shown = list(fitted)
+    if len(shown) > room:
+        least = sorted(shown, key=lambda n: fitted[n].verdict is Verdict.WELL_KNOWN)[: room - 1]
+        shown = [name for name in shown if name in least]
+    looks = {Verdict.WELL_KNOWN: "well", Verdict.WEAKLY_KNOWN: "weak"}
+    rows = [
+        (
+            name,
+            f"{row.initial:.5g}",
+            f"{row.best:.5g}",
+            half_width_in_words(row.ci95, row.best, row.unit),
+            row.unit,
+            Cell(verdict_in_words(row.verdict), look=looks.get(row.verdict, "not")),
+        )
+        for name, row in fitted.items()
+        if name in shown
+    ]
+    columns = ("coefficient", "start", "fitted", "± 95 %", "unit", "known")
+    lines: list[Text | Table] = [Table(columns, rows, words=("coefficient", "unit", "known"))]
+    if others := len(fitted) - len(shown):
+        lines.append(Text(f"{others} more fitted coefficients are in the report."))
+    return lines if rows else []
+
+
+def _rest(result: RunResult) -> list[str]:
+    """Return a line on what was fixed and one on the terms."""
+    from tuner.wording.result import nearly_kept
+
+    fixed = [f"{n} {row.best:.4g}" for n, row in result.coefficients.items() if not row.fitted]
+    lines = [f"Fixed: {listed_within(fixed, WIDTH - 8)}."] if fixed else []
+    if rows := result.selection:
+        kept = [row.group for row in rows if row.kept]
+        nearly = [row.group for row in rows if nearly_kept(row)]
+        text = f"Terms: {', '.join(kept) if kept else 'none'} of {len(rows)} kept"
+        text += f"; nearly: {', '.join(nearly)}" if nearly else ""
+        lines.append(shorten(f"{text}.", WIDTH))
+    return lines
+
+
+def _written(folder: Path, exports: Sequence[object], seconds: float | None) -> list[str]:
+    from tuner.result import ExportRecord
+
+    known = [one for one in exports if isinstance(one, ExportRecord)]
+    files = [one.file for one in known if one.file]
+    refused = [f"{one.format} was refused" for one in known if one.refused]
+    took = "" if seconds is None else f" in {seconds:.0f} s"
+    parts = [part for part in (", ".join(files), "; ".join(refused)) if part]
+    lines = [shorten(f"Exported: {'; '.join(parts)}.", WIDTH)] if parts else []
+    return [*lines, f"Written to {shlex.quote(str(folder))}{took}: report.html, best_fit.yaml."]
+
+
+def print_sections(folder: Path) -> None:
+    """Print what a result folder's page says, its figures left out."""
+    from tuner.report.contents import read_contents
+    from tuner.report.sections import sections_of
 
     screen = console()
-    screen.print(_coefficients(result))
-    if result.selection:
-        _print_selection(screen, result)
-    if result.effective is not None:
-        _print_effective(screen, result, result.effective)
-    if said := refits_in_words(result):
-        screen.print(_refits(result))
-        screen.print(" ".join(said), markup=False)
-    screen.print(_errors(result))
-    for line in starts_in_words(result.flights):
-        screen.print(line, markup=False)
-    if any(flight.predicted_best for flight in result.flights):
-        screen.print(_predictions(result))
-    for line in next_log_in_words(result.next_log):
-        screen.print(line, markup=False)
-    search = result.search
-    screen.print(
-        f"{ending_sentence(search.message)} It took {search.evaluations} Jacobians and "
-        f"{search.wall_time:.0f} s."
-    )
-    vehicles = "best_fit.yaml" if result.effective is None else "best_fit.yaml, effective.yaml"
-    screen.print(
-        f"written to {folder}/ (report.html, {vehicles}, result.json, metrics.csv, "
-        "sensitivity.csv)",
-        markup=False,
-    )
+    for section in sections_of(read_contents(folder)):
+        if section.key != "provenance":
+            _print_section(screen, section)
 
 
-def print_bench(bench: BenchResult) -> None:
+def _print_section(screen: Console, section: Section) -> None:
+    screen.print(Text(f"\n{section.title}", "bold"))
+    for sentence in section.sentences:
+        screen.print(Text(sentence))
+    for point in section.points:
+        screen.print(Text(f"- {point.text}", STYLES.get(point.look, "")))
+    for table in section.tables:
+        screen.print(_drawn(table))
+    if section.note:
+        screen.print(Text(section.note, "dim"))
+
+
+def _drawn(table: Table) -> object:
+    drawn = columns_of(table.fold)
+    for name in table.columns:
+        drawn.add_column(name.strip(), justify="left" if name in table.words else "right")
+    for row in table.rows:
+        drawn.add_row(*(_cell(of) for of in row))
+    return drawn
+
+
+def _cell(of: Cell | str) -> Text:
+    if isinstance(of, str):
+        return Text(of)
+    text = f"{of.text}: {of.small}" if of.look and of.small else of.text
+    return Text(text, STYLES.get(of.look, ""))
+
+
+def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
     """Print what each experiment and all together say, and where everything lies."""
     from tuner.ground.bench_json import bench_record
     from tuner.wording.bench import agreement_in_words, numbers_in_words
-    from tuner.wording.findings import one_line
 
     screen = console()
     record = bench_record(bench.combination, bench.measurements)
     for experiment in record.experiments:
         screen.print(f"{experiment.name}: {'; '.join(numbers_in_words(experiment))}", markup=False)
-    screen.print(_coefficients(bench.result))
     screen.print(agreement_in_words(record))
-    for finding in bench.result.findings:
-        screen.print(one_line(finding), markup=False)
-    screen.print(
-        f"written to {bench.folder}/ (report.html, best_fit.yaml, result.json, bench.json)",
-        markup=False,
-    )
+    print_run(bench.folder, bench.result, verbose=verbose)
 
 
-def print_sensitivity(result: SensitivityResult) -> None:
+def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    from tuner.report.contents import read_contents
+    from tuner.report.sections import sections_of
     from tuner.wording.findings import one_line
-    from tuner.wording.proposals import proposals_in_words
-    from tuner.wording.verdicts import direction_in_words, judgement_in_words
+    from tuner.wording.verdicts import direction_in_words
 
     screen = console()
-    then = ("unit", "+1 % moves position by", "how well it is known")
-    table = columns_of("Coefficients", left=("coefficient",), right=("value", "±"), then=then)
-    for name, known in result.knowledge.coefficients.items():
-        error = "" if known.std_error is None else f"{known.std_error:.2g}"
-        judgement = judgement_in_words(known.verdict, known.reason)
-        table.add_row(
-            known.label(name),
-            f"{known.value:.5g}",
-            error,
-            known.unit,
-            _largest_change(result, name),
-            judgement,
-        )
-    screen.print(table)
+    for section in sections_of(read_contents(result.folder)):
+        if verbose or section.key in ("coefficients", "next_flight"):
+            _print_section(screen, section)
     for finding in result.findings:
         screen.print(one_line(finding), markup=False)
     for direction in result.knowledge.directions[:1]:
         screen.print(
             f"The worst determined combination of coefficients: {direction_in_words(direction)}"
         )
-    for sentence in proposals_in_words(result.proposals) if result.proposals else ():
-        screen.print(sentence)
-    screen.print(f"written to {result.folder}/ (report.html, sensitivity.csv, correlation.csv, …)")
+    screen.print(f"Written to {result.folder}: report.html, sensitivity.csv, correlation.csv.")
 
 
-def _largest_change(result: SensitivityResult, name: str) -> str:
-    """Return the largest RMS change of a position axis, and where."""
-    changes = [
-        (output.change[name], output.axis, output.flight)
-        for output in result.knowledge.outputs
-        if output.channel == "position" and name in output.change
-    ]
-    if not changes:
-        return ""
-    change, axis, flight = max(changes)
-    return f"{1000 * change:.3g} mm ({axis}, {flight})"
-
-
-def _coefficients(result: RunResult) -> Table:
-    from tuner.wording.verdicts import judgement_in_words
-
-    numbers, then = ("initial", "best", "±"), ("unit", "how well it is known")
-    table = columns_of("Coefficients", left=("coefficient",), right=numbers, then=then)
-    for name, coefficient in result.coefficients.items():
-        table.add_row(
-            name,
-            f"{coefficient.initial:.5g}",
-            f"{coefficient.best:.5g}",
-            "" if coefficient.std_error is None else f"{coefficient.std_error:.2g}",
-            coefficient.unit,
-            judgement_in_words(coefficient.verdict, coefficient.reason),
-        )
-    return table
-
-
-def _refits(result: RunResult) -> Table:
-    """Return the standard errors of the fit beside those of refits to other flights."""
-    errors_of = ("this fit", "jackknife", "bootstrap")
-    table = columns_of("Standard errors by refits", left=("coefficient",), right=errors_of)
-    for name, found in result.coefficients.items():
-        errors = (found.std_error, found.jackknife_error, found.bootstrap_error)
-        if found.fitted:
-            table.add_row(name, *("" if error is None else f"{error:.2g}" for error in errors))
-    return table
-
-
-def _print_selection(screen: Console, result: RunResult) -> None:
-    """Print what each group of terms beyond the base model is worth."""
-    from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
-
-    gains_in, then = ("gain in the fit", "gain held out"), ("in the model", "why")
-    table = columns_of("Terms beyond the motor model", left=("term",), right=gains_in, then=then)
-    for row in result.selection:
-        gains = gain_in_words(row.gain_fit), gain_in_words(row.gain_holdout)
-        table.add_row(row.group, *gains, "yes" if row.kept else "no", reason_in_words(row))
-    screen.print(table)
-    screen.print(selection_in_words(result.selection), markup=False)
-
-
-def _print_effective(screen: Console, result: RunResult, effective: EffectiveResult) -> None:
-    """Print with which coefficients Gazebo flies most like the vehicle, where they differ."""
-    from tuner.wording.result import effective_in_words, rmse_in_words
-
-    answers = ("physical", "effective")
-    table = columns_of("In Gazebo", left=("coefficient",), right=answers, then=("unit",))
-    for name, value in effective.coefficients.items():
-        row = result.coefficients.get(name)
-        if row is not None and value != row.best:
-            table.add_row(name, f"{row.best:.5g}", f"{value:.5g}", row.unit)
-    screen.print(table)
-    screen.print(effective_in_words(effective), markup=False)
-    for term in effective.lost:
-        missed = rmse_in_words(term.rmse_without)
-        screen.print(f"Without {term.group} alone: {missed}.", markup=False)
-
-
-def _errors(result: RunResult) -> Table:
-    title = "RMSE with the initial → with the best coefficients"
-    table = columns_of(title, left=("flight",), right=RMSE_COLUMNS)
-    for flight in result.flights:
-        cells = []
-        for axis in RMSE_UNITS:
-            both = [_axis(rmse, axis) for rmse in (flight.rmse_initial, flight.rmse_best)]
-            cells.append(NOT_SIMULATED if both == [NOT_SIMULATED] * 2 else " → ".join(both))
-        held_out = " (held out)" if flight.split == "holdout" else ""
-        table.add_row(flight.name + held_out, *cells)
-    return table
-
-
-def _predictions(result: RunResult) -> Table:
-    """Return the open-loop predictions' errors, before and after the fit."""
-    from tuner.wording.result import PREDICTED
-
-    title = (
-        "Open-loop predictions from recorded states: mean error, initial → best coefficients (of a "
-        "state that stays)"
-    )
-    errors = [f"{name.replace('_', ' ')} {unit}" for name, unit in PREDICTED.items()]
-    table = columns_of(title, left=("flight",), right=("after", *errors))
-    for flight in result.flights:
-        held_out = " (held out)" if flight.split == "holdout" else ""
-        rows = zip(
-            flight.predicted_initial,
-            flight.predicted_best,
-            flight.predicted_holding or (None,) * len(flight.predicted_best),
-            strict=True,
-        )
-        for before, after, held in rows:
-            cells = [
-                NOT_SIMULATED
-                if getattr(before, name) is None and getattr(after, name) is None
-                else f"{_number(getattr(before, name))} → {_number(getattr(after, name))}"
-                + ("" if held is None else f" ({_number(getattr(held, name))})")
-                for name in PREDICTED
-            ]
-            table.add_row(flight.name + held_out, f"{after.seconds:g} s", *cells)
-    return table
-
-
-def estimates_table(estimates: Sequence[PointEstimate]) -> Table:
+def estimates_table(estimates: Sequence[PointEstimate]) -> object:
     """Return where a search ended, of which nothing is known yet but the values."""
-    table = columns_of(left=("coefficient",), right=("initial", "estimate"))
-    table.add_column("unit")
-    for row in estimates:
-        table.add_row(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit)
-    return table
+    rows = [(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit) for row in estimates]
+    columns = ("coefficient", "initial", "estimate", "unit")
+    return _drawn(Table(columns, rows, words=("coefficient", "unit")))
 
 
-def folds_table(folds: Sequence[Fold]) -> Table:
+def folds_table(folds: Sequence[Fold]) -> object:
     """Return how well each flight is predicted by the fit to the others."""
+    from tuner.result import RMSE_UNITS
+
+    rows = [
+        (
+            fold.left_out,
+            *(
+                "impossible"
+                if fold.rmse is None
+                else "crash"
+                if (value := getattr(fold.rmse, axis)) is None
+                else f"{value:.3g}"
+                for axis in RMSE_UNITS
+            ),
+        )
+        for fold in folds
+    ]
+    columns = ("left out", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     title = "RMSE of each flight with the fit to the others"
-    table = columns_of(title, left=("left out",), right=RMSE_COLUMNS)
-    for fold in folds:
-        cells = [
-            "impossible" if fold.rmse is None else _axis(fold.rmse, axis) for axis in RMSE_UNITS
-        ]
-        table.add_row(fold.left_out, *cells)
-    return table
-
-
-def _axis(rmse: AxesRmse, axis: str) -> str:
-    """Return an axis' RMSE; of a flight whose attitude is followed three axes are not simulated."""
-    flown = any(getattr(rmse, each) is not None for each in RMSE_UNITS)
-    value = getattr(rmse, axis)
-    return NOT_SIMULATED if flown and value is None else _number(value)
-
-
-def _number(value: float | None) -> str:
-    return "crash" if value is None else f"{value:.4f}" if value < 0.1 else f"{value:.3f}"
+    return _drawn(Table(columns, rows, words=("left out",), fold=title))

@@ -19,6 +19,7 @@ from tuner.cli.options import (
     Quiet,
     Topics,
     VehicleChoice,
+    Verbose,
     Workers,
 )
 
@@ -45,6 +46,7 @@ def sensitivity(
     workers: Workers = None,
     cluster: Cluster = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Report the effect of each coefficient, how well it is known and from which flights.
 
@@ -97,7 +99,7 @@ def sensitivity(
         span=span / 100.0,
         profiles=profile or (),
     )
-    with engine_for(workers, cluster), listening(quiet=quiet) as listener:
+    with engine_for(workers, cluster), listening(quiet=quiet, verbose=verbose) as listener:
         result = examine_vehicle(
             options,
             request,
@@ -106,4 +108,4 @@ def sensitivity(
             on_message=listener.on_message,
         )
     if not quiet:
-        print_sensitivity(result)
+        print_sensitivity(result, verbose=verbose)

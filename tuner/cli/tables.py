@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 WIDTH = 140
 
 
-def console() -> Console:
-    """Return a console wide enough that no number is cut."""
+def console(width: int = WIDTH) -> Console:
+    """Return a console of at least so many columns, so that no number is cut."""
     fitting = Console(highlight=False)
-    return fitting if fitting.width >= WIDTH else Console(highlight=False, width=WIDTH)
+    return fitting if fitting.width >= width else Console(highlight=False, width=width)
 
 
 def columns_of(
@@ -36,7 +36,7 @@ def columns_of(
     then: Sequence[str] = (),
 ) -> Table:
     """Return a table without rows: columns of words, then of numbers, then of words again."""
-    table = Table(box=None, title=title or None, title_justify="left")
+    table = Table(box=None, title=title or None, title_justify="left", pad_edge=False)
     for name in left:
         table.add_column(name)
     for name in right:
@@ -95,12 +95,6 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     screen = console()
     screen.print(table)
     screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
-
-
-def print_settings(settings: Settings, screen: Console) -> None:
-    """Print where each setting comes from."""
-    for name, origin in settings.origin.items():
-        screen.print(f"{name}: {origin}", markup=False)
 
 
 def print_comparison(

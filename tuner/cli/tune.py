@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
-from tuner.cli.options import TYPED, Cluster, FitOptions, Quiet, Switch, Workers
+from tuner.cli.options import TYPED, Cluster, FitOptions, Quiet, Switch, Verbose, Workers
 
 
 def tune(
@@ -21,6 +22,7 @@ def tune(
     dry_run: Switch = False,
     profile: Switch = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Fit the coefficients, validate them on held-out flights, and write the report.
 
@@ -52,6 +54,7 @@ def tune(
     if dry_run:
         print(job_script_for(cluster))
         return
+    began = time.perf_counter()
     from tuner.cli.profile import profiling
     from tuner.core.spans import span
 
@@ -70,7 +73,7 @@ def tune(
         with span("reading"):
             bare, left_out = without_pose(settle(options))
         if bare:
-            with listening(quiet=quiet) as listener:
+            with listening(quiet=quiet, verbose=verbose) as listener:
                 measured = fit_without_pose(
                     settle(options),
                     bare,
@@ -81,9 +84,9 @@ def tune(
                 )
             profile_into(measured.folder)
             if not quiet:
-                print_bench(measured)
+                print_bench(measured, verbose=verbose)
             return
-        with engine_for(workers, cluster), listening(quiet=quiet) as listener:
+        with engine_for(workers, cluster), listening(quiet=quiet, verbose=verbose) as listener:
             folder, result = run(
                 options,
                 out=out,
@@ -96,4 +99,4 @@ def tune(
             )
         profile_into(folder)
         if not quiet:
-            print_run(folder, result)
+            print_run(folder, result, seconds=time.perf_counter() - began, verbose=verbose)

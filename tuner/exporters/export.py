@@ -27,7 +27,7 @@ from tuner.exporters.target import (
     not_carried,
     target_of,
 )
-from tuner.result import EXPORTS, Run, read_run
+from tuner.result import EXPORTS, ExportRecord, ExportRecords, GateRecord, Run, read_run
 from tuner.vehicle import read_vehicle
 from tuner.wording.result import what_is_exported, what_is_lost
 
@@ -137,7 +137,17 @@ def export(
     refuse(run.folder, gates, accept, "fit again")
     write(draft, *places)
     notes = (*decided, *flown, *draft.notes, *not_carried(vehicle, target))
+    if places[0].is_relative_to(run.folder):
+        checked = tuple(GateRecord(name=g.name, objections=g.objections, ran=g.ran) for g in gates)
+        file = places[0].relative_to(run.folder).as_posix()
+        _record(run.folder, ExportRecord(format=kind, file=file, gates=checked))
     return Exported(places[0], gates, notes)
+
+
+def _record(folder: Path, made: ExportRecord) -> None:
+    """Note in a result folder what was exported into it, or was not."""
+    known = ExportRecords.read_if_any(folder) or ExportRecords()
+    ExportRecords(exports={**known.exports, made.format: made}).write(folder)
 
 
 def export_vehicle(
@@ -336,4 +346,5 @@ def exports_of_job(
             )
             yield kind, done.path
         except InputError as error:
+            _record(folder, ExportRecord(format=kind, refused=str(error)))
             yield kind, error

@@ -265,7 +265,7 @@ def _fitted(
             findings=(*findings, *at_start),
         )
     except (KeyboardInterrupt, OutputError, EngineError):
-        listener.on_message(
+        listener.on_stop(
             f"The best coefficients so far are in {folder}. "
             f"Continue the search with --out {folder} --resume."
         )

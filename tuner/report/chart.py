@@ -114,6 +114,10 @@ class Chart:
         What it is, and how to read it.
     height
         Pixels on the page.
+    fold
+        On the page it is folded under this word; empty shows it.
+    clock
+        Charts with one of these share their time axis; empty shares none.
     """
 
     key: str
@@ -122,6 +126,19 @@ class Chart:
     x_title: str = ""
     caption: str = ""
     height: int = 420
+    fold: str = ""
+    clock: str = ""
+
+    @property
+    def is_worth_drawing(self) -> bool:
+        """Whether a panel of it has more than a point."""
+        return any(sum(map(_size, panel.marks)) > 1 for panel in self.panels)
+
+
+def _size(mark: Line | Bars | Heat) -> int:
+    if isinstance(mark, Line):
+        return sum(value is not None for value in mark.y)
+    return len(mark.labels) if isinstance(mark, Bars) else len(mark.rows) * len(mark.columns)
 
 
 def rounded(values: NDArray[np.float64], digits: int) -> list[float | None]:

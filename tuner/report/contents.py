@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from tuner.evaluate.comparison_table import Table
 from tuner.ground.bench_json import BenchRecord
 from tuner.recordings.flight import Array
 from tuner.report.record import About, Recording, SearchRecord, read_traces
-from tuner.result import Run, RunResult, read_run
+from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
 from tuner.uncertainty.global_sensitivity_json import GlobalSensitivity
 from tuner.uncertainty.profiles_json import Profiles
 from tuner.uncertainty.sensitivity_json import Knowledge
@@ -41,6 +41,8 @@ class Contents:
         Ground measurements.
     search, laps
         How the fit went, and how closely laps are met.
+    exports
+        What was exported into the folder, or refused.
     traces
         Flight -> name -> array, see `tuner.report.record`.
     """
@@ -55,6 +57,7 @@ class Contents:
     bench: BenchRecord | None
     search: SearchRecord | None
     laps: Table | None
+    exports: Sequence[ExportRecord]
     traces: Mapping[str, Mapping[str, Array]]
 
 
@@ -73,6 +76,7 @@ def read_contents(folder: str | Path) -> Contents:
     if about is None or (folder / RunResult.FILE).exists():
         run = read_run(folder)
         about = _about_run(run)
+    exported = ExportRecords.read_if_any(folder)
     names = {file_name(flight.name): flight.name for flight in about.flights}
     return Contents(
         folder=folder,
@@ -85,6 +89,7 @@ def read_contents(folder: str | Path) -> Contents:
         bench=BenchRecord.read_if_any(folder),
         search=SearchRecord.read_if_any(folder),
         laps=Table.read_if_any(folder),
+        exports=() if exported is None else tuple(exported.exports.values()),
         traces={names.get(key, key): arrays for key, arrays in read_traces(folder).items()},
     )
 

@@ -64,7 +64,7 @@ def figure_of(chart: Chart) -> Json:
         for value, text in panel.levels
     ]
     layout["showlegend"] = len(shown) > 1
-    return {"key": chart.key, "title": chart.title, "data": traces, "layout": layout}
+    return {"key": chart.key, "clock": chart.clock, "data": traces, "layout": layout}
 
 
 def _panel(panel: Panel, suffix: str, shown: set[str]) -> tuple[list[Json], Json]:

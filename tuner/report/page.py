@@ -1,4 +1,4 @@
-"""The page: sections, figures as images and interactive ones, everything inside one file."""
+"""The page: the outcome, sections and interactive figures, everything inside one file."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import base64
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -16,10 +16,17 @@ from tuner.core.disk import write_text
 from tuner.core.spans import span
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
-from tuner.report.paper import data_uri, plot_file, write_plots
+from tuner.report.outcome import (
+    flights_table,
+    next_step,
+    of_examination,
+    outcome,
+    warnings_of,
+)
+from tuner.report.paper import write_plots
 from tuner.report.section import Section
 from tuner.report.sections import sections_of
-from tuner.report.summary import summary
+from tuner.wording.proposals import proposals_in_words
 
 REPORT_FILE = "report.html"
 
@@ -51,21 +58,12 @@ def render(
         drawn = wait_for_plots()
     with span("figures"):
         write_plots([chart for chart in charts if chart.key not in drawn], contents.folder)
-    images = {
-        chart.key: data_uri(plot_file(contents.folder, chart).read_text()) for chart in charts
-    }
     path = contents.folder / REPORT_FILE
-    write_text(path, _page(contents, sections, images, figures, library))
+    write_text(path, _page(contents, sections, figures, library))
     return path
 
 
-def _page(
-    contents: Contents,
-    sections: Sequence[Section],
-    images: Mapping[str, str],
-    figures: str,
-    library: str,
-) -> str:
+def _page(contents: Contents, sections: Sequence[Section], figures: str, library: str) -> str:
     environment = Environment(
         loader=PackageLoader("tuner.report"),
         autoescape=True,
@@ -73,19 +71,30 @@ def _page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"figures": _figures, "rmse": _rmse}
     script = _source(environment, "page.js")
+    run = contents.run
+    found = None if run is None else outcome(run.result, contents.bench)
     return environment.get_template("page.html.jinja").render(
         about=contents.about,
-        summary=summary(contents),
+        outcome=found,
+        checks=flights_table(found.checks if found else ()),
+        next=next_step(run.result, found, contents.folder) if run and found else None,
+        said=_said(contents),
+        warnings=warnings_of(contents.about.findings),
+        exports=contents.exports,
         sections=sections,
-        images=images,
         policy=_policy(script, library),
         style=Markup(_source(environment, "page.css")),
         script=Markup(script),
         figures=Markup(_packed(figures)),
         library=Markup(_packed(library)),
     )
+
+
+def _said(contents: Contents) -> list[str]:
+    """Return what an examination without a fit came to, in sentences."""
+    said = [] if contents.knowledge is None else [of_examination(contents.knowledge)]
+    return said + (proposals_in_words(contents.proposals)[:2] if contents.proposals else [])
 
 
 def _policy(*scripts: str) -> str:
@@ -105,15 +114,6 @@ def _policy(*scripts: str) -> str:
 def _source(environment: Environment, name: str) -> str:
     assert environment.loader is not None
     return environment.loader.get_source(environment, name)[0]
-
-
-def _figures(value: float | None) -> str:
-    """Write a number to five significant figures."""
-    return "–" if value is None else f"{value:.5g}"
-
-
-def _rmse(value: float | None) -> str:
-    return "crash" if value is None else f"{value:.4f}" if value < 1 else f"{value:.3g}"
 
 
 def _packed(text: str) -> str:

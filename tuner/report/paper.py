@@ -1,14 +1,12 @@
-"""Charts as SVG files for papers, and as images inside the page where no script runs."""
+"""Charts as files for papers: SVG, or PNG where a path ends so."""
 
 from __future__ import annotations
 
 import io
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -29,10 +27,6 @@ PIXELS = 96.0
 ALIKE = 1.001
 """Numbers that differ by less than so many times are one, for a logarithmic axis."""
 DASHES = {"solid": "-", "dot": ":", "dash": "--"}
-PATH = re.compile(r'(?<=\bd=")[^"]*')
-"""The data of an SVG path."""
-DIGITS = re.compile(r"(\.\d\d)\d+")
-"""A decimal fraction: two digits of it are a hundredth of a point, finer than paper shows."""
 SETTINGS: dict[Any, Any] = {
     "font.size": 8,
     "axes.grid": True,
@@ -202,13 +196,3 @@ def _heat(heat: Heat, place: Axes) -> None:
     bar = place.figure.colorbar(image, ax=place, label=heat.bar)
     if heat.ticks:
         bar.set_ticks(list(heat.ticks), labels=list(heat.ticks.values()))
-
-
-def data_uri(svg: str) -> str:
-    """Return a figure as the address of an image that needs no file.
-
-    Half of a figure is digits that no printer resolves; they are left out here, and kept in
-    ``plots/``.
-    """
-    drawing = PATH.sub(lambda path: " ".join(DIGITS.sub(r"\1", path[0]).split()), svg)
-    return "data:image/svg+xml," + quote(drawing, safe=" ,:;=/()")

@@ -28,6 +28,8 @@ class Listener:
         Gets where the search of the base model ended, long before intervals and validation.
     on_message
         Gets a sentence on what is done next, or on what a user should know.
+    on_stop
+        Gets a sentence on how to go on, where the run was interrupted.
     on_folds
         Gets the cross-validation's folds.
     """
@@ -36,6 +38,7 @@ class Listener:
     on_iteration: Callable[[Iteration, float], None] = lambda *_: None
     on_estimates: Callable[[Sequence[PointEstimate]], None] = lambda _: None
     on_message: Callable[[str], None] = lambda _: None
+    on_stop: Callable[[str], None] = lambda _: None
     on_folds: Callable[[Sequence[Fold]], None] = lambda _: None
 
 

@@ -31,7 +31,7 @@ def left_out(finding: Finding) -> str:
     """Return why a flight takes no part: of a clause without a subject the flight is that."""
     what = finding.names[0]
     it = "it " if what.split()[0] in WITHOUT_SUBJECT else ""
-    return f"The flight is left out: {it}{what}."
+    return as_sentence(f"{it}{what}; the flight is left out")
 
 
 def salvaged(finding: Finding) -> str:
@@ -39,7 +39,7 @@ def salvaged(finding: Finding) -> str:
     cause, subject = finding.names
     numbers: Mapping[str, Any] = finding.numbers
     damage = damage_sentence(Damage(Cause(cause), subject, **numbers))
-    return f"The recording is broken, and the flight is what was salvaged of it: {damage}."
+    return f"It is broken: {damage}; what was salvaged is used."
 
 
 def inlet_chosen(finding: Finding) -> str:
@@ -69,7 +69,7 @@ def setpoints_scaled(finding: Finding) -> str:
     axis, law = finding.names
     so = f", as those of the {law} law would be" if law else ""
     factor = f"{finding.numbers['gain']:.1f}"
-    return f"The recorded {axis} rate set-points are {factor} times the controller file's{so}."
+    return f"{axis.capitalize()} rate set-points are {factor} times the controller file's{so}."
 
 
 def setpoints_remedy(finding: Finding) -> str:
@@ -84,8 +84,8 @@ def setpoints_foreign(finding: Finding) -> str:
     """Return on which axes set-points do not follow."""
     alike = " and ".join(f"{value:.2f} in {axis}" for axis, value in finding.numbers.items())
     return (
-        "The recorded rate set-points do not follow from reference, state and controller file "
-        f"(correlation {alike}): another controller flew, or another reference."
+        "Another controller flew, or another reference: the recorded rate set-points do not follow "
+        f"from reference, state and controller file (correlation {alike})."
     )
 
 
@@ -101,8 +101,8 @@ def holding_better(finding: Finding) -> str:
         ]
     )
     return (
-        f"That the state stays as it is predicts this flight, {numbers['seconds']:g} s ahead, "
-        f"better than the fitted coefficients do: {lost} in the mean."
+        f"That it stays as it is predicts better: {numbers['seconds']:g} s ahead the fitted "
+        f"coefficients miss {lost} in the mean."
     )
 
 
@@ -124,8 +124,8 @@ def inertia_balanced(finding: Finding) -> str:
             f"are predicted with {error:.2f} times the error."
         )
     return (
-        "Errors in the measured rotor speeds pass for inertia and damping: recorded motion and "
-        f"rotor speeds balance at {values}. What predicts these flights is kept, for flights that "
+        "Errors in rotor speeds pass for inertia: recorded motion and rotor speeds balance at "
+        f"{values}. What predicts these flights is kept, for flights that "
         f"are left out would be predicted with {error:.2f} times the error."
     )
 
@@ -159,6 +159,6 @@ def flight_unmatched(finding: Finding) -> str:
         f"{channel.replace('_', ' ')} {value:.1f}" for channel, value in finding.numbers.items()
     )
     return (
-        "The simulation does not match this flight: its residuals in multiples of the measurement "
-        f"noise are {multiples}, and its weight in the fit was lowered accordingly."
+        "The simulation does not match it: its residuals in multiples of the measurement noise are "
+        f"{multiples}, and its weight in the fit was lowered accordingly."
     )

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 
 from tuner.core.findings import Code, Finding
 from tuner.vehicle.motor_orders import order_in_words
 from tuner.wording import composed
-from tuner.wording.phrases import as_sentence, listed, percent
+from tuner.wording.phrases import as_sentence, listed, percent, shorten
 
 GIVE_VEHICLE = (
     "Give the vehicle with --vehicle and what it weighs with --mass; tune new-vehicle writes a "
@@ -15,6 +16,8 @@ GIVE_VEHICLE = (
 )
 
 
+CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
+"""Where the first clause of a sentence ends; not before the value of a setting."""
 Text = str | Callable[[Finding], str]
 """With the finding's numbers in braces, ``names``, ``first`` and ``last`` for its names in words,
 ``coefficients`` and ``given`` for them as they stand, ``subject`` for its subject; or what makes a
@@ -23,35 +26,32 @@ sentence of a finding."""
 TEXTS: Mapping[Code, tuple[Text, Text]] = {
     Code.FLIGHT_WORSE: (
         (
-            "The fitted coefficients meet the {first} of this flight worse than the initial ones "
-            "did: RMSE {after:.3g} {unit}, before {before:.3g} {unit}."
+            "Its {first} is met worse than before the fit: RMSE {after:.3g} {unit}, before "
+            "{before:.3g} {unit}."
         ),
         "Look at its figures and at inspect: it may have been flown, or recorded, otherwise.",
     ),
     Code.FLIGHT_CRASHES: (
         (
-            "With the fitted coefficients the simulated flight crashes after {seconds:.1f} s; with "
-            "the initial ones it does not."
+            "The simulated flight crashes after {seconds:.1f} s: with the initial coefficients it "
+            "does not."
         ),
         "Do not use this fit: free other coefficients, and look at inspect.",
     ),
     Code.PART_FAILED: (
         (
-            "This part of the explanation failed ({given}: {text}) and is left out; the rest "
-            "of the result does not depend on it."
+            "This part failed and is left out: {given}, {text}. The rest of the result does not "
+            "depend on it."
         ),
         "Please report it, with the job's log.",
     ),
     Code.MISSING_SIGNALS: (
-        (
-            "The recording holds no {names}, without which the flight says less about the motors, "
-            "and about inertia."
-        ),
+        ("It holds no {names}: the flight says less about the motors, and about inertia."),
         "Log that too, if you can.",
     ),
     Code.WRONG_VEHICLE: (
         (
-            "This is not the vehicle that flew: turning as recorded its rotors would lift "
+            "This is not the vehicle that flew: turning as recorded, its rotors would lift "
             "{lift:.3g} N on average, and {mass:g} kg weigh {weight:.3g} N."
         ),
         GIVE_VEHICLE,
@@ -69,20 +69,20 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.SPARSE_INPUT: (
         (
-            "The {first} was recorded at {recorded:.0f} Hz but computed at {needed:.0f} Hz: what "
-            "happened in between is lost, and moments of inertia may be wrong by tens of percent, "
-            "more than their intervals show."
+            "The {first} comes at {recorded:.0f} of {needed:.0f} Hz: what happened in between is "
+            "lost, and moments of inertia may be wrong by tens of percent, more than their "
+            "intervals show."
         ),
         "Log it at the full rate, or choose an inlet further upstream.",
     ),
     Code.STILL_AXES: (
-        "No fitted flight moves in {names}, so that inertia and rotor drag there are not excited.",
+        "No flight moves in {names}: inertia and rotor drag there are not excited.",
         "Fly a circle or a lemniscate.",
     ),
     Code.NO_YAW: (
         (
-            "No fitted flight yaws faster than {rate:.2f} rad/s, so that inertia_zz and "
-            "moment_constant are not excited."
+            "No flight yaws faster than {rate:.2f} rad/s: inertia_zz and moment_constant are not "
+            "excited."
         ),
         "Fly a yaw spin.",
     ),
@@ -111,10 +111,10 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.SINGULAR_DIRECTION: (
         (
-            "The flights do not distinguish {coefficients}: a common change of them leaves every "
+            "The flights do not tell them apart: a common change of {coefficients} leaves every "
             "recorded signal as it is."
         ),
-        "Fix one of them to its weighed or measured value (--fix {given}).",
+        "Fix one of them to its measured value (--fix {given}).",
     ),
     Code.CLOCK_OFFSET: (
         "The {first} clock is {milliseconds:+.2f} ms late, which the fit takes into account.",
@@ -122,30 +122,31 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.TURNING_UNEXPLAINED: (
         (
-            "The recorded inputs explain {explained_percent} of the change of body rate over half "
-            "a second. Noise in them, and the loop's answer to disturbances, make their torque "
-            "look weaker than it is: inertia and lags are those that predict best, and inertia "
-            "may be several times too large, whatever its interval says."
+            "Inputs explain {explained_percent} of the turning: that share of the change of body "
+            "rate over half a second. Noise in them, and the loop's answer to disturbances, make "
+            "their torque look weaker than it is: inertia and lags are those that predict best, "
+            "and inertia may be several times too large, whatever its interval says."
         ),
         "Log inputs at the rate loop's rate, or measure the inertia on the ground (tune bench).",
     ),
     Code.TURNING_REGRESSED: (
         (
-            "Rotor speeds and forces of the air explain {explained_x_percent}, "
-            "{explained_y_percent} and {explained_z_percent} of the angular acceleration about "
-            "forward, left and up: the rest is not recorded, and the loop's rotors answer it. "
-            "Moments of inertia and other physical coefficients are those of a regression of "
-            "accelerations that the answer does not bend. Torque gains, damping and steady torque "
-            "are not physical, but what predicts up to {seconds:g} s ahead best."
+            "Not all turning is recorded: rotor speeds and forces of the air explain "
+            "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
+            "acceleration about forward, left and up. The rest is not recorded, and the loop's "
+            "rotors answer it. Moments of inertia and other physical coefficients are those of a "
+            "regression of accelerations that the answer does not bend. Torque gains, damping and "
+            "steady torque are not physical, but what predicts up to {seconds:g} s ahead best."
         ),
         "Fly faster and less evenly, or measure the inertia on the ground (tune bench).",
     ),
     Code.TURNING_NOT_PREDICTED: (
         (
-            "Rotor speeds and forces of the air explain {explained_x_percent}, "
-            "{explained_y_percent} and {explained_z_percent} of the angular acceleration about "
-            "forward, left and up, too little to predict roll and pitch 0.1 s ahead better than "
-            "that they stay. Physical coefficients are those of a regression of accelerations."
+            "Most turning is not recorded: rotor speeds and forces of the air explain "
+            "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
+            "acceleration about forward, left and up, too little to predict roll and pitch 0.1 s "
+            "ahead better than that they stay. Physical coefficients are those of a regression of "
+            "accelerations."
         ),
         "Feed the attitude in (inlet: attitude), or log what the loop is told to do.",
     ),
@@ -166,16 +167,15 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.MODEL_UNMATCHED: (
         (
-            "The residuals of {unmatched:.0f} of {flights:.0f} flights are about "
-            "{noise_multiple:.0f} times the measurement noise: the model lacks an effect "
-            "that these flights share."
+            "It lacks an effect that flights share: the residuals of {unmatched:.0f} of "
+            "{flights:.0f} flights are about {noise_multiple:.0f} times the measurement noise."
         ),
-        "Judge the fit by the held-out flights rather than by its standard errors.",
+        "Judge the fit by held-out flights, not by its intervals.",
     ),
     Code.FINER_THAN_STEPS: (
         (
-            "The 95 % intervals say how well these lags of this simulator are known: simulators "
-            "with another physics step differ by {milliseconds:g} ms."
+            "Simulators differ by {milliseconds:g} ms: their physics steps do, which the 95 % "
+            "intervals of these lags leave out."
         ),
         "Take these values as known to {twice:g} ms.",
     ),
@@ -188,22 +188,22 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.POORLY_MET: (
         (
-            "The simulated {first} differs from the recorded one by {noise_multiple:.0f} times the "
-            "measurement noise, and the intervals are widened accordingly."
+            "Its {first} is {noise_multiple:.0f} times the noise off: intervals are widened "
+            "accordingly."
         ),
         "Fit first, then examine the fitted vehicle.",
     ),
     Code.GROUND_CONFLICT: (
         (
-            "Ground measurements give {ground:.5g} {unit}, the flights alone {flights:.5g} {unit}: "
+            "Ground and flights disagree: {ground:.5g} {unit} and {flights:.5g} {unit}, "
             "{deviation:+.1f} standard errors apart, model error included."
         ),
-        "Find out which is wrong, the rig or the model, before believing the value of both.",
+        "Find out which is wrong, the rig or the model.",
     ),
     Code.BENCH_CONFLICT: (
         (
-            "What it says of {coefficients} lies {deviation:+.1f} standard errors from what all "
-            "other experiments say."
+            "It contradicts the other experiments: what it says of {coefficients} lies "
+            "{deviation:+.1f} standard errors from theirs."
         ),
         "Check its geometry (levers, arms, wires), its units and its calibration.",
     ),
@@ -220,22 +220,22 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.HEADING_FLOWN: (
         (
-            "The recorded yaw rate set-points do not follow from the controller file (correlation "
-            "{correlation:.2f}): the heading was commanded otherwise, as by hand, so that the "
+            "The heading was commanded otherwise, as by hand: recorded yaw rate set-points do not "
+            "follow from the controller file (correlation {correlation:.2f}), so that the "
             "reference says nothing of it."
         ),
         "Feed in its rate set-points (inlet: body_rate) if yaw matters.",
     ),
     Code.MOTOR_ORDER: (
         (
-            "The recorded motors are not in the order of the vehicle file's rotors: how they turn "
-            "the vehicle makes them {names} of the columns that the topic map lists."
+            "Motors are in another order: how they turn the vehicle makes them {names} of the "
+            "columns that the topic map lists."
         ),
-        "Write motor_order: {order} into the topic map, or list its fields in that order.",
+        "Write motor_order: {order} into the topic map.",
     ),
     Code.SPINS_REVERSED: (
-        "The recorded motors yaw the vehicle against the rotors' spins in the vehicle file.",
-        "Check the spins there, which motors drive which rotors, and the sign of the gyro's z.",
+        "Motors yaw it against the spins of the vehicle file.",
+        "Check the spins, the motors' order, and the sign of the gyro's z.",
     ),
     Code.SCALES_WITH_MASS: (
         (
@@ -257,9 +257,8 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.RATE_WORSE: (
         (
-            "From its commands alone the fitted coefficients predict the body rate of this flight "
-            "{seconds:g} s ahead to {after:.3g} rad/s, worse than the initial ones did: "
-            "{before:.3g} rad/s."
+            "Its body rate is predicted worse than before: {seconds:g} s ahead, from its commands "
+            "alone, to {after:.3g} rad/s instead of {before:.3g} rad/s."
         ),
         "Fit it by itself: another build, battery or propeller turns the vehicle otherwise.",
     ),
@@ -282,8 +281,8 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     ),
     Code.VEHICLE_NOT_GIVEN: (
         (
-            "No vehicle was given, so that these flights were taken for its own: without a pose "
-            "mass and arms come from the vehicle file."
+            "No vehicle was given: these flights were taken for its own, and without a pose mass "
+            "and arms come from the vehicle file."
         ),
         "Give the vehicle with --vehicle, and what it weighs with --mass.",
     ),
@@ -306,18 +305,17 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
     Code.SALVAGED: (composed.salvaged, "Record the flight again if what was lost matters."),
     Code.SATURATION_FEEDBACK: (
         (
-            "Rotors were clipped at their lower limit, and the recordings agree with a mixer that "
-            "{mixer} then, other than the controller file has it; it was simulated so."
+            "The mixer was another: the recordings agree with one that {mixer} at the rotors' "
+            "lower limit, other than the controller file has it. It was simulated so."
         ),
-        "Set mixer.saturation_feedback: {flag} in the controller file.",
+        "Set mixer.saturation_feedback: {flag} (in the controller file).",
     ),
     Code.SEES_MARKERS: (
         (
-            "The markers' frame is off the vehicle's, and the recordings agree with position and "
-            "attitude controllers that see {frame}, other than the controller file has it; it was "
-            "simulated so."
+            "The controllers see another frame: the recordings agree with ones that see {frame}, "
+            "other than the controller file has it. It was simulated so."
         ),
-        "Set sensing.sees_markers: {seen_flag} in the controller file.",
+        "Set sensing.sees_markers: {seen_flag} (in the controller file).",
     ),
     Code.FLIGHT_UNMATCHED: (
         composed.flight_unmatched,
@@ -343,7 +341,7 @@ TEXTS: Mapping[Code, tuple[Text, Text]] = {
         "",
     ),
     Code.LOGS_DIFFER: (
-        "The logs have different values of {coefficients}; those of the first are simulated.",
+        "The logs differ: in {coefficients}; those of the first are simulated.",
         "Fit them one by one.",
     ),
     Code.ATTITUDE_FOLLOWED: (
@@ -384,6 +382,20 @@ def remedy(finding: Finding) -> str:
 def one_line(finding: Finding) -> str:
     """Return a finding as one line of a terminal."""
     return f"{finding.level}: {finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
+
+
+def brief(finding: Finding, width: int) -> str:
+    """Return a finding in so many characters: its subject, what was noticed, what to do.
+
+    What does not fit is cut from the middle, what to do last.
+    """
+    first, *others = finding.subject.split(", ")
+    subject = shorten(f"{first} and {len(others)} more" if others else first, 30)
+    what, to_do = CLAUSE.split(sentence(finding))[0].removesuffix("."), remedy(finding)
+    if len(f"{subject}: {what}. {to_do}") > width and to_do:
+        to_do = f"{CLAUSE.split(to_do)[0].removesuffix('.')}."
+    left = width - len(f"{subject}: . {to_do}")
+    return shorten(f"{subject}: {shorten(what, max(left, 12))}. {to_do}".rstrip(), width)
 
 
 def _worded(text: Text, finding: Finding) -> str:

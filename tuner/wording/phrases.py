@@ -33,3 +33,20 @@ def as_sentence(clause: str) -> str:
     """Return a clause as a sentence; a first word that is a name keeps its small letter."""
     first = clause.partition(" ")[0]
     return f"{clause[:1].upper() if first.isalpha() else clause[:1]}{clause[1:]}."
+
+
+def shorten(text: str, width: int) -> str:
+    """Return a text of no more than so many characters, cut at a word where it was longer."""
+    if len(text) <= width:
+        return text
+    return f"{text[: max(width - 1, 1)].rpartition(' ')[0] or text[: width - 1]}…"
+
+
+def listed_within(words: Sequence[str], width: int) -> str:
+    """Return as many words as fit, with commas, and how many more there are."""
+    for count in range(len(words), 0, -1):
+        more = len(words) - count
+        text = ", ".join(words[:count]) + (f" and {more} more" if more else "")
+        if len(text) <= width:
+            return text
+    return f"{len(words)} in all"

@@ -21,6 +21,8 @@ from tuner.uncertainty.calibration import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.wording.phrases import listed, percent
 
+NEARLY = 0.01
+"""Share of the loss from which a term that is left out is worth naming."""
 APART = 2.0
 """Times the standard error of a fit beyond which that of refits is called larger."""
 
@@ -94,6 +96,14 @@ def effective_in_words(effective: EffectiveResult) -> str:
     if effective.carried:
         text += f" Gazebo has a place for {listed(effective.carried)}."
     return text
+
+
+def simulator_lacks(effective: EffectiveResult) -> str:
+    """Return as a sentence what Gazebo lacks, and how it flies all the same."""
+    return (
+        f"Gazebo lacks {listed([term.group for term in effective.lost])}, and with effective "
+        f"coefficients misses them by {rmse_in_words(effective.rmse_effective)}."
+    )
 
 
 def rmse_in_words(rmse: PoseRmse) -> str:
@@ -178,6 +188,11 @@ _REASONS = {
 def reason_in_words(row: SelectionRow) -> str:
     """Return why a group is in the model or not, as a clause."""
     return _REASONS[row.reason]
+
+
+def nearly_kept(row: SelectionRow) -> bool:
+    """Return whether a group that was left out gained a percent or more in the fit."""
+    return not row.kept and (row.gain_fit or 0.0) >= NEARLY
 
 
 def gain_in_words(gain: float | None) -> str:

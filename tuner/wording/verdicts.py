@@ -48,6 +48,19 @@ def reason_in_words(reason: Reason) -> str:
     return phrase
 
 
+def half_width_in_words(
+    interval: tuple[float | None, float | None] | None, value: float, unit: str
+) -> str:
+    """Return half a 95 % interval: a time in ms, else as a share of the value where it has one."""
+    if interval is None or None in interval:
+        return ""
+    low, high = interval
+    half = ((high or 0.0) - (low or 0.0)) / 2.0
+    if unit == "s" or abs(value) < half:
+        return f"±{quantity(half, unit)}"
+    return f"±{percent(half / abs(value))}"
+
+
 def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
     """Return what half of a 95 % interval would be from each cause alone.
 

@@ -30,39 +30,54 @@ def iterations(stage, count, first=1):
     ]
 
 
-def test_a_stage_is_one_line_with_its_last_iteration(capsys):
+def lines_of(capsys):
+    """Return what was printed, without the seconds before each line."""
+    return [re.sub(r"^ *\d+ s  ", "", line) for line in capsys.readouterr().out.splitlines()]
+
+
+def test_a_stage_is_one_line_and_a_search_ends_with_its_last_iteration(capsys):
     with listening(quiet=False) as listener:
         listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
-        for iteration in (*iterations("2 s", 30), *iterations("whole flights", 60, first=31)):
-            listener.on_iteration(iteration, 12.0)
+        with span("reading"):
+            pass
+        with span("search"):
+            for iteration in (*iterations("2 s", 30), *iterations("whole flights", 60, first=31)):
+                listener.on_iteration(iteration, 12.0)
         listener.on_message(MESSAGE)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4
-    assert lines[0] == "mass: --mass"
-    assert lines[1].startswith("2 s: iteration 30, horizon 2 s, position RMSE 3.33 mm")
-    assert lines[2].startswith("whole flights: iteration 90, ")
-    assert lines[3] == MESSAGE
+        with span("examination"), span("reading"):
+            pass
+    assert lines_of(capsys) == [
+        "Reading the flights",
+        "Searching, and compiling its first steps",
+        "Searched: whole flights: iteration 90, horizon 2 s, position RMSE 1.11 mm, loss 0.01111",
+        "Examining how well each coefficient is known",
+    ]
 
 
-def test_where_the_search_ended_is_a_table_after_its_last_stage(capsys):
+def test_verbose_shows_settings_messages_and_where_the_search_ended(capsys):
     estimate = PointEstimate(name="inertia_xx", unit="kg m²", initial=0.021, estimate=0.0265)
-    with listening(quiet=False) as listener:
+    with listening(quiet=False, verbose=True) as listener:
+        listener.on_settings(SimpleNamespace(origin={"mass": "--mass"}))
         listener.on_iteration(iterations("polish", 1)[0], 1.0)
         listener.on_estimates([estimate])
-        listener.on_message("Examining.")
-    stage, head, row, searched, message = capsys.readouterr().out.splitlines()
-    assert stage.startswith("polish: ")
+        listener.on_message(MESSAGE)
+    origin, stage, head, row, searched, message = lines_of(capsys)
+    assert origin == "mass: --mass"
+    assert stage.startswith("Searched: polish: ")
     assert searched.startswith("The search ended here. ")
     assert head.split() == ["coefficient", "initial", "estimate", "unit"]
     assert row.split() == ["inertia_xx", "0.021", "0.0265", "kg", "m²"]
-    assert message == "Examining."
+    assert message == MESSAGE
 
 
-def test_an_interrupted_stage_still_gets_its_line(capsys):
+def test_an_interrupted_search_still_gets_its_line_and_says_how_to_go_on(capsys):
     with listening(quiet=False) as listener:
         for iteration in iterations("2 s", 3):
             listener.on_iteration(iteration, 12.0)
-    assert capsys.readouterr().out.count("2 s: iteration 3,") == 1
+        listener.on_stop("Continue with --resume.")
+    stage, go_on = lines_of(capsys)
+    assert "2 s: iteration 3," in stage
+    assert go_on == "Continue with --resume."
 
 
 def test_quiet_shows_nothing(capsys):
@@ -83,7 +98,7 @@ def test_a_terminal_names_the_stage_that_runs_and_promises_nothing():
         assert now().startswith("Starting, 0 s")
         with watching(line.stage), span("search"):
             assert now().startswith("Searching")
-            line.show(iterations("polish", 1)[0], 4.0)
+            line.show(iterations("polish", 1)[0])
             assert now().startswith("polish: iteration 1")
             assert "left" not in now()
             with span("examination"):

@@ -1,43 +1,83 @@
-"""Tables of a run: what is not simulated is no crash; what to log next time is said."""
+"""A finished job on a terminal: thirty lines of a hundred columns, and all of it if asked."""
 
-from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
-from tuner.cli.results import print_run
-from tuner.design.log_proposal import LogProposal
-from tuner.result import AxesRmse, PredictedErrors
-from tuner.wording.result import starts_in_words
+import pytest
+
+from tests.tuner.report import making
+from tests.tuner.report.conftest import FREE, ROLLING
+from tests.tuner.wording.test_findings import MADE
+from tuner.cli.results import LINES, WIDTH, print_run
+from tuner.core.findings import Finding
+from tuner.evaluate.rmse import AxesRmse
+from tuner.result import read_run
+from tuner.vehicle import COEFFICIENTS
 
 
-def test_a_followed_attitude_is_no_crash(make_run, capsys):  # noqa: F811
-    run = make_run()
+@pytest.fixture
+def folder(tmp_path):
+    making.write_run(tmp_path, FREE, ROLLING)
+    return tmp_path
+
+
+def lines_of(folder, result, capsys, **how):
+    print_run(folder, result, **how)
+    return capsys.readouterr().out.splitlines()
+
+
+def test_a_finished_job_says_what_the_issue_lists(folder, capsys):
+    lines = lines_of(folder, read_run(folder).result, capsys, seconds=41.7)
+    text = "\n".join(lines)
+    assert len(lines) <= LINES
+    assert max(map(len, lines)) <= WIDTH or str(folder) in max(lines, key=len)
+    assert "7 coefficients were fitted to 1 flight; 1 was held out to check them." in lines[0]
+    (held,) = (line for line in lines if line.startswith("spin, held out"))
+    assert "→" in held
+    assert held.split()[-1] in ("matched", "better", "unchanged")
+    assert "Terms: fuselage_drag of 2 kept." in text
+    assert "Fixed: mass " in text
+    assert f"Written to {folder} in 42 s" in text
+    assert lines[-1].startswith("Next: ")
+
+
+def test_many_warnings_and_coefficients_still_fit(folder, capsys):
+    result = read_run(folder).result
+    many = dict.fromkeys(COEFFICIENTS, result.coefficients["inertia_xx"])
+    findings = tuple(
+        Finding(made.code, "warning", f"a flight with a rather long name, {made.subject}",
+                made.numbers, made.names)
+        for made in MADE.values()
+    )  # fmt: skip
+    flights = tuple(
+        result.flights[1].model_copy(update={"name": f"held_{number}"}) for number in range(9)
+    )
+    update = {"coefficients": many, "findings": findings, "flights": flights}
+    lines = lines_of(folder, result.model_copy(update=update), capsys)
+    assert len(lines) <= LINES
+    assert [line for line in lines if len(line) > WIDTH and str(folder) not in line] == []
+    assert sum(line.startswith("! ") for line in lines) == 7
+
+
+def test_verbose_adds_what_the_page_says(folder, capsys):
+    result = read_run(folder).result
+    short = lines_of(folder, result, capsys)
+    long = lines_of(folder, result, capsys, verbose=True)
+    assert long[-len(short) :] == short
+    text = "\n".join(long)
+    for said in ("RMSE axis by axis", "Open-loop predictions", "What to log next time",
+                 "In Gazebo", "Terms beyond the motor model"):  # fmt: skip
+        assert said in text
+
+
+def test_a_followed_attitude_is_no_crash(folder, capsys):
+    result = read_run(folder).result
     met = AxesRmse(x=0.01, y=0.02, z=0.03, roll=None, pitch=None, yaw=None)
     crashed = AxesRmse(x=None, y=None, z=None, roll=None, pitch=None, yaw=None)
-    ahead = PredictedErrors(seconds=0.5, position=0.1, velocity=0.2, attitude=None, body_rate=None)
-    followed = run.result.flights[0].model_copy(
-        update={
-            "name": "followed",
-            "horizon": 1.0,
-            "rmse_initial": met,
-            "rmse_best": met,
-            "rmse_fitted_starts": met,
-            "predicted_initial": (ahead,),
-            "predicted_best": (ahead,),
-        }
+    followed = result.flights[1].model_copy(
+        update={"name": "followed", "rmse_initial": met, "rmse_best": met}
     )
-    fell = run.result.flights[0].model_copy(
-        update={"name": "fell", "horizon": 1.0, "rmse_best": crashed, "rmse_fitted_starts": crashed}
-    )
-    tachometer = LogProposal(
-        signal="rotor_speed", change="added", rate=100.0, noise=6.0, shrinks={"motor_constant": 0.5}
-    )
-    update = {"flights": (followed, fell), "next_log": (tachometer,)}
-    print_run(run.folder, run.result.model_copy(update=update))
-    out = capsys.readouterr().out
-    assert "Log the rotor speed, at 100 Hz and good to 6 rad/s: it would halve" in out
-    lines = out.splitlines()
-    rows = [line.split() for line in lines if line.split()[:1] == ["followed"] and "–" in line]
-    assert [row.count("–") for row in rows] == [3, 2]  # attitude; attitude and body rate
-    assert not any("crash" in cell for row in rows for cell in row)
-    (row,) = (line for line in lines if line.split()[:1] == ["fell"])
-    assert row.count("crash") == 6
-    *_, starts = starts_in_words((followed, fell))
-    assert "followed x 0.01 m, y 0.02 m, z 0.03 m; fell crashes" in starts
+    fell = result.flights[1].model_copy(update={"name": "fell", "rmse_best": crashed})
+    lines = lines_of(folder, result.model_copy(update={"flights": (followed, fell)}), capsys)
+    (row,) = (line for line in lines if line.startswith("followed"))
+    assert "–" in row
+    assert "crash" not in row
+    (row,) = (line for line in lines if line.startswith("fell"))
+    assert row.split()[-1] == "crashes"

@@ -14,6 +14,7 @@ import yaml
 from markupsafe import escape
 
 from tuner.cli import main
+from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.config import Options
 from tuner.core.errors import InputError
 from tuner.core.findings import Code
@@ -99,6 +100,19 @@ def test_mass_and_rolling_moment_stay_as_given(finished):
         coefficient = finished[1].coefficients[name]
         assert not coefficient.fitted
         assert coefficient.best == coefficient.initial
+
+
+@pytest.mark.slow
+def test_the_terminal_says_in_thirty_lines_that_it_can_be_used(finished, capsys):
+    print_run(*finished, seconds=40.0)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= LINES
+    assert [line for line in lines if len(line) > WIDTH and str(finished[0]) not in line] == []
+    assert lines[0].startswith("Usable. 12 coefficients were fitted to 4 flights")
+    (held,) = (line for line in lines if line.startswith("circle_4mps, held out"))
+    assert held.split()[-1] == "matched"
+    assert sum(line.startswith("! ") for line in lines) == 2
+    assert "Terms: none of" in "\n".join(lines)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ class Reading:
     requests: list[str] = field(default_factory=list)
 
     def wait_until_drawn(self) -> None:
-        self.page.wait_for_selector("body[data-drawn]", timeout=PATIENCE)
+        self.page.wait_for_selector("body[data-ready]", timeout=PATIENCE)
 
 
 @contextmanager

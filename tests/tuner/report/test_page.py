@@ -9,10 +9,14 @@ from pathlib import Path
 import pytest
 
 from tests.tuner.report import making
+from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.core.errors import InputError
+from tuner.core.findings import Code, Finding
 from tuner.report import render
 from tuner.report.contents import read_contents
-from tuner.report.sections.selection import selection
+from tuner.report.record import SearchRecord
+from tuner.report.sections import sections_of
+from tuner.result import ExportRecord, ExportRecords, GateRecord, read_run
 from tuner.uncertainty.directions import Direction
 
 WITH_MASS = (
@@ -36,16 +40,17 @@ def words(page: Path) -> str:
 
 def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     text = words(report)
-    assert "on the held-out flights the position RMSE went from" in text
-    assert "7 coefficients were fitted to 1 flight, of which the flights do not identify 1" in text
+    assert text.index("Usable") < text.index("Coefficients coefficient")
+    assert "7 coefficients were fitted to 1 flight; 1 was held out to check them" in text
+    assert "spin, held out: position error from" in text
+    assert "Not as physical values: rolling_moment_coefficient, not identifiable." in text
     assert "Gazebo cannot fly fuselage_drag" in text
     assert "rotor_drag_coefficient 0.000806 0.0009672 N s²/(rad m) +20 %" in text
     for heading in (
         "Coefficients",
         "In Gazebo",
         "Terms beyond the motor model",
-        "RMSE of each flight",
-        "Simulated against recorded",
+        "Flights",
         "Local sensitivity",
         "Information and correlation",
         "Residuals",
@@ -54,7 +59,7 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
     ):
         assert heading in text
     assert "swing, lap 2" in text
-    assert "3 → 1.25 (0.7500)" in text
+    assert "3 → 1.2 (0.75)" in text
     assert "What to log next time" in text
     assert "Log the command at 200 Hz" in text
     assert "Added to Gazebo's motor model: fuselage_drag." in text
@@ -65,9 +70,10 @@ def test_the_page_answers_what_a_reader_asks(report: Path) -> None:
 
 def test_the_page_is_one_file_without_the_network(report: Path) -> None:
     raw = report.read_text()
-    assert report.stat().st_size < 5_000_000
-    head = re.sub(r' src="data:[^"]*"', "", raw.partition('<script id="figures"')[0])
-    assert not re.search(r'(src|href)="(?!#|data:)', head)
+    assert report.stat().st_size < 3_000_000
+    head = raw.partition('<script id="figures"')[0]
+    assert len(head) < 400_000
+    assert not re.search(r'(src|href)="(?!#|data:|export/)', head)
     assert "@import" not in head
     assert "url(" not in head
 
@@ -128,19 +134,47 @@ def test_a_damaged_file_is_named(report: Path, tmp_path: Path) -> None:
         render(tmp_path)
 
 
-def test_a_term_that_makes_left_out_flights_worse_is_drawn_left_of_zero(report: Path) -> None:
-    contents = read_contents(report.parent)
-    assert contents.run is not None
-    section = selection(contents)
-    assert section is not None
-    (panel,) = section.charts[0].panels
-    gains = {row.group: row.gain_holdout for row in contents.run.result.selection}
-    assert min(gains.values()) < 0.0
-    drawn = {
-        label: value
-        for bars in panel.marks
-        for label, value in zip(bars.labels, bars.values, strict=True)
-        if value is not None
-    }
-    assert drawn == {name: pytest.approx(100.0 * gain) for name, gain in gains.items()}
-    assert panel.x_scale == "linear"
+def test_terms_that_are_worth_nothing_are_one_line(report: Path) -> None:
+    text = words(report)
+    assert "Tried, and worth nothing here: ground_effect." in text
+    assert "fuselage_drag fuselage_drag 30 % 28 % 4 % in the model" in text
+
+
+def test_warnings_stand_with_the_outcome_and_remarks_are_folded(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    result = read_run(tmp_path).result
+    gap = Finding(Code.POSE_GAP, "warning", "swing", {"seconds": 0.4})
+    late = Finding(Code.INPUT_LATE, "info", "spin", {"seconds": 0.002})
+    result.model_copy(update={"findings": (late, gap)}).write(tmp_path)
+    raw = render(tmp_path).read_text()
+    box = raw.partition('id="outcome"')[2].partition("</section>")[0]
+    assert "No pose was recorded for 0.40 s" in box
+    assert "Check the cameras" in box
+    remarks = raw.partition('<details class="section" id="remarks">')[2].partition("</details>")[0]
+    assert "+2.00 ms late" in remarks
+
+
+def test_exports_are_linked_with_their_conditions(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    gates = (GateRecord(name="it hovers"), GateRecord(name="it flies", objections=("it crashed",)))
+    made = ExportRecord(format="sdf", file="export/quad.sdf", gates=gates)
+    refused = ExportRecord(format="px4", refused="no thrust")
+    ExportRecords(exports={"sdf": made, "px4": refused}).write(tmp_path)
+    page = render(tmp_path)
+    assert '<a href="export/quad.sdf" download>quad.sdf</a>' in page.read_text()
+    text = words(page)
+    assert "1 of 2 conditions not met, and accepted" in text
+    assert "○ not met: it flies (it crashed)" in text
+    assert "px4 refused no thrust" in text
+
+
+def test_no_figure_shows_a_single_point(tmp_path: Path) -> None:
+    making.write_run(tmp_path, FREE, ROLLING)
+    search = SearchRecord.read(tmp_path)
+    short = search.model_copy(
+        update={"iterations": search.iterations[:1], "starts": search.starts[:1]}
+    )
+    short.write(tmp_path)
+    keys = [c.key for s in sections_of(read_contents(tmp_path)) for c in s.charts]
+    assert "intervals" in keys
+    assert not {"waterfall", "trace", "selection"} & set(keys)

@@ -29,7 +29,8 @@ def test_a_conflict_is_marked_and_what_flights_do_not_say_is_none():
             inertia_xx=source(None, flights=None),
         )
     )
-    assert [row["conflict"] for row in section.values["rows"]] == [True, False, False]
+    said = [row[-1].text for row in section.tables[0].rows]
+    assert said == ["● conflict", "○ yes", "flights do not identify it"]
 
 
 def test_a_fit_without_ground_measurements_has_no_such_section():

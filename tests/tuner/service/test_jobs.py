@@ -1,5 +1,6 @@
 """Jobs through the HTTP interface: shapes, states, deaths, cancelling, trying again."""
 
+import html
 import io
 import json
 import random
@@ -13,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from tests.tuner.service.conftest import ended, submit, upload
-from tuner.report.summary import outcome
+from tuner.report.outcome import outcome
 from tuner.result import RunResult
 from tuner.service import archive, attempt, jobs, queue
 from tuner.service.attempt import put
@@ -323,5 +324,9 @@ def test_a_job_s_page_begins_with_the_report_s_outcome_and_its_files(client, rec
     job = ended(client, submit(client, recording))
     page = client.get(f"/jobs/{job['id']}").text
     result = RunResult.model_validate(client.get(job["links"]["files"]["result.json"]).json())
-    assert f'<p class="outcome">{" ".join(outcome(result))}</p>' in page
+    box = html.unescape(page.partition('id="outcome"')[2].partition("</section>")[0])
+    found = outcome(result)
+    assert f'<p class="standing">{found.standing.capitalize()}</p>' in box
+    assert all(sentence in box for sentence in (found.what, *found.uses, *found.reasons))
+    assert page.index('id="outcome"') < page.index("<iframe")
     assert page.index("/files.zip") < page.index("<iframe")

@@ -7,13 +7,14 @@ show.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
 from tuner.report.sections.effects import effects
-from tuner.report.sections.flights import errors, flights, forces
+from tuner.report.sections.flights import flights, forces
 from tuner.report.sections.global_sensitivity import global_sensitivity
 from tuner.report.sections.information import information
 from tuner.report.sections.next_flight import next_flight
@@ -21,25 +22,24 @@ from tuner.report.sections.profiles import profiles
 from tuner.report.sections.residuals import residuals
 from tuner.report.sections.search import search
 from tuner.report.sections.selection import selection
-from tuner.report.sections.tables import effective, findings, next_log, provenance, refits, sources
+from tuner.report.sections.tables import effective, next_log, provenance, refits, remarks, sources
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
-    findings,
     coefficients,
+    flights,
     selection,
     effective,
     bench,
     sources,
     refits,
-    errors,
-    flights,
-    forces,
-    effects,
-    information,
     next_flight,
     next_log,
     profiles,
     global_sensitivity,
+    remarks,
+    forces,
+    effects,
+    information,
     residuals,
     search,
     provenance,
@@ -49,4 +49,8 @@ SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
 def sections_of(contents: Contents) -> tuple[Section, ...]:
     """Return the sections that apply."""
     sections = (section(contents) for section in SECTIONS)
-    return tuple(section for section in sections if section is not None)
+    return tuple(
+        replace(section, charts=[chart for chart in section.charts if chart.is_worth_drawing])
+        for section in sections
+        if section is not None
+    )

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tuner.ground.bench_json import CurveRecord, ExperimentRecord
 from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Section, Table
 from tuner.wording.bench import agreement_in_words, numbers_in_words, remarks_in_words
 
 USED = Look(PALETTE[2], marks=True)
@@ -17,27 +15,28 @@ NOT_USED = Look(GREY, marks=True)
 RESIDUAL = Look(PALETTE[1], marks=True)
 
 
-@dataclass(frozen=True)
-class Row:
-    """An experiment: its name, the numbers that it gives, and what its checks noticed."""
-
-    name: str
-    numbers: list[str]
-    remarks: list[str]
-
-
 def bench(contents: Contents) -> Section | None:
     """Return a table of the experiments and a picture of each: data, law, residuals."""
     if contents.bench is None:
         return None
     experiments = contents.bench.experiments
-    rows = [Row(e.name, numbers_in_words(e), remarks_in_words(e)) for e in experiments]
-    values = {"rows": rows, "agreement": agreement_in_words(contents.bench)}
+    rows = [
+        (e.name, "; ".join(numbers_in_words(e)), " ".join(remarks_in_words(e))) for e in experiments
+    ]
+    columns = ("experiment", "gives", "what its checks noticed")
+    table = Table(columns, rows, words=columns)
     charts = [
         chart for number, experiment in enumerate(experiments)
         for chart in _charts(number, experiment)
     ]  # fmt: skip
-    return Section("bench", "Ground measurements", values, charts)
+    return Section(
+        "bench",
+        "Ground measurements",
+        sentences=(agreement_in_words(contents.bench),),
+        tables=(table,),
+        charts=charts,
+        note="± is one standard error.",
+    )
 
 
 def _charts(number: int, experiment: ExperimentRecord) -> list[Chart]:

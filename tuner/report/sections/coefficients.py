@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 from tuner.core.numerics import Z95
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.result import CoefficientResult
 from tuner.uncertainty.calibration import calibration
 from tuner.uncertainty.sensitivity_json import CoefficientKnowledge
-from tuner.uncertainty.verdict import ReasonCode, Verdict
+from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import COEFFICIENTS
 from tuner.wording.result import calibration_in_words
 from tuner.wording.verdicts import (
+    half_width_in_words,
     judgement_in_words,
     parts_in_words,
     reason_in_words,
@@ -35,76 +36,122 @@ WIDEST = 1000.0
 """% at which a bar of the figure ends."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of the table; numbers in ``unit``."""
-
-    name: str
-    meaning: str
-    unit: str
-    initial: float | None
-    best: float
-    error: float | None
-    interval: tuple[float | None, float | None] | None
-    verdict: str
-    badge: str
-    sign: str
-    reason: str
-
-
 def coefficients(contents: Contents) -> Section | None:
-    """Return the table and how wide the intervals are."""
+    """Return the table, how wide the intervals are, and what makes them so."""
+    knowledge = {} if contents.knowledge is None else contents.knowledge.coefficients
+    charts = _intervals(knowledge)
     if contents.run is not None:
-        known = {} if contents.knowledge is None else contents.knowledge.coefficients
         results = contents.run.result.coefficients
-        rows = [_fitted(name, result, known.get(name)) for name, result in results.items()]
-    elif contents.knowledge is not None:
-        known = contents.knowledge.coefficients
-        rows = [_examined(name, knowledge) for name, knowledge in known.items()]
+        free = {name: found for name, found in results.items() if found.fitted}
+        fixed = {name: found for name, found in results.items() if not found.fitted}
+        tables = [_fitted(free), _parts(free)] if free else []
+        if fixed:
+            tables.append(_fixed(fixed, knowledge))
+    elif knowledge:
+        tables = [_examined(knowledge)]
     else:
         return None
-    charts = [] if contents.knowledge is None else _intervals(contents.knowledge.coefficients)
-    measured = calibration_in_words(calibration())
-    values = {"rows": rows, "fit": contents.run is not None, "calibration": measured}
-    return Section("coefficients", "Coefficients", values, charts)
-
-
-def _fitted(name: str, result: CoefficientResult, known: CoefficientKnowledge | None) -> Row:
-    reason = reason_in_words(result.reason)
-    if result.reason.code is ReasonCode.INTERVAL and result.std_error_parts is not None:
-        words = parts_in_words(result.std_error_parts, result.reason.unit, result.best)
-        reason = f"{reason}; {words}"
-    if not result.fitted and known is not None:
-        judgement = judgement_in_words(known.verdict, known.reason)
-        reason = f"were it fitted with the others: {judgement}"
-    return _row(
-        name,
-        (result.initial, result.best),
-        (result.std_error, result.ci95),
-        (result.verdict, reason),
+    note = (
+        "± 95 % is half the 95 % interval: it holds the true value in 95 of 100 such experiments, "
+        f"if the model is right. {calibration_in_words(calibration())}"
     )
+    return Section("coefficients", "Coefficients", tables=tables, charts=charts, note=note)
 
 
-def _examined(name: str, known: CoefficientKnowledge) -> Row:
-    reason = reason_in_words(known.reason)
-    if not known.fitted:
-        reason = f"were it fitted with the others: {reason}"
-    return _row(name, (None, known.value), (known.std_error, known.ci95), (known.verdict, reason))
+def _name(name: str) -> Cell:
+    return Cell(name, small=COEFFICIENTS[name].meaning)
 
 
-def _row(
-    name: str,
-    values: tuple[float | None, float],
-    spread: tuple[float | None, tuple[float | None, float | None] | None],
-    judged: tuple[Verdict, str],
-) -> Row:
-    verdict, reason = judged
-    badge, sign, _ = VERDICTS[verdict]
-    about, words = COEFFICIENTS[name], verdict_in_words(verdict)
-    return Row(name, about.meaning, about.unit, *values, *spread, words, badge, sign, reason)
+def _judged(verdict: Verdict, reason: str = "") -> Cell:
+    look, sign, _ = VERDICTS[verdict]
+    words = verdict_in_words(verdict)
+    return Cell(f"{sign} {words}", small="" if reason == words else reason, look=look)
 
 
-def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
+def _fitted(free: Mapping[str, CoefficientResult]) -> Table:
+    rows = [
+        (
+            _name(name),
+            figures(found.initial),
+            figures(found.best),
+            half_width_in_words(found.ci95, found.best, found.unit),
+            found.unit,
+            _judged(
+                found.verdict,
+                "" if found.verdict is Verdict.WELL_KNOWN else reason_in_words(found.reason),
+            ),
+        )
+        for name, found in free.items()
+    ]
+    columns = ("coefficient", "start", "fitted", "± 95 %", "unit", "how well it is known")
+    return Table(columns, rows, words=("coefficient", "unit", "how well it is known"))
+
+
+def _parts(free: Mapping[str, CoefficientResult]) -> Table:
+    """Return from where each interval comes."""
+    rows = []
+    for name, found in free.items():
+        parts, unit = found.std_error_parts, found.reason.unit
+        rows.append(
+            (
+                name,
+                short(found.std_error),
+                _from_to(found.ci95),
+                Cell(
+                    reason_in_words(found.reason),
+                    small="" if parts is None else parts_in_words(parts, unit, found.best),
+                ),
+            )
+        )
+    columns = ("coefficient", "standard error", "95 % interval", "why")
+    words = ("coefficient", "why")
+    return Table(columns, rows, words=words, fold="What makes each interval as wide as it is")
+
+
+def _fixed(
+    fixed: Mapping[str, CoefficientResult], knowledge: Mapping[str, CoefficientKnowledge]
+) -> Table:
+    rows = [
+        (
+            _name(name),
+            figures(found.best),
+            found.unit,
+            judgement_in_words(knowledge[name].verdict, knowledge[name].reason)
+            if name in knowledge
+            else "",
+        )
+        for name, found in fixed.items()
+    ]
+    columns = ("coefficient", "value", "unit", "were it fitted with the others")
+    words = ("coefficient", "unit", "were it fitted with the others")
+    return Table(columns, rows, words=words, fold=f"Fixed: {', '.join(fixed)}")
+
+
+def _examined(knowledge: Mapping[str, CoefficientKnowledge]) -> Table:
+    rows = [
+        (
+            _name(name),
+            figures(known.value),
+            short(known.std_error),
+            _from_to(known.ci95),
+            known.unit,
+            _judged(
+                known.verdict,
+                ("" if known.fitted else "were it fitted with the others: ")
+                + reason_in_words(known.reason),
+            ),
+        )
+        for name, known in knowledge.items()
+    ]
+    columns = ("coefficient", "value", "±", "95 % interval", "unit", "how well it is known")
+    return Table(columns, rows, words=("coefficient", "unit", "how well it is known"))
+
+
+def _from_to(interval: tuple[float | None, float | None] | None) -> str:
+    return "" if interval is None else f"{figures(interval[0])} to {figures(interval[1])}"
+
+
+def _intervals(known: Mapping[str, CoefficientKnowledge]) -> list[Chart]:
     """Return half the 95 % interval of every coefficient, relative to its value."""
     wide = {
         name: 100.0 * Z95 * coefficient.std_error / coefficient.step
@@ -136,5 +183,6 @@ def _intervals(known: dict[str, CoefficientKnowledge]) -> list[Chart]:
             panels=(Panel(bars, x_scale="log"),),
             x_title="± % of the value (of its usual uncertainty where the value is smaller)",
             height=120 + 24 * len(order),
+            fold="How closely each coefficient is known",
         )
     ]

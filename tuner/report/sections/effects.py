@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Section, Table
 from tuner.uncertainty.sensitivity_json import Knowledge, OutputSensitivity
 
 FAINTEST = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
-
-
-@dataclass(frozen=True)
-class Cell:
-    """RMSE of one channel over all flights, for −10 % and +10 %; None where one crashed."""
-
-    down: float | None
-    up: float | None
 
 
 def effects(contents: Contents) -> Section | None:
@@ -31,24 +22,40 @@ def effects(contents: Contents) -> Section | None:
         return None
     names = [name for name in knowledge.coefficients if name in knowledge.outputs[0].change]
     channels = [c for c in knowledge.channels if _of(knowledge, c)]
-    now = {channel: _together([o.rmse for o in _of(knowledge, channel)]) for channel in channels}
-    table = {
-        name: {
-            channel: Cell(
-                _together([o.rmse_down[name] for o in _of(knowledge, channel)]),
-                _together([o.rmse_up[name] for o in _of(knowledge, channel)]),
-            )
-            for channel in channels
-        }
+    units = {channel: _of(knowledge, channel)[0].unit for channel in channels}
+    now = [
+        f"{_words(c)} {_number(_together([o.rmse for o in _of(knowledge, c)]))} {units[c]}"
+        for c in channels
+    ]
+    rows = [
+        (
+            name,
+            *(
+                f"{_number(_together([o.rmse_down[name] for o in _of(knowledge, c)]))} / "
+                f"{_number(_together([o.rmse_up[name] for o in _of(knowledge, c)]))}"
+                for c in channels
+            ),
+        )
         for name in names
-    }
-    values = {
-        "units": {channel: _of(knowledge, channel)[0].unit for channel in channels},
-        "now": now,
-        "table": table,
-    }
+    ]
+    columns = ("coefficient", *(f"{_words(c)} [{units[c]}]" for c in channels))
+    table = Table(columns, rows, words=("coefficient",), fold="RMSE for −10 % / +10 % of each")
     charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
-    return Section("effects", "Local sensitivity", values, charts)
+    note = (
+        "RMSE for −10 % / +10 % of one coefficient, the others unchanged, over all axes and "
+        f"flights of a channel; now: {', '.join(now)}."
+    )
+    return Section(
+        "effects", "Local sensitivity", tables=(table,), charts=charts, note=note, folded=True
+    )
+
+
+def _words(channel: str) -> str:
+    return channel.replace("_", " ")
+
+
+def _number(value: float | None) -> str:
+    return "crash" if value is None else f"{value:.3g}"
 
 
 def _of(knowledge: Knowledge, channel: str) -> list[OutputSensitivity]:
@@ -129,6 +136,7 @@ def _over_time(knowledge: Knowledge, names: Sequence[str]) -> list[Chart]:
                 panels=(Panel((heat,)),),
                 x_title=f"time since {start_of}'s start [s]",
                 height=130 + 20 * len(names),
+                fold=over_time.flight,
             )
         )
     return charts

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,9 +21,10 @@ from tuner.report.chart import (
     rounded,
 )
 from tuner.report.contents import Contents
-from tuner.report.section import Section
-from tuner.result import RMSE_UNITS, AxesRmse, FlightResult
-from tuner.wording.result import PREDICTED
+from tuner.report.outcome import flights_table, outcome
+from tuner.report.section import Cell, Section, Table, short
+from tuner.result import RMSE_UNITS, AxesRmse, FlightResult, RunResult
+from tuner.wording.result import PREDICTED, starts_in_words
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
 CURVES = {
@@ -36,6 +37,10 @@ QUANTITIES = {
     "position": (("x", "y", "z"), "m"),
     "attitude": (("roll", "pitch", "yaw"), "°"),
 }
+PER_AXIS = {axis: (1e3, "mm") if unit == "m" else (1.0, "°") for axis, unit in RMSE_UNITS.items()}
+"""Axis -> what its RMSE is multiplied by for a table, and the unit then."""
+WORSE = 1.05
+"""Times the error before beyond which it is marked as worse."""
 SMALLEST = 1e-6
 """Errors below this are drawn as this on a logarithmic axis."""
 TIME = "time since the mission's start [s]"
@@ -48,26 +53,71 @@ DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
 
 
 def flights(contents: Contents) -> Section | None:
-    """Return four charts a flight."""
-    if not contents.traces:
+    """Return how closely each flight is met, and four charts of each; held-out flights first."""
+    result = None if contents.run is None else contents.run.result
+    found = [] if result is None else list(result.flights)
+    if not found and not contents.traces:
         return None
-    held = {
-        flight.name
-        for flight in (contents.run.result.flights if contents.run else ())
-        if flight.split == "holdout"
-    }
-    charts = []
-    for name, arrays in contents.traces.items():
-        title = f"{name} (held out)" if name in held else name
-        charts += [
-            _over_time(name, title, "position", arrays),
-            _over_time(name, title, "attitude", arrays),
-            _errors(name, title, arrays),
-            _from_above(name, title, arrays),
-        ]
-    return Section(
-        "flights", "Simulated against recorded", {"fit": contents.run is not None}, charts
+    held = {flight.name for flight in found if flight.split == "holdout"}
+    order = sorted(contents.traces, key=lambda name: name not in held)
+    charts = [
+        chart
+        for name in order
+        for chart in _of_flight(name, contents.traces[name], held, open_=name == order[0])
+    ]
+    legend = "Recorded (wide grey), " + (
+        "simulated with the start values (dotted) and with the fitted coefficients."
+        if found
+        else "and simulated."
     )
+    tables = [] if result is None else _tables(contents, result)
+    return Section(
+        "flights",
+        "Flights",
+        starts_in_words(found),
+        tables=tables,
+        charts=charts,
+        note=f"{legend} Drag to zoom, double-click to zoom out." if charts else "",
+    )
+
+
+def _tables(contents: Contents, result: RunResult) -> list[Table]:
+    tables = [flights_table(outcome(result).flights)]
+    axes = [f"{axis} [{PER_AXIS[axis][1]}]" for axis in RMSE_UNITS]
+    by_axis = [(_title(f), *_pairs(f.rmse_initial, f.rmse_best)) for f in result.flights]
+    tables.append(Table(("flight", *axes), by_axis, words=("flight",), fold="RMSE axis by axis"))
+    if laps := _laps(contents):
+        tables.append(Table(("lap", *axes), laps, words=("lap",), fold="RMSE lap by lap"))
+    if ahead := [row for flight in result.flights for row in _predictions(flight)]:
+        quantities = [f"{name.replace('_', ' ')} [{unit}]" for name, unit in PREDICTED.items()]
+        fold = (
+            "Open-loop predictions from recorded states: mean error before → after (of a state "
+            "that stays as it is)"
+        )
+        tables.append(
+            Table(("flight", "after [s]", *quantities), ahead, words=("flight",), fold=fold)
+        )
+    return tables
+
+
+def _of_flight(
+    name: str, arrays: Mapping[str, Array], held: set[str], *, open_: bool
+) -> list[Chart]:
+    title = f"{name}, held out" if name in held else name
+    charts = (
+        _errors(name, title, arrays),
+        _over_time(name, title, "position", arrays),
+        _over_time(name, title, "attitude", arrays),
+        _from_above(name, title, arrays),
+    )
+    return [
+        replace(
+            chart,
+            clock="" if chart.key.endswith("_top") else name,
+            fold="" if open_ and not number else title,
+        )
+        for number, chart in enumerate(charts)
+    ]
 
 
 def _over_time(name: str, title: str, quantity: str, arrays: Mapping[str, Array]) -> Chart:
@@ -117,80 +167,60 @@ def _from_above(name: str, title: str, arrays: Mapping[str, Array]) -> Chart:
     return Chart(f"{name}_top", f"{title}: from above", (panel,), x_title="x [m]", height=460)
 
 
-@dataclass(frozen=True)
-class Row:
-    """A flight or lap; per axis the RMSE before and after, None for a crash."""
-
-    name: str
-    pairs: list[tuple[float | None, float | None]]
+def _title(flight: FlightResult) -> str:
+    return flight.name + (", held out" if flight.split == "holdout" else "")
 
 
-def errors(contents: Contents) -> Section | None:
-    """Return the RMSE before and after, of flights and of laps."""
-    if contents.run is None or not contents.run.result.flights:
-        return None
-    rows = [
-        Row(
-            flight.name + (" (held out)" if flight.split == "holdout" else ""),
-            _pairs(flight.rmse_initial, flight.rmse_best),
-        )
-        for flight in contents.run.result.flights
-    ]
-    values = {
-        "axes": RMSE_UNITS,
-        "rows": rows,
-        "laps": _laps(contents),
-        "predicted": PREDICTED,
-        "predictions": [p for f in contents.run.result.flights for p in _predictions(f)],
-    }
-    return Section("errors", "RMSE of each flight", values)
-
-
-@dataclass(frozen=True)
-class PredictedRow:
-    """Open-loop predictions of a flight so many s ahead.
-
-    ``errors`` are, quantity by quantity, those with the initial and the fitted coefficients, and of
-    a state that stays; None of what is not predicted.
-    """
-
-    name: str
-    seconds: float
-    errors: list[tuple[float | None, float | None, float | None]]
-
-
-def _predictions(flight: FlightResult) -> list[PredictedRow]:
+def _predictions(flight: FlightResult) -> list[tuple[Cell | str, ...]]:
+    """Return a flight's open-loop predictions, by how far they look ahead."""
     held = flight.predicted_holding or (None,) * len(flight.predicted_best)
     rows = zip(flight.predicted_initial, flight.predicted_best, held, strict=True)
     return [
-        PredictedRow(
-            flight.name + (" (held out)" if flight.split == "holdout" else ""),
-            best.seconds,
-            [
-                (
-                    getattr(initial, n),
-                    getattr(best, n),
-                    None if naive is None else getattr(naive, n),
-                )
+        (
+            _title(flight),
+            f"{best.seconds:g}",
+            *(
+                _ahead(getattr(before, n), getattr(best, n), getattr(naive, n, None))
                 for n in PREDICTED
-            ],
+            ),
         )
-        for initial, best, naive in rows
+        for before, best, naive in rows
     ]
 
 
-def _pairs(before: AxesRmse, after: AxesRmse) -> list[tuple[float | None, float | None]]:
-    return [(getattr(before, axis), getattr(after, axis)) for axis in RMSE_UNITS]
+def _ahead(before: float | None, best: float | None, held: float | None) -> Cell | str:
+    if best is None:
+        return "–"
+    text = f"{short(before) or 'crash'} → {short(best)}"
+    if held is None:
+        return text
+    return Cell(f"{text} ({short(held)})", look="worse" if best > held else "")
 
 
-def _laps(contents: Contents) -> list[Row]:
+def _pairs(before: AxesRmse, after: AxesRmse) -> list[Cell | str]:
+    """Return six errors before and after, a crash as such, and a dash for what is followed."""
+    cells: list[Cell | str] = []
+    flown = any(getattr(rmse, axis) is not None for rmse in (before, after) for axis in RMSE_UNITS)
+    for axis in RMSE_UNITS:
+        one, other = getattr(before, axis), getattr(after, axis)
+        if one is None and other is None and flown:
+            cells.append("–" if after.x is not None else "crash")
+            continue
+        scale = PER_AXIS[axis][0]
+        text = " → ".join("crash" if v is None else f"{scale * v:.3g}" for v in (one, other))
+        worse = one is not None and (other is None or other > WORSE * one)
+        cells.append(Cell(text, look="worse" if worse else ""))
+    return cells
+
+
+def _laps(contents: Contents) -> list[tuple[Cell | str, ...]]:
     if contents.laps is None:
         return []
     by_lap = {(row.flight, row.lap, row.vehicle): row.rmse for row in contents.laps.rows}
     return [
-        Row(
+        (
             f"{flight}, lap {lap}",
-            _pairs(by_lap[flight, lap, "initial"], by_lap[flight, lap, "best"]),
+            *_pairs(by_lap[flight, lap, "initial"], by_lap[flight, lap, "best"]),
         )
         for flight, lap in dict.fromkeys(
             (row.flight, row.lap) for row in contents.laps.rows if row.lap is not None
@@ -214,7 +244,14 @@ def forces(contents: Contents) -> Section | None:
         _chart(name, "forces", "N", time, {n: v[:, :3] for n, v in of_term.items()}),
         _chart(name, "moments", "N m", time, {n: v[:, 3:] for n, v in of_term.items()}),
     )
-    return Section("forces", "Forces and moments by term", {"flight": name}, charts)
+    note = (
+        f"What each term of the model does along the simulated {name}, the flight that accelerates "
+        "most: about the centre of mass, in body axes. Forces add up to mass times acceleration, "
+        "moments to the rate of change of the angular momentum. Click a name in a legend to hide "
+        "its curve. tune simulate --forces FILE.csv writes the same at full rate for any "
+        "trajectory."
+    )
+    return Section("forces", "Forces and moments by term", charts=charts, note=note, folded=True)
 
 
 def _of_terms(arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -247,7 +284,10 @@ def _chart(
         )
         for axis, title in enumerate(AXES)
     ]
-    return Chart(f"{flight}_{quantity}", f"{flight}: {quantity}", panels, x_title=TIME, height=520)
+    title = f"{flight}: {quantity}"
+    return Chart(
+        f"{flight}_{quantity}", title, panels, x_title=TIME, height=520, clock=f"{flight} forces"
+    )
 
 
 def _look(number: int) -> Look:

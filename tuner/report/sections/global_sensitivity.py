@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Section, Table, figures
 from tuner.uncertainty.global_sensitivity_json import MEANING, GlobalSensitivity
 
 
@@ -14,7 +14,24 @@ def global_sensitivity(contents: Contents) -> Section | None:
     if indices is None:
         return None
     charts = (_over_all(indices), _each(indices))
-    return Section("global_sensitivity", "Global sensitivity", {"indices": indices}, charts)
+    crashed = (
+        f"; {indices.crashed} of them crashed on some flight and count there as no better than the "
+        "worst that flew"
+        if indices.crashed
+        else ""
+    )
+    note = (
+        f"{indices.method.capitalize()}'s indices over the ranges: {indices.simulations} vehicles "
+        f"were flown{crashed}. Large means that the simulation depends on it somewhere in the "
+        "range."
+    )
+    if indices.crashed > 0.5 * indices.simulations:
+        note += " Most crashed: a narrower --span would show more."
+    rows = [(name, figures(low), figures(high)) for name, (low, high) in indices.bounds.items()]
+    table = Table(("coefficient", "from", "to"), rows, words=("coefficient",), fold="ranges")
+    return Section(
+        "global_sensitivity", "Global sensitivity", tables=(table,), charts=charts, note=note
+    )
 
 
 def _over_all(indices: GlobalSensitivity) -> Chart:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Cell, Section, Table
 from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.wording.verdicts import direction_in_words
 
@@ -18,35 +16,38 @@ ANNOTATED = 14
 """Rows up to which a correlation is written into its cell."""
 
 
-@dataclass(frozen=True)
-class Bias:
-    """A fixed coefficient, and by how many percent fitted ones follow one percent of error."""
-
-    name: str
-    follows: list[tuple[str, float]]
-
-
 def information(contents: Contents) -> Section | None:
     """Return shares, worst directions, correlations, and the debts of what is fixed."""
     knowledge = contents.knowledge
     if knowledge is None:
         return None
-    directions = [(d.null, direction_in_words(d)) for d in knowledge.directions]
-    values = {"directions": directions, "biases": _biases(knowledge)}
+    points = [
+        Cell(direction_in_words(d), look="failure" if d.null else "") for d in knowledge.directions
+    ]
     charts = [_by_channel(knowledge), _by_flight(knowledge)]
     if len(knowledge.names) > 1:
         charts.append(_correlation(knowledge))
-    return Section("information", "Information and correlation", values, charts)
+    return Section(
+        "information",
+        "Information and correlation",
+        sentences=("The worst-determined combinations of coefficients:",),
+        points=points,
+        tables=_biases(knowledge),
+        charts=charts,
+        folded=True,
+    )
 
 
-def _biases(knowledge: Knowledge) -> list[Bias]:
-    biases = []
+def _biases(knowledge: Knowledge) -> list[Table]:
+    """Return what an error of a fixed coefficient does to fitted ones."""
+    rows = []
     for name, known in knowledge.coefficients.items():
         follows = sorted(known.bias.items(), key=lambda item: -abs(item[1]))[:MOST]
         noticed = [(other, share) for other, share in follows if abs(share) >= NOTICED]
         if noticed:
-            biases.append(Bias(name, noticed))
-    return biases
+            rows.append((name, ", ".join(f"{share:+.2g} % into {o}" for o, share in noticed)))
+    columns = ("fixed coefficient", "1 % of error in it puts")
+    return [Table(columns, rows, words=columns)] if rows else []
 
 
 def _by_channel(knowledge: Knowledge) -> Chart:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Cell, Section
 from tuner.wording.proposals import proposals_in_words
 
 
@@ -13,7 +13,18 @@ def next_flight(contents: Contents) -> Section | None:
     proposals = contents.proposals
     if proposals is None:
         return None
-    values = {"proposals": proposals, "sentences": proposals_in_words(proposals)}
+    points = [Cell(sentence) for sentence in proposals_in_words(proposals)]
+    known = (
+        "The fitted coefficients are well known, so that it is shown for others as if they were "
+        "fitted."
+        if proposals.all_known
+        else "Shown for the coefficients that are not well known."
+    )
+    arena = " × ".join(f"{length:g}" for length in proposals.arena)
+    note = (
+        f"Flights of {proposals.seconds:.0f} s in an arena of {arena} m, simulated with these "
+        f"coefficients, recorded and weighed as these flights were. {known}"
+    )
     charts = []
     if proposals.flights:
         shares = [
@@ -43,6 +54,7 @@ def next_flight(contents: Contents) -> Section | None:
                 caption="Flights that gain most over all come first (A-optimal).",
                 panels=(Panel((heat,)),),
                 height=190 + 22 * len(proposals.flights),
+                fold="each flight, each coefficient",
             )
         )
-    return Section("next_flight", "What to fly next", values, charts)
+    return Section("next_flight", "What to fly next", points=points, charts=charts, note=note)

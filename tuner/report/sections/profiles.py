@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.chart import FITTED, GREY, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Cell, Section, figures
 from tuner.uncertainty.profiles_json import THRESHOLD, Profile
 
 HIGHEST = 12.0
@@ -17,7 +17,20 @@ def profiles(contents: Contents) -> Section | None:
         return None
     profiles = contents.profiles.profiles
     charts = [_chart(profile) for profile in profiles]
-    return Section("profiles", "Profile likelihood", {"profiles": profiles}, charts)
+    note = (
+        "Each point sets one coefficient to a value and fits all others again, priors left out, in "
+        "the weights of the final residuals. Where the curve stays below the dashed line, the "
+        "flights do not distinguish the values."
+    )
+    points = [Cell(_interval(profile)) for profile in profiles]
+    return Section("profiles", "Profile likelihood", points=points, charts=charts, note=note)
+
+
+def _interval(profile: Profile) -> str:
+    low, high = profile.interval
+    lower = "open below" if low is None else figures(low)
+    upper = "open above" if high is None else figures(high)
+    return f"{profile.name}: 95 % interval {lower} to {upper} {profile.unit}"
 
 
 def _chart(profile: Profile) -> Chart:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tuner.report.chart import PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Section, Table
 
 
 def residuals(contents: Contents) -> Section | None:
@@ -37,4 +37,23 @@ def residuals(contents: Contents) -> Section | None:
         x_title="lag [s]",
         height=100 + 110 * len(panels),
     )
-    return Section("residuals", "Residuals", {"residuals": known}, (chart,))
+    rows = [
+        (
+            residual.flight,
+            residual.channel.replace("_", " "),
+            f"{residual.rms:.2f}",
+            f"{residual.memory:.3f}",
+            "● yes" if residual.white else "○ no",
+        )
+        for residual in known
+    ]
+    columns = ("flight", "channel", "RMS in σ of the noise", "memory [s]", "white?")
+    table = Table(columns, rows, words=("flight", "channel", "white?"), fold="each residual")
+    note = (
+        "What remains between simulation and recording. White noise of the size of the measurement "
+        "noise means that the flights hold no more information; anything else is an effect that "
+        "the model lacks, and standard errors are widened for it."
+    )
+    return Section(
+        "residuals", "Residuals", tables=(table,), charts=(chart,), note=note, folded=True
+    )

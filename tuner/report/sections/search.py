@@ -17,13 +17,21 @@ def search(contents: Contents) -> Section | None:
     if contents.search is not None:
         charts = [*_waterfall(contents.search), *_trace(contents.search)]
     result = contents.run.result.search
-    values = {"search": result, "ending": ending_sentence(result.message)}
-    return Section("search", "Search", values, charts)
+    how = (
+        f"{result.method}: {result.evaluations} Jacobians, {result.iterations} iterations, "
+        f"{result.wall_time:.0f} s. {ending_sentence(result.message)}"
+    )
+    if result.cost_initial is not None and result.cost_best is not None:
+        how += (
+            " Loss (half the mean squared residual in σ) "
+            f"{result.cost_initial:.4g} → {result.cost_best:.4g}."
+        )
+    return Section("search", "Search", sentences=(how,), charts=charts, folded=True)
 
 
 def _waterfall(record: SearchRecord) -> list[Chart]:
     ends = sorted((s for s in record.starts if s.loss is not None), key=lambda s: s.loss or 0.0)
-    if not ends:
+    if len(ends) < 2:
         return []
     marks = []
     for number, origin in enumerate(dict.fromkeys(start.origin for start in ends)):
@@ -39,12 +47,7 @@ def _waterfall(record: SearchRecord) -> list[Chart]:
             )
         )
     failed = len(record.starts) - len(ends)
-    several = (
-        "Starts with the same loss ended in the same minimum; a step is another minimum."
-        if len(ends) > 1
-        else "The search began at a single start; more (search.starts in the job file) would show "
-        "whether another minimum lies lower."
-    )
+    several = "Starts with the same loss ended in the same minimum; a step is another minimum."
     return [
         Chart(
             key="waterfall",

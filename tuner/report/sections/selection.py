@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from tuner.report.chart import FITTED, GREY, Bars, Chart, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section
-from tuner.wording.result import gain_in_words, reason_in_words, selection_in_words
+from tuner.report.section import Cell, Section, Table
+from tuner.terms.selection_table import SelectionRow
+from tuner.wording.phrases import listed
+from tuner.wording.result import (
+    gain_in_words,
+    nearly_kept,
+    reason_in_words,
+    selection_in_words,
+)
 
 
 def selection(contents: Contents) -> Section | None:
@@ -13,26 +22,40 @@ def selection(contents: Contents) -> Section | None:
     rows = () if contents.run is None else contents.run.result.selection
     if not rows:
         return None
+    shown = [row for row in rows if row.kept or nearly_kept(row)]
     table = [
-        {
-            "group": row.group,
-            "names": row.names,
-            "gain_fit": gain_in_words(row.gain_fit),
-            "gain_holdout": gain_in_words(row.gain_holdout),
-            "scatter": gain_in_words(row.scatter),
-            "kept": row.kept,
-            "reason": reason_in_words(row),
-        }
-        for row in rows
+        (
+            Cell(row.group, small=", ".join(row.names)),
+            gain_in_words(row.gain_fit),
+            gain_in_words(row.gain_holdout),
+            gain_in_words(row.scatter),
+            Cell(
+                "in the model" if row.kept else "left out",
+                small=reason_in_words(row),
+                look="well" if row.kept else "kept",
+            ),
+        )
+        for row in shown
     ]
-    values = {"rows": table, "sentence": selection_in_words(rows)}
-    return Section("selection", "Terms beyond the motor model", values, _figure(contents))
+    columns = ("term", "gain in the fit", "gain held out", "±", "why")
+    tables = [Table(columns, table, words=("term", "why"))] if shown else []
+    sentences = [selection_in_words(rows)]
+    if rejected := [row.group for row in rows if row not in shown]:
+        sentences.append(f"Tried, and worth nothing here: {listed(rejected)}.")
+    note = (
+        "Gains are shares of the loss, each beside the other terms in the model: in the fit, and "
+        "in what is left out of a fit to the rest, ± the scatter over stretches of the flights."
+        if shown
+        else ""
+    )
+    charts = _figure(shown)
+    title = "Terms beyond the motor model"
+    return Section("selection", title, sentences, tables=tables, charts=charts, note=note)
 
 
-def _figure(contents: Contents) -> list[Chart]:
-    assert contents.run is not None
-    scored = [row for row in contents.run.result.selection if row.gain_holdout is not None]
-    if not scored:
+def _figure(rows: Sequence[SelectionRow]) -> list[Chart]:
+    scored = [row for row in rows if row.gain_holdout is not None]
+    if len(scored) < 2:
         return []
     bars = [
         Bars(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 
 from tuner.report.contents import Contents
-from tuner.report.section import Section
+from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.uncertainty.sources import CONFLICT
 from tuner.vehicle import COEFFICIENTS
 from tuner.wording.findings import remedy, sentence
@@ -18,19 +19,15 @@ from tuner.wording.result import effective_in_words, refits_in_words, rmse_in_wo
 SHOWN = ("command", "origin", "starts")
 
 
-def findings(contents: Contents) -> Section | None:
-    """Return what was noticed before, during and after the search, as sentences."""
-    rows = [
-        {
-            "level": finding.level,
-            "subject": finding.subject,
-            "sentence": sentence(finding),
-            "remedy": remedy(finding),
-        }
-        for finding in contents.about.findings
+def remarks(contents: Contents) -> Section | None:
+    """Return what was noticed that is no warning; warnings stand above, beside the outcome."""
+    points = [
+        Cell(f"{found.subject}: {sentence(found)} {remedy(found)}".strip())
+        for found in contents.about.findings
+        if found.level == "info"
     ]
-    title = "What to know before believing a number"
-    return Section("findings", title, {"findings": rows}) if rows else None
+    title = f"{len(points)} remark{'' if len(points) == 1 else 's'}"
+    return Section("remarks", title, points=points, folded=True) if points else None
 
 
 def refits(contents: Contents) -> Section | None:
@@ -38,15 +35,26 @@ def refits(contents: Contents) -> Section | None:
     if contents.run is None:
         return None
     result = contents.run.result
-    rows = [
-        {"name": name, "found": found}
+    rows: list[tuple[Cell | str, ...]] = [
+        (
+            name,
+            figures(found.best),
+            *map(short, (found.std_error, found.jackknife_error, found.bootstrap_error)),
+            found.unit,
+        )
         for name, found in result.coefficients.items()
         if found.jackknife_error is not None or found.bootstrap_error is not None
     ]
     if not rows:
         return None
+    columns = ("coefficient", "best", "±, this fit", "±, jackknife", "±, bootstrap", "unit")
     return Section(
-        "refits", "Refits to other flights", {"rows": rows, "said": refits_in_words(result)}
+        "refits",
+        "Refits to other flights",
+        refits_in_words(result),
+        tables=(Table(columns, rows, words=("coefficient", "unit")),),
+        note="± is one standard error. The jackknife leaves each flight out in turn; the bootstrap "
+        "draws as many flights with replacement.",
     )
 
 
@@ -54,24 +62,46 @@ def sources(contents: Contents) -> Section | None:
     """Return a table of what the ground, the flights and both give."""
     if contents.run is None or not contents.run.result.sources:
         return None
-    rows = [
-        {
-            "name": name,
-            "unit": COEFFICIENTS[name].unit,
-            "source": source,
-            "conflict": source.deviation is not None and abs(source.deviation) > CONFLICT,
-        }
-        for name, source in contents.run.result.sources.items()
-    ]
-    return Section("sources", "Ground and flights", {"rows": rows})
+    rows: list[tuple[Cell | str, ...]] = []
+    for name, source in contents.run.result.sources.items():
+        both = (source.ground, source.flights, source.both)
+        errors = (source.ground_error, source.flights_error, source.both_error)
+        pairs = [t for v, e in zip(both, errors, strict=True) for t in (figures(v), short(e))]
+        if source.deviation is None:
+            agree = Cell("flights do not identify it", look="kept")
+        elif abs(source.deviation) > CONFLICT:
+            agree = Cell("● conflict", look="not")
+        else:
+            agree = Cell("○ yes", look="well")
+        apart = "–" if source.deviation is None else f"{source.deviation:+.1f}"
+        rows.append((name, *pairs, COEFFICIENTS[name].unit, apart, agree))
+    columns = (
+        *("coefficient", "ground", "±", "flights alone", "±", "both", "±", "unit", "apart [±]"),
+        "do they agree?",
+    )
+    words = ("coefficient", "unit", "do they agree?")
+    return Section(
+        "sources",
+        "Ground and flights",
+        tables=(Table(columns, rows, words=words),),
+        note="± is one standard error, that of flights widened for model error. Flights alone are "
+        "what one step without the ground measurements gives from the end of the fit. More than "
+        "three standard errors apart is a conflict: do not believe the value of both before one of "
+        "them is explained.",
+    )
 
 
 def next_log(contents: Contents) -> Section | None:
     """Return what other signals, or more samples, would narrow."""
     if contents.run is None or not contents.run.result.next_log:
         return None
-    sentences = next_log_in_words(contents.run.result.next_log)
-    return Section("next_log", "What to log next time", {"sentences": sentences}, [])
+    points = [Cell(sentence) for sentence in next_log_in_words(contents.run.result.next_log)]
+    note = (
+        "Computed at the fitted coefficients, with the quoted intervals: an added signal is "
+        "simulated and weighed with the noise named; what twice the samples of an input would "
+        "bring follows from leaving out some of them."
+    )
+    return Section("next_log", "What to log next time", points=points, note=note)
 
 
 def effective(contents: Contents) -> Section | None:
@@ -81,22 +111,36 @@ def effective(contents: Contents) -> Section | None:
         return None
     physical = {name: row.best for name, row in contents.run.result.coefficients.items()}
     rows = [
-        {
-            "name": name,
-            "unit": COEFFICIENTS[name].unit,
-            "physical": physical[name],
-            "effective": value,
-            "change": _change(physical[name], value),
-        }
+        (
+            name,
+            figures(physical[name]),
+            figures(value),
+            COEFFICIENTS[name].unit,
+            _change(physical[name], value),
+        )
         for name, value in found.coefficients.items()
         if name in physical and value != physical[name]
     ]
     lost = [
-        {"group": term.group, "names": term.names, "rmse": rmse_in_words(term.rmse_without)}
+        (Cell(term.group, small=", ".join(term.names)), rmse_in_words(term.rmse_without))
         for term in found.lost
     ]
-    values = {"sentence": effective_in_words(found), "rows": rows, "lost": lost}
-    return Section("effective", "In Gazebo", values)
+    columns = ("coefficient", "physical", "in Gazebo", "unit", "change")
+    tables = (
+        Table(columns, rows, words=("coefficient", "unit")),
+        Table(
+            ("term that Gazebo lacks", "RMSE without it alone"),
+            lost,
+            words=("term that Gazebo lacks",),
+        ),
+    )
+    note = (
+        "Physical coefficients say what is true of the vehicle; those in Gazebo stand in for what "
+        "it lacks, and mean less than their names say. Exports for simulators hold the latter, "
+        "unless the job file has target: physical. RMSE is over all flights, in position and in "
+        "attitude."
+    )
+    return Section("effective", "In Gazebo", (effective_in_words(found),), tables=tables, note=note)
 
 
 def _change(before: float, after: float) -> str:
@@ -109,20 +153,34 @@ def _change(before: float, after: float) -> str:
 def provenance(contents: Contents) -> Section:
     """Return everything that decides the numbers."""
     about = contents.about
+    rows: list[tuple[Cell | str, ...]] = [
+        (name, str(origin)) for name, origin in _mapping(about.settings.get("origin")).items()
+    ]
+    if contents.run:
+        rows.append(("seed", str(contents.run.result.seed)))
+    rows += [
+        (flight.name, Cell(f"{flight.duration:.1f} s, {flight.path}", f"sha256 {flight.sha256}"))
+        for flight in about.flights
+    ]
+    rows += [
+        (f"{name} as used", f"sha256 {_digest(about.settings[name])}")
+        for name in ("vehicle", "controller", "job")
+        if name in about.settings
+    ]
+    rows += list(about.versions.items())
+    columns = ("what", "which")
+    tables = [Table(columns, rows, words=columns)]
     settings = {name: value for name, value in about.settings.items() if name not in SHOWN}
-    texts = {name: json.dumps(value, indent=2) for name, value in settings.items()}
-    values = {
-        "about": about,
-        "origin": about.settings.get("origin", {}),
-        "settings": texts,
-        "hashes": {
-            name: _digest(about.settings[name])
-            for name in ("vehicle", "controller", "job")
-            if name in about.settings
-        },
-        "seed": contents.run.result.seed if contents.run else None,
-    }
-    return Section("provenance", "Provenance", values)
+    tables += [
+        Table(("",), [(json.dumps(value, indent=2),)], words=("",), fold=name)
+        for name, value in settings.items()
+    ]
+    said = (f"Command: {about.command}",) if about.command else ()
+    return Section("provenance", "Provenance", said, tables=tables, folded=True)
+
+
+def _mapping(value: object) -> Mapping[str, object]:
+    return value if isinstance(value, dict) else {}
 
 
 def _digest(value: object) -> str:

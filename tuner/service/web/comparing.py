@@ -8,11 +8,19 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from tuner.core.files import MAX_BYTES
-from tuner.result import RMSE_UNITS, CoefficientResult, FlightResult, RunResult
+from tuner.result import (
+    RMSE_UNITS,
+    CoefficientResult,
+    ExportRecord,
+    ExportRecords,
+    FlightResult,
+    RunResult,
+)
 from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError
 from tuner.service.store import Store
+from tuner.service.tables import JobRow
 from tuner.vehicle.registry import at_mass
 
 
@@ -58,19 +66,36 @@ def result_of(database: Database, store: Store, job: str) -> RunResult:
         There is no such job, or it has no result that can be read.
     """
     row = jobs.job(database, job)
-    file = next((file for file in row.files if file.name == RunResult.FILE), None)
-    if file is None:
+    content = _content(row, store, RunResult.FILE)
+    if content is None:
         raise NotNowError(f"job {row.id}", f"is {row.state}", "compare jobs that are done")
-    if not store.has(file.sha256):
-        raise NotKnownError(f"job {row.id}", "has lost its result", "submit it again")
-    with store.reading(file.sha256) as stream:
-        content = stream.read(MAX_BYTES)
     try:
         return RunResult.model_validate_json(content)
     except ValidationError:
         raise NotNowError(
             f"job {row.id}", "was made by another version of tune", "submit it again"
         ) from None
+
+
+def exports_of(store: Store, row: JobRow) -> tuple[ExportRecord, ...]:
+    """Return what a job exported, with the conditions that were checked."""
+    content = _content(row, store, ExportRecords.FILE)
+    try:
+        records = ExportRecords.model_validate_json(content or b"{}")
+    except ValidationError:
+        return ()
+    return tuple(records.exports.values())
+
+
+def _content(row: JobRow, store: Store, name: str) -> bytes | None:
+    """Return a file of a job; None if it has none of that name."""
+    file = next((file for file in row.files if file.name == name), None)
+    if file is None:
+        return None
+    if not store.has(file.sha256):
+        raise NotKnownError(f"job {row.id}", "has lost its result", "submit it again")
+    with store.reading(file.sha256) as stream:
+        return stream.read(MAX_BYTES)
 
 
 def mass_of(result: RunResult) -> float | None:

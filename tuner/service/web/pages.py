@@ -6,6 +6,7 @@ import secrets
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,8 +21,8 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.core.validation import config_error
 from tuner.core.yaml_document import read_yaml
-from tuner.report import summary
-from tuner.result import EXPORTS, RMSE_UNITS
+from tuner.report.outcome import flights_table, outcome, warnings_of
+from tuner.result import RMSE_UNITS
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
 from tuner.service.history import history, vehicles
@@ -249,13 +250,21 @@ def show_job(service: Served, job: str) -> Response:
     row = jobs.job(service.database, job)
     done, _ = jobs.page(service.database, vehicle=row.vehicle, state=State.DONE)
     others = [other for other in done if other.id != row.id]
-    outcome: list[str] = []
+    box: dict[str, object] = {"outcome": None}
     with suppress(InputError):  # the report, if it is there, says what it can
         if row.state == State.DONE:
-            outcome = summary.outcome(comparing.result_of(service.database, service.store, row.id))
-    exports = [file for file in row.files if file.name.startswith(f"{EXPORTS}/")]
-    more = {"others": others, "outcome": outcome, "exports": exports}
-    return render("job.html.jinja", **more, **_live(service, row))
+            result = comparing.result_of(service.database, service.store, row.id)
+            found = outcome(result)
+            box = {
+                "outcome": found,
+                "flights": flights_table(found.checks),
+                "warnings": [
+                    replace(warning, text=on_the_web(warning.text), small=on_the_web(warning.small))
+                    for warning in warnings_of(result.findings)
+                ],
+                "exports": comparing.exports_of(service.store, row),
+            }
+    return render("job.html.jinja", others=others, **box, **_live(service, row))
 
 
 @web.get("/jobs/{job}/live")

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import cache
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
 from tuner.recordings.notes import Cause, Damage, Note
@@ -31,7 +31,7 @@ STATES: Mapping[str, tuple[str, str]] = {
 def environment() -> Environment:
     """Return the templates; whatever stands in them is escaped."""
     made = Environment(
-        loader=PackageLoader("tuner.service.web"),
+        loader=ChoiceLoader([PackageLoader("tuner.service.web"), PackageLoader("tuner.report")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -1,0 +1,99 @@
+"""Whether a fit can be used: the held-out flights and what was noticed decide."""
+
+import math
+
+import pytest
+
+from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
+from tuner.core.findings import Code, Finding
+from tuner.evaluate.rmse import AxesRmse
+from tuner.report.outcome import Standing, counted, next_step, outcome, warnings_of
+from tuner.uncertainty.verdict import Verdict
+
+CRASHED = AxesRmse(x=None, y=None, z=None, roll=None, pitch=None, yaw=None)
+
+
+def rmse(metres):
+    return AxesRmse(x=metres, y=metres, z=metres, roll=metres, pitch=metres, yaw=metres)
+
+
+@pytest.fixture
+def result(make_run):  # noqa: F811
+    """A fit whose held-out flight is met to a millimetre, which is the noise."""
+    run = make_run()
+    fitted = run.result.flights[0].model_copy(
+        update={"split": "fit", "rmse_initial": rmse(0.1), "rmse_best": rmse(0.001)}
+    )
+    held = fitted.model_copy(update={"name": "checks", "split": "holdout"})
+    noise = {"position": 0.001, "attitude": 0.001}
+    update = {"flights": (fitted, held), "settings": {"noise": noise}, "findings": ()}
+    return run.result.model_copy(update=update)
+
+
+def with_held(result, **update):
+    fitted, held = result.flights
+    return result.model_copy(update={"flights": (fitted, held.model_copy(update=update))})
+
+
+def noticing(result, *findings):
+    return result.model_copy(update={"findings": findings})
+
+
+def test_a_held_out_flight_met_to_its_noise_makes_a_fit_usable(result):
+    found = outcome(result)
+    assert found.standing is Standing.USABLE
+    assert found.flights[0].name == "checks"
+    (met,) = found.checks
+    assert met.word == "matched"
+    assert met.position[2] == pytest.approx(math.sqrt(3) * 0.001)
+    assert met.attitude[2] == pytest.approx(math.degrees(math.sqrt(3) * 0.001))
+    assert "position error from 17 cm to 1.7 mm" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("after", "word", "standing"),
+    [
+        (rmse(0.02), "better", Standing.USABLE),
+        (rmse(0.09), "unchanged", Standing.WITH_CARE),
+        (CRASHED, "crashes", Standing.UNUSABLE),
+    ],
+)
+def test_what_becomes_of_the_held_out_flight_decides(result, after, word, standing):
+    found = outcome(with_held(result, rmse_best=after))
+    assert (found.checks[0].word, found.standing) == (word, standing)
+
+
+def test_a_held_out_flight_that_is_met_worse_forbids_it(result):
+    numbers, names = {"before": 0.1, "after": 0.2}, ("position", "m")
+    worse = Finding(Code.FLIGHT_WORSE, "warning", "checks", numbers, names)
+    found = outcome(noticing(result, worse))
+    assert (found.checks[0].word, found.standing) == ("worse", Standing.UNUSABLE)
+    assert found.uses == ("Do not use these numbers: see the warnings for what to do first.",)
+
+
+def test_what_nothing_checks_or_something_doubts_is_used_with_care(result, tmp_path):
+    unchecked = with_held(result, split="fit")
+    assert outcome(unchecked).standing is Standing.WITH_CARE
+    assert "No flight was held out" in outcome(unchecked).reasons[-1]
+    assert next_step(unchecked, outcome(unchecked), tmp_path)[1] == "tune ... --holdout checks"
+    lacks = {"unmatched": 2.0, "flights": 2.0, "noise_multiple": 30.0}
+    doubted = noticing(result, Finding(Code.MODEL_UNMATCHED, "warning", "model", lacks))
+    assert outcome(doubted).standing is Standing.WITH_CARE
+    gap = noticing(result, Finding(Code.POSE_GAP, "warning", "checks", {"seconds": 0.2}))
+    assert outcome(gap).standing is Standing.USABLE
+
+
+def test_what_doubts_the_numbers_comes_before_what_does_not():
+    gap = Finding(Code.POSE_GAP, "warning", "a", {"seconds": 0.2})
+    info = Finding(Code.YAW_OPEN, "info", "b")
+    doubt = Finding(Code.VEHICLE_NOT_GIVEN, "warning", "c")
+    failure = Finding(Code.NOT_FINITE, "failure", "d")
+    assert [w.link for w in warnings_of((info, gap, doubt, failure))] == ["d", "c", "a"]
+
+
+def test_held_coefficients_are_counted_as_held():
+    verdicts = [Verdict.WELL_KNOWN, Verdict.WELL_KNOWN, Verdict.HELD, Verdict.NOT_IDENTIFIABLE]
+    assert counted(verdicts) == (
+        "2 are well known, 1 is held at its initial value and 1 is not identifiable"
+    )
+    assert counted([Verdict.HELD] * 2) == "all 2 are held at their initial values"

@@ -1,0 +1,334 @@
+"""Whether a fit can be used, for what, and why: one answer for terminal, page and service."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from tuner.core.findings import Code, Finding
+from tuner.ground.bench_json import BenchRecord
+from tuner.report.section import Cell, Table
+from tuner.result import AxesRmse, FlightResult, RunResult
+from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.verdict import Verdict
+from tuner.wording.bench import bench_in_words
+from tuner.wording.findings import remedy, sentence
+from tuner.wording.phrases import listed
+from tuner.wording.result import metres, simulator_lacks
+from tuner.wording.verdicts import verdict_in_words
+
+AT_NOISE = 1.5
+"""Times the noise up to which what remains of a flight is called noise."""
+UNCHANGED = 0.8
+"""Share of what it was above which an error is called unchanged."""
+Errors = tuple[float | None, float | None, float | None]
+"""Before and after a fit, and of the noise."""
+POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
+DOUBTS = frozenset(
+    {
+        Code.MODEL_UNMATCHED,
+        Code.FLIGHT_UNMATCHED,
+        Code.FLIGHT_WORSE,
+        Code.HOLDING_BETTER,
+        Code.GROUND_CONFLICT,
+        Code.BENCH_CONFLICT,
+        Code.TURNING_UNEXPLAINED,
+        Code.TURNING_REGRESSED,
+        Code.TURNING_NOT_PREDICTED,
+        Code.INERTIA_NOT_BALANCED,
+        Code.SPARSE_INPUT,
+        Code.SINGULAR_DIRECTION,
+        Code.WRONG_VEHICLE,
+        Code.CANNOT_HOVER,
+        Code.VEHICLE_NOT_GIVEN,
+        Code.SETPOINTS_FOREIGN,
+        Code.FLIGHTS_FAR_OFF,
+        Code.STARTS_DISAGREE,
+        Code.RATE_WORSE,
+    }
+)
+"""Warnings that put the numbers themselves in doubt."""
+
+
+class Standing(StrEnum):
+    """Whether a fit can be used."""
+
+    USABLE = "usable"
+    WITH_CARE = "usable with care"
+    UNUSABLE = "not usable"
+
+
+LOOKS = {Standing.USABLE: "well", Standing.WITH_CARE: "weak", Standing.UNUSABLE: "not"}
+
+
+@dataclass(frozen=True)
+class Met:
+    """How closely a flight is met.
+
+    Attributes
+    ----------
+    name, held_out
+        Which flight.
+    position, attitude
+        RMSE before, after, and that of the measurement noise alone: distance in m, the three angles
+        together in degrees; None for a crash or what is not simulated.
+    word
+        ``matched`` to the noise, ``better``, ``unchanged``, ``worse``, or it ``crashes``.
+    """
+
+    name: str
+    held_out: bool
+    position: Errors
+    attitude: Errors
+    word: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a fit came to.
+
+    Attributes
+    ----------
+    standing
+        Whether it can be used.
+    what
+        What was fitted to what, as a sentence.
+    uses, reasons
+        For what, and why so, in sentences.
+    flights
+        How closely each is met, held-out ones first.
+    """
+
+    standing: Standing
+    what: str
+    uses: tuple[str, ...]
+    reasons: tuple[str, ...]
+    flights: tuple[Met, ...]
+
+    @property
+    def look(self) -> str:
+        """Class of the page's style."""
+        return LOOKS[self.standing]
+
+    @property
+    def checks(self) -> tuple[Met, ...]:
+        """Flights that speak for or against it: held-out ones, else all."""
+        return tuple(met for met in self.flights if met.held_out) or self.flights
+
+
+def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
+    """Return whether a fit can be used, for what, and why."""
+    met = tuple(sorted((_met(flight, result) for flight in result.flights), key=_order))
+    checks = tuple(one for one in met if one.held_out) or met
+    standing = _standing(result, checks, met)
+    return Outcome(
+        standing,
+        _what(result) if bench is None else bench_in_words(bench),
+        _uses(result, standing),
+        _reasons(result, checks),
+        met,
+    )
+
+
+def by_weight(findings: Sequence[Finding]) -> list[Finding]:
+    """Return failures and warnings: failures first, then what puts the numbers in doubt."""
+    found = [finding for finding in findings if finding.level != "info"]
+    return sorted(
+        found, key=lambda finding: (finding.level != "failure", finding.code not in DOUBTS)
+    )
+
+
+def warnings_of(findings: Sequence[Finding]) -> list[Cell]:
+    """Return the same with the remedy of each."""
+    found = by_weight(findings)
+    return [Cell(sentence(f), small=remedy(f), look=f.level, link=f.subject) for f in found]
+
+
+def next_step(result: RunResult, found: Outcome, folder: Path) -> tuple[str, str]:
+    """Return what to do next with a fit: in words, and the command."""
+    name = shlex.quote(str(folder))
+    doubts = [warning for warning in warnings_of(result.findings) if warning.small]
+    if found.standing is Standing.UNUSABLE:
+        return doubts[0].small if doubts else "Look at its flights.", f"tune report {name} --open"
+    if found.flights and not any(met.held_out for met in found.flights):
+        flight = shlex.quote(found.flights[-1].name)
+        return "Hold a flight out, which then checks the fit.", f"tune ... --holdout {flight}"
+    if not found.flights:
+        return "Fit flights from it.", f"tune --flights FLIGHT... --bench {name}"
+    return "Put it into your model.", f"tune export {name} --format sdf --into model.sdf"
+
+
+def of_examination(knowledge: Knowledge) -> str:
+    """Return what an examination without a fit came to, as a sentence."""
+    known = knowledge.coefficients.values()
+    verdicts = [coefficient.verdict for coefficient in known if coefficient.fitted]
+    flights = len(knowledge.flights)
+    return (
+        f"{len(verdicts)} coefficient{'s were' if len(verdicts) != 1 else ' was'} examined on "
+        f"{flights} flight{'s' if flights != 1 else ''}, nothing fitted: {counted(verdicts)}."
+    )
+
+
+def flights_table(flights: Sequence[Met]) -> Table:
+    """Return how closely flights are met, beside the noise."""
+    looks = {"matched": "well", "better": "well", "unchanged": "weak"}
+    rows: list[tuple[Cell | str, ...]] = [
+        (
+            met.name + (", held out" if met.held_out else ""),
+            *_cells(met.position, lambda value: f"{1e3 * value:.3g} mm"),
+            *_cells(met.attitude, lambda value: f"{value:.3g}°"),
+            Cell(met.word, look=looks.get(met.word, "not")),
+        )
+        for met in flights
+    ]
+    columns = ("flight", "position RMSE", "noise", "attitude RMSE", "noise ", "verdict")
+    return Table(columns, rows, words=("flight", "verdict"))
+
+
+def counted(verdicts: Sequence[Verdict]) -> str:
+    """Return how many coefficients have each verdict, as a clause."""
+    counts = Counter(verdict_in_words(verdict) for verdict in verdicts)
+    if len(counts) == 1 and len(verdicts) > 1:
+        return f"all {len(verdicts)} are {_of_many(next(iter(counts)))}"
+    return listed(
+        [f"1 is {one}" if n == 1 else f"{n} are {_of_many(one)}" for one, n in counts.items()]
+    )
+
+
+def _of_many(words: str) -> str:
+    return words.replace("at its initial value", "at their initial values")
+
+
+def _order(met: Met) -> bool:
+    return not met.held_out
+
+
+def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
+    before, after, noise = errors
+    if before is None and after is None:
+        return ["–", ""]
+    both = " → ".join("crash" if value is None else write(value) for value in (before, after))
+    return [both, "" if noise is None else write(noise)]
+
+
+def _met(flight: FlightResult, result: RunResult) -> Met:
+    position = _errors(flight, POSITION, _noise(result, "position", 1.0))
+    attitude = _errors(flight, ATTITUDE, _noise(result, "attitude", math.degrees(1.0)))
+    codes = {found.code for found in result.findings if found.subject == flight.name}
+    return Met(
+        flight.name, flight.split == "holdout", position, attitude, _word(position, attitude, codes)
+    )
+
+
+def _word(
+    position: Errors,
+    attitude: Errors,
+    codes: set[Code],
+) -> str:
+    before, after, _ = position
+    if after is None:
+        return "crashes"
+    if Code.FLIGHT_WORSE in codes:
+        return "worse"
+    pairs = [(end, noise) for _, end, noise in (position, attitude) if end is not None and noise]
+    if pairs and all(end <= AT_NOISE * noise for end, noise in pairs):
+        return "matched"
+    return "better" if before is None or after < UNCHANGED * before else "unchanged"
+
+
+def _errors(flight: FlightResult, axes: Sequence[str], noise: float | None) -> Errors:
+    return length(flight.rmse_initial, axes), length(flight.rmse_best, axes), noise
+
+
+def length(rmse: AxesRmse, axes: Sequence[str]) -> float | None:
+    """Return an RMSE of several axes together; None where one has none."""
+    parts = [getattr(rmse, axis) for axis in axes]
+    return None if None in parts else math.hypot(*parts)
+
+
+def _noise(result: RunResult, channel: str, unit: float) -> float | None:
+    """Return the measurement noise of three axes together, estimated by the fit."""
+    noise = result.settings.get("noise")
+    value = noise.get(channel) if isinstance(noise, dict) else None
+    return math.sqrt(3.0) * unit * value if isinstance(value, float) else None
+
+
+def _standing(result: RunResult, checks: Sequence[Met], met: Sequence[Met]) -> Standing:
+    words = {one.word for one in checks}
+    if words & {"worse", "crashes"} or any(one.word == "crashes" for one in met):
+        return Standing.UNUSABLE
+    if any(found.level == "failure" for found in result.findings):
+        return Standing.UNUSABLE
+    fitted = [row for row in result.coefficients.values() if row.fitted]
+    unsure = (
+        "unchanged" in words,
+        bool(met) and not any(one.held_out for one in met),
+        not result.search.converged,
+        bool(fitted) and all(row.identifiable is False for row in fitted),
+        any(f.level == "warning" and f.code in DOUBTS for f in result.findings),
+    )
+    return Standing.WITH_CARE if any(unsure) else Standing.USABLE
+
+
+def _what(result: RunResult) -> str:
+    fitted, held = (
+        sum(flight.split == split for flight in result.flights) for split in ("fit", "holdout")
+    )
+    free = sum(row.fitted for row in result.coefficients.values())
+    text = f"{free} coefficient{'s were' if free != 1 else ' was'} fitted"
+    if result.flights:
+        text += f" to {fitted} flight{'s' if fitted != 1 else ''}"
+        text += f"; {held} {'was' if held == 1 else 'were'} held out to check them" if held else ""
+    return text + "."
+
+
+def _uses(result: RunResult, standing: Standing) -> tuple[str, ...]:
+    """Return for what a fit can be used, and for what it cannot, in sentences."""
+    if standing is Standing.UNUSABLE:
+        return ("Do not use these numbers: see the warnings for what to do first.",)
+    sentences = []
+    if result.effective is not None:
+        sentences.append(f"Simulating such flights: {simulator_lacks(result.effective)}")
+    elif result.flights:
+        sentences.append("Simulating such flights, in Gazebo too: it has every term in this model.")
+    else:
+        sentences.append("Starting a fit of flights that hold position and attitude.")
+    by_verdict: dict[Verdict, list[str]] = {}
+    for name, row in result.coefficients.items():
+        if row.fitted:
+            by_verdict.setdefault(row.verdict, []).append(name)
+    known = by_verdict.pop(Verdict.WELL_KNOWN, [])
+    if known and not by_verdict:
+        sentences.append(f"Physical values: all {len(known)} coefficients are well known.")
+    elif known:
+        sentences.append(f"Physical values: {listed(known)} {_are(known)} well known.")
+    for verdict, names in by_verdict.items():
+        sentences.append(f"Not as physical values: {listed(names)}, {verdict_in_words(verdict)}.")
+    return tuple(sentences)
+
+
+def _are(names: Sequence[str]) -> str:
+    return "is" if len(names) == 1 else "are"
+
+
+def _reasons(result: RunResult, checks: Sequence[Met]) -> tuple[str, ...]:
+    sentences = []
+    for met in checks[:3]:
+        before, after, noise = met.position
+        what = "held out" if met.held_out else "fitted"
+        if after is None:
+            sentences.append(f"{met.name}, {what}, crashes in the simulation.")
+            continue
+        moved = f"{'a crash' if before is None else metres(before)} to {metres(after)}"
+        floor = "" if noise is None else f"; the noise of its recording alone is {metres(noise)}"
+        sentences.append(f"{met.name}, {what}: position error from {moved}{floor}.")
+    if result.flights and not any(met.held_out for met in checks):
+        sentences.append("No flight was held out, so that nothing checks the fit: hold one out.")
+    if not result.search.converged:
+        sentences.append("The search stopped at its limit of iterations: resume it.")
+    return tuple(sentences)
