@@ -32,12 +32,14 @@ from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from sim_jax.inlet import ReferenceInlet
 from tuner.config import Options, settle
+from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
-from tuner.objective.job_flights import read_recordings
 from tuner.objective.normal import Objective
+from tuner.objective.space import Space
 from tuner.search.continuation import grow
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import read_recordings
 from tuner.search.optimiser import Free
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import beginning, criterion_of, point_of
@@ -46,8 +48,6 @@ from tuner.terms.candidates import with_terms
 from tuner.uncertainty.calibration import FILE, LEVELS, Calibration, Held
 from tuner.uncertainty.estimates import uncertainty_of
 from tuner.vehicle.model import with_terms_computed
-from tuner.vehicle.space import Space
-from tuner.wording.phrases import listed
 
 DRAWS = int(os.environ.get("TUNE_CALIBRATION_DRAWS", "20"))
 WORKERS = int(os.environ.get("TUNE_CALIBRATION_WORKERS", "0")) or None

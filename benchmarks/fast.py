@@ -20,9 +20,9 @@ from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.regression import adding, convolved
 from tuner.equation_error.turning import regressors
 from tuner.job.run import run
-from tuner.objective.job_flights import read_usable
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
+from tuner.search.job_flights import read_usable
 from tuner.vehicle import VehicleFile
 
 LABS = ((10, 400.0), (11, 100.0))

@@ -20,9 +20,9 @@ from benchmarks.calibration import fitted, problem, reference_job
 from benchmarks.simulated_recordings import Flown, recorded
 from benchmarks.table import Bar, Section, figure
 from benchmarks.timing import ROOT
-from tuner.disturbances.estimation import with_disturbances
 from tuner.engine import Report, engine_for
 from tuner.search.problem import Job
+from tuner.terms.refit_with_disturbances import with_disturbances
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from benchmarks.simulated_recordings import recorded
 from tuner.core.numerics import Inverse
+from tuner.objective.information import information_at
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.information import information_at
 
 Array = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from tuner.core.errors import InputError
 from tuner.evaluate.predict import UNITS, Predictions, predict, summary
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
-from tuner.objective.job_flights import read_usable
 from tuner.result import BEST_FIT_FILE, RunResult
+from tuner.search.job_flights import read_usable
 from tuner.vehicle import ControllerFile, read_vehicle
 
 FLIGHTS = Path(os.environ.get("TUNE_REAL_FLIGHTS", ROOT.parent / "shared" / "flights"))

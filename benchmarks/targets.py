@@ -12,14 +12,14 @@ import tempfile
 from pathlib import Path
 
 from tuner.core.runtime import configure
+from tuner.core.shipped import EXPORT_TARGETS
 from tuner.exporters.draft import write
 from tuner.exporters.effective import pose_rmse
 from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.refly import refly
 from tuner.exporters.target import Choices, target_of
-from tuner.exporters.targets import NAMES
+from tuner.report.result_texts import rmse_in_words
 from tuner.result import PoseRmse, read_run
-from tuner.wording.result import rmse_in_words
 
 
 def main(folder: str) -> None:
@@ -34,7 +34,7 @@ def main(folder: str) -> None:
     best = over_flights({f.name: f.rmse_best for f in run.result.flights})
     print("| target | all terms | physical there | effective there | in the simulator itself |")
     print("|---|---|---|---|---|")
-    for kind in NAMES:
+    for kind in EXPORT_TARGETS:
         target = target_of(kind)
         simulator = target.simulator
         found = None if simulator is None else kept_effective(run, simulator)

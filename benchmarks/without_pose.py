@@ -19,7 +19,7 @@ from benchmarks.contest import STRIDE, Contest, simple
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
 from tuner.evaluate.predict import Predictions, predict
-from tuner.inertial.job import fit_without_pose, without_pose
+from tuner.job.without_pose import fit_without_pose, without_pose
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.inertial import InertialFlight
 from tuner.recordings.states import initial_state

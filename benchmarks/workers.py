@@ -82,10 +82,10 @@ def _processes(engine: Engine, workers: int) -> dict[float, dict[str, float]]:
 def _cross_validation() -> tuple[dict[str, _Folds], list[str]]:
     """Return engine -> its cross-validation, and every table."""
     from tuner.config import Options, settle  # noqa: PLC0415 (jax is configured first)
-    from tuner.evaluate.cross_validation import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
-    from tuner.objective.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.estimation import search  # noqa: PLC0415
+    from tuner.search.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.problem import job_of  # noqa: PLC0415
+    from tuner.uncertainty.cross_validation import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
 
     settings = settle(Options([str(path) for path in sorted(FOLDER.glob("*.bag"))]))
     job = job_of(settings, read_recordings(settings))

@@ -33,14 +33,14 @@ from tuner.engine import Report, engine_for  # noqa: E402
 from tuner.evaluate.best_fit import vehicle_fitted  # noqa: E402
 from tuner.evaluate.held_out import validate  # noqa: E402
 from tuner.objective.criterion import OFFSET_UNIT  # noqa: E402
-from tuner.objective.job_flights import read_recordings  # noqa: E402
 from tuner.recordings.flight import Flight, Series  # noqa: E402
 from tuner.search.estimation import search  # noqa: E402
 from tuner.search.fitted import Fitted  # noqa: E402
+from tuner.search.job_flights import read_recordings  # noqa: E402
 from tuner.search.problem import Job, job_of  # noqa: E402
 from tuner.uncertainty.estimates import uncertainty_of  # noqa: E402
+from tuner.uncertainty.verdict_texts import direction_in_words, verdict_in_words  # noqa: E402
 from tuner.vehicle import with_values  # noqa: E402 (jax is configured first)
-from tuner.wording.verdicts import direction_in_words, verdict_in_words  # noqa: E402
 
 FOLDER = Path(__file__).parents[1] / "reference_flights"
 TIMES = ("time_constant_up", "time_constant_down", "estimate_latency", "actuator_latency")

@@ -13,11 +13,12 @@ from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile
 from tuner.core.findings import Finding
 from tuner.design.log_proposal import LogProposal
-from tuner.terms.selection_table import SelectionRow
+from tuner.evaluate.rmse import AxesRmse, PredictedErrors
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
+from tuner.vehicle.selection_table import SelectionRow
 
 EXPORTS = "export"
 """Folder of a result folder, for its exports."""
@@ -87,40 +88,6 @@ class CoefficientResult(Part):
     @field_serializer("reason")
     def _without_nulls(self, reason: Reason) -> dict[str, JsonValue]:
         return reason.model_dump(mode="json", exclude_none=True)
-
-
-RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
-"""Axis -> unit of its RMSE."""
-
-
-class AxesRmse(Part):
-    """The thesis's six: position along world x, y, z in m; roll, pitch, yaw in degrees.
-
-    None stands for a flight that crashed or an axis that was not recorded.
-    """
-
-    x: FiniteOrNone
-    y: FiniteOrNone
-    z: FiniteOrNone
-    roll: FiniteOrNone
-    pitch: FiniteOrNone
-    yaw: FiniteOrNone
-
-
-class PredictedErrors(Part):
-    """How far open-loop predictions lie from the recording, ``seconds`` after they begin.
-
-    Means over all predictions of a flight of the Euclidean distance in position (m), velocity (m/s)
-    and body rate (rad/s), and of the angle between the attitudes (rad). Each begins at the recorded
-    state, filtered within hundredths of a second (`tuner.recordings.states`); nothing is
-    fitted to it.
-    """
-
-    seconds: float
-    position: FiniteOrNone
-    velocity: FiniteOrNone
-    attitude: FiniteOrNone
-    body_rate: FiniteOrNone
 
 
 class FlightResult(Part):

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.oracle import oracle_error
 from tests.tuner.uncertainty import making
-from tuner.uncertainty.information import information_at
+from tuner.objective.information import information_at
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
 

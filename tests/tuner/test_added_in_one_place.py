@@ -25,9 +25,9 @@ from sim_jax.vector import Vec3
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
 from tuner.config import JobFile
+from tuner.core import shipped
 from tuner.core.errors import ExportError
 from tuner.evaluate.write import write_flights
-from tuner.exporters import targets
 from tuner.exporters.draft import Draft, differences
 from tuner.exporters.target import Target, registered
 from tuner.recordings.inspection import inspect_recordings
@@ -111,7 +111,7 @@ def ini_target(monkeypatch):
     module = ModuleType("tuner.exporters.targets.ini")
     module.TARGET = Target("ini", ".ini", draft, entry)
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(targets, "NAMES", [*targets.NAMES, "ini"])
+    monkeypatch.setattr(shipped, "EXPORT_TARGETS", [*shipped.EXPORT_TARGETS, "ini"])
 
 
 def effects_that_do_nothing():

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
+from tuner.core.phrases import listed
 from tuner.core.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
-from tuner.wording.phrases import listed
 
 if TYPE_CHECKING:
     from rich.table import Table

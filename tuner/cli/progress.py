@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from tuner.cli.tables import console
+from tuner.core.phrases import as_sentence
 from tuner.core.spans import watching
-from tuner.wording.phrases import as_sentence
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from tuner.config import Settings
+    from tuner.job.listener import Listener
     from tuner.search.iteration import Iteration
-    from tuner.search.listener import Listener
     from tuner.search.point_estimate import PointEstimate
 
 
@@ -57,7 +57,7 @@ DOING = {
 def listening(*, quiet: bool, verbose: bool = False) -> Iterator[Listener]:
     """Yield a listener that shows a run on the terminal, or nothing; each message if verbose."""
     from tuner.cli.results import estimates_table, folds_table
-    from tuner.search.listener import SILENT, Listener
+    from tuner.job.listener import SILENT, Listener
 
     if quiet:
         yield SILENT

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from tuner.client.client import Client
-    from tuner.search.listener import Listener
+    from tuner.job.listener import Listener
 
 Server = Annotated[
     str | None,
@@ -70,8 +70,8 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
 
 
 def _folds(rows: list[dict[str, Any]]) -> Any:
-    from tuner.evaluate.cross_validation import Fold  # (jax)
-    from tuner.result import AxesRmse
+    from tuner.evaluate.rmse import AxesRmse
+    from tuner.uncertainty.cross_validation import Fold  # (jax)
 
     return [
         Fold(row["left_out"], {}, None if row["rmse"] is None else AxesRmse(**row["rmse"]))

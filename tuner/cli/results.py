@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from tuner.cli.tables import columns_of, console
+from tuner.core.phrases import listed_within, shorten
 from tuner.report.section import Cell, Section, Table
-from tuner.wording.phrases import listed_within, shorten
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from tuner.evaluate.cross_validation import Fold
-    from tuner.ground.job import BenchResult
+    from tuner.job.ground import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
     from tuner.search.point_estimate import PointEstimate
+    from tuner.uncertainty.cross_validation import Fold
 
 WIDTH, LINES = 100, 30
 """What a finished job takes of a terminal at most, without --verbose."""
@@ -110,7 +110,7 @@ def _warnings(result: RunResult) -> list[Text]:
 def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
     """Return the fitted coefficients, those least known first where they do not fit."""
     from tuner.uncertainty.verdict import Verdict
-    from tuner.wording.verdicts import half_width_in_words, verdict_in_words
+    from tuner.uncertainty.verdict_texts import half_width_in_words, verdict_in_words
 
     fitted = {name: row for name, row in result.coefficients.items() if row.fitted}
     shown = list(fitted)
@@ -139,7 +139,7 @@ def _coefficients(result: RunResult, room: int) -> list[Text | Table]:
 
 def _rest(result: RunResult) -> list[str]:
     """Return a line on what was fixed and one on the terms."""
-    from tuner.wording.result import nearly_kept
+    from tuner.report.result_texts import nearly_kept
 
     fixed = [f"{n} {row.best:.4g}" for n, row in result.coefficients.items() if not row.fitted]
     lines = [f"Fixed: {listed_within(fixed, WIDTH - 8)}."] if fixed else []
@@ -206,7 +206,7 @@ def _cell(of: Cell | str) -> Text:
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
     """Print what each experiment and all together say, and where everything lies."""
     from tuner.ground.bench_json import bench_record
-    from tuner.wording.bench import agreement_in_words, numbers_in_words
+    from tuner.ground.texts import agreement_in_words, numbers_in_words
 
     screen = console()
     record = bench_record(bench.combination, bench.measurements)
@@ -220,8 +220,8 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
     from tuner.report.contents import read_contents
     from tuner.report.sections import sections_of
+    from tuner.uncertainty.verdict_texts import direction_in_words
     from tuner.wording.findings import one_line
-    from tuner.wording.verdicts import direction_in_words
 
     screen = console()
     for section in sections_of(read_contents(result.folder)):
@@ -245,7 +245,7 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
 
 def folds_table(folds: Sequence[Fold]) -> object:
     """Return how well each flight is predicted by the fit to the others."""
-    from tuner.result import RMSE_UNITS
+    from tuner.evaluate.rmse import RMSE_UNITS
 
     rows = [
         (

@@ -66,8 +66,8 @@ def tune(
 
             configure()
             from tuner.config import settle
-            from tuner.inertial.job import fit_without_pose, without_pose
             from tuner.job.run import run
+            from tuner.job.without_pose import fit_without_pose, without_pose
 
         options = fitted.options(bench=bench)
         with span("reading"):

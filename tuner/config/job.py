@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from tuner.config.trajectory_settings import TrajectorySettings
 from tuner.core.errors import ConfigError, did_you_mean
-from tuner.core.shipped import Kind, find_config
+from tuner.core.shipped import EXPORT_TARGETS, Kind, find_config
 from tuner.core.yaml_section import (
     Flag,
     Number,
@@ -20,7 +20,6 @@ from tuner.core.yaml_section import (
     read_model,
     refuse,
 )
-from tuner.exporters.targets import NAMES
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups
 
 #: Recorded signals whose residuals a fit can weigh, in this order everywhere.
@@ -52,7 +51,7 @@ CoefficientName = Annotated[
 ]
 TermName = Annotated[str, AfterValidator(lambda name: _known(name, _terms(), "term"))]
 FormatName = Annotated[
-    str, AfterValidator(lambda name: _known(name, tuple(NAMES), "export format"))
+    str, AfterValidator(lambda name: _known(name, tuple(EXPORT_TARGETS), "export format"))
 ]
 ChannelName = Annotated[str, AfterValidator(lambda name: _known(name, CHANNELS, "channel"))]
 

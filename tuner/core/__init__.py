@@ -1,1 +1,1 @@
-"""What every room needs: errors, files, YAML, findings, numerics, the time that stages take."""
+"""Errors, files, YAML, findings, numerics, phrases and the times of stages."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 from pathlib import Path
 from typing import Literal
 
@@ -9,6 +10,12 @@ from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, did_you_mean
 
 Kind = Literal["vehicles", "controllers", "topics"]
+
+EXPORT_TARGETS = [
+    module.name.replace("_", "-")
+    for module in pkgutil.iter_modules([str(Path(__file__).parents[1] / "exporters" / "targets")])
+]
+"""Names that ``--format`` takes: of the modules in `tuner.exporters.targets`, not imported."""
 
 
 def configs_folder() -> Path:

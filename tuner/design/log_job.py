@@ -17,14 +17,14 @@ from tuner.design.next_log import (
     share_at_twice_the_rate,
     signals_to_add,
 )
+from tuner.objective.information import information_at
 from tuner.objective.inlets import INLETS, STEADY_TORQUE, TURNING
-from tuner.objective.job_flights import Recording
 from tuner.objective.normal import Objective
 from tuner.recordings.flight import Series
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import Recording
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import plain_criterion
-from tuner.uncertainty.information import information_at
 from tuner.vehicle import VehicleFile
 
 WORTH_LOGGING = 0.9

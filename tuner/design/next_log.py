@@ -19,11 +19,11 @@ from tuner.config.job import InletName
 from tuner.core.numerics import errors_of
 from tuner.design.log_proposal import LogProposal
 from tuner.objective.criterion import Criterion
+from tuner.objective.information import information_at
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured
 from tuner.search.fitted import Fitted
-from tuner.uncertainty.information import information_at
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]

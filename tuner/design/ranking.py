@@ -20,10 +20,10 @@ from tuner.design.candidate_problem import candidate_point, candidate_problem
 from tuner.design.candidates import Arena, Candidate, candidates
 from tuner.design.next_flight_json import Proposal, Proposals
 from tuner.objective.criterion import Criterion
+from tuner.objective.information import information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.examination import Examination
-from tuner.uncertainty.information import information_from_jacobian
 from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import COEFFICIENTS
 

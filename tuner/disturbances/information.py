@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_solve
 from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
+from tuner.objective.information import FisherInformation
 from tuner.objective.inlets import INLETS
-from tuner.uncertainty.information import FisherInformation
 
 Array = NDArray[np.float64]
 

@@ -27,11 +27,11 @@ from tuner.disturbances.recorded import (
 )
 from tuner.disturbances.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
+from tuner.objective.information import FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.objective.simulator import Simulator
 from tuner.recordings.flight import Flight
-from tuner.uncertainty.information import FisherInformation, information_from_jacobian
 
 Array = NDArray[np.float64]
 

@@ -27,9 +27,9 @@ from tuner.disturbances.recorded import gathered
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.loss import gauss_newton, robust
 from tuner.objective.normal import Objective
+from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.search.normal_equations import normal_equations
-from tuner.vehicle.space import Space
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from tuner.core.findings import Code, Finding
 from tuner.objective.explained import Source, squared_speed
-from tuner.objective.job_flights import Recording
 from tuner.recordings.flight import Array, Flight
 from tuner.recordings.states import filtered, states_at
+from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile
 
 WINDOW = 0.25

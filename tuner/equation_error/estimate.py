@@ -17,12 +17,11 @@ from tuner.equation_error.regression import (
     predicting,
     regress,
 )
+from tuner.objective.space import Space
 from tuner.recordings.flight import Array
-from tuner.terms.candidates import Groups
-from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import Model, with_terms_computed
-from tuner.vehicle.space import Space
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 GAINS = ("torque_gain_x", "torque_gain_y", "torque_gain_z")
 """What of a moment predicts turning: no part of the vehicle."""

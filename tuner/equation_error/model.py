@@ -16,8 +16,8 @@ from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from tuner.equation_error.measured import Measured
 from tuner.recordings.flight import Array
+from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import Model, with_coefficients
-from tuner.vehicle.space import Parameter
 
 NUDGE = 1e-3
 """Change of a scaled coordinate over its usual size, and of a rotor's speed over itself, by which

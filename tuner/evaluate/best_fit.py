@@ -6,9 +6,9 @@ import numpy as np
 
 from tuner.evaluate.comparison import Comparison
 from tuner.objective.criterion import OFFSET_UNIT, units_of
-from tuner.objective.job_flights import with_conditions, with_offsets
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import with_conditions, with_offsets
 from tuner.search.loop import loop_of
 from tuner.search.point_estimate import PointEstimate
 from tuner.search.problem import Job

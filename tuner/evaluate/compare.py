@@ -12,9 +12,8 @@ from tuner.core.errors import InputError
 from tuner.core.shipped import find_config
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.comparison_table import Row, Table, check_table_file, write_table
-from tuner.evaluate.rmse import FlightErrors, rmse_of
-from tuner.objective.job_flights import as_logged, read_usable
-from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse, FlightErrors, rmse_of
+from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import VehicleFile, read_vehicle
 from tuner.wording.findings import one_line
 

@@ -22,21 +22,13 @@ from sim_jax.crash import AIRBORNE, Limits
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
 from tuner.evaluate.forces import Forces, acting, in_order
-from tuner.evaluate.rmse import (
-    FlightErrors,
-    SignalErrors,
-    joined,
-    laps_of,
-    limits_of,
-    short_way,
-)
+from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, short_way
 from tuner.evaluate.simulation_table import roll_pitch_yaw
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.flight import MOTION, TURNED
 from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import INLETS, window_seconds
-from tuner.objective.job_flights import Recording
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Reading, at_stamps
@@ -47,14 +39,16 @@ from tuner.objective.segments import (
     segments_of,
     window_segments,
 )
+from tuner.objective.space import Space
 from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Array
 from tuner.search.free_starts import FAR
+from tuner.search.job_flights import Recording
+from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_mixer
 from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed
-from tuner.vehicle.space import Space
 
 POSE = ("position", "attitude")
 LAG = 0.03
@@ -76,7 +70,7 @@ class Comparison:
     ----------
     recordings
         At least one. Their clock offsets are taken as known (`with_offsets` of
-        `tuner.objective.job_flights`); one that a fit would estimate counts as zero.
+        `tuner.search.job_flights`); one that a fit would estimate counts as zero.
     controller
         What flew.
     window

@@ -8,7 +8,7 @@ from pathlib import Path
 from tuner.core.disk import check_file, write_text
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile, csv_text
-from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
 
 TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from tuner.core.findings import Code, Finding
 from tuner.evaluate.best_fit import comparison_of, controller_flown
-from tuner.evaluate.predict import Predictions, hold, predict
-from tuner.evaluate.rmse import FlightErrors
+from tuner.evaluate.predict import UNITS, Predictions, hold, predict
+from tuner.evaluate.rmse import FlightErrors, Pose, PredictedErrors
 from tuner.objective.inlets import INLETS
 from tuner.recordings.flight import Flight
-from tuner.result import PredictedErrors
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
 from tuner.vehicle import VehicleFile
@@ -117,3 +117,61 @@ def _turning_explained(flight: Flight, predictions: Predictions) -> float:
     naive = hold(flight, predictions.begins, predictions.ahead)
     squares = [float(np.nanmean(of.errors["body_rate"][-1] ** 2)) for of in (predictions, naive)]
     return 1.0 - squares[0] / squares[1]
+
+
+WORSE = 0.01
+"""Share by which a flight may be met worse than before the fit without a word."""
+
+
+MET_BY: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
+"""What a flight is judged by, with its unit."""
+
+
+def flights_worse(
+    initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
+) -> tuple[Finding, ...]:
+    """Return which flights the fitted coefficients meet worse than the initial ones, or crash.
+
+    Parameters
+    ----------
+    initial, best
+        Flight -> errors of a simulation with the initial, and with the fitted coefficients.
+    """
+    findings = []
+    for flight in best:
+        crashed = best[flight].crash_time
+        if crashed is not None:
+            if initial[flight].crash_time is None:
+                numbers = {"seconds": crashed}
+                findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
+            continue
+        for what, unit in MET_BY.items():
+            before, after = initial[flight].length(what), best[flight].length(what)
+            if after > (1.0 + WORSE) * before:
+                numbers = {"before": before, "after": after}
+                findings.append(
+                    Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
+                )
+    return tuple(findings)
+
+
+def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
+    """Return what of a flight is predicted no better than by leaving it as it is, in the mean."""
+    findings = []
+    for recording in job.recordings:
+        name = recording.flight.name
+        pairs = zip(
+            validation.predicted_best.get(name, ()),
+            validation.predicted_holding.get(name, ()),
+            strict=True,
+        )
+        for best, held in pairs:
+            numbers = {"seconds": best.seconds}
+            for quantity in UNITS:
+                of_best, of_held = getattr(best, quantity), getattr(held, quantity)
+                if of_best is not None and of_held is not None and of_best > of_held:
+                    numbers |= {quantity: of_best, f"{quantity}_held": of_held}
+            lost = tuple(quantity for quantity in UNITS if quantity in numbers)
+            if lost:
+                findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
+    return tuple(findings)

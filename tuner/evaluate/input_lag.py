@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from sim_jax.numeric import GRAVITY
 from tuner.objective.inlets import INLETS
-from tuner.objective.job_flights import Recording
 from tuner.recordings.flight import Array, Flight
 from tuner.recordings.states import states_at
+from tuner.search.job_flights import Recording
 from tuner.vehicle import VehicleFile
 
 BAND = (0.7, 8.0)

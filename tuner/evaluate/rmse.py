@@ -9,15 +9,45 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.crash import AIRBORNE, Limits
+from tuner.core.files import FiniteOrNone, Part
 from tuner.evaluate.forces import Forces
 from tuner.recordings.flight import Array, Flight
-from tuner.result import RMSE_UNITS, AxesRmse
 
 Pose = Literal["position", "attitude"]
 
-#: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
-CLEARANCE = 0.3
+
+RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
+"""Axis -> unit of its RMSE."""
+
+
+class AxesRmse(Part):
+    """The thesis's six: position along world x, y, z in m; roll, pitch, yaw in degrees.
+
+    None stands for a flight that crashed or an axis that was not recorded.
+    """
+
+    x: FiniteOrNone
+    y: FiniteOrNone
+    z: FiniteOrNone
+    roll: FiniteOrNone
+    pitch: FiniteOrNone
+    yaw: FiniteOrNone
+
+
+class PredictedErrors(Part):
+    """How far open-loop predictions lie from the recording, ``seconds`` after they begin.
+
+    Means over all predictions of a flight of the Euclidean distance in position (m), velocity (m/s)
+    and body rate (rad/s), and of the angle between the attitudes (rad). Each begins at the recorded
+    state, filtered within hundredths of a second (`tuner.recordings.states`); nothing is
+    fitted to it.
+    """
+
+    seconds: float
+    position: FiniteOrNone
+    velocity: FiniteOrNone
+    attitude: FiniteOrNone
+    body_rate: FiniteOrNone
 
 
 @dataclass(frozen=True)
@@ -135,19 +165,3 @@ def laps_of(flight: Flight) -> Array:
     rises: NDArray[np.bool_] = np.diff(count, prepend=0.0) > 0
     inside = rises & (series.time > 0) & (series.time <= flight.duration)
     return series.time[inside]
-
-
-def limits_of(flights: Sequence[Flight]) -> Limits:
-    """Return the space in which these flights count as flying.
-
-    The simulator's own arena, unless a recording itself comes near its floor or leaves it.
-    """
-    arena = Limits()
-    for flight in flights:
-        place = flight.series["position"]
-        inside = (place.time >= 0) & (place.time <= flight.duration)
-        places = place.values[inside & np.isfinite(place.values).all(axis=1)]
-        low = places[:, 2].min() < arena.floor + CLEARANCE
-        if low or np.abs(places).max() > arena.half_width / 2:
-            return AIRBORNE
-    return arena

@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.errors import ConfigError
+from tuner.core.phrases import listed
 from tuner.evaluate.best_fit import comparison_of, controller_flown
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import FlightErrors
+from tuner.evaluate.rmse import AxesRmse, FlightErrors
 from tuner.exporters.target import target_of
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
-from tuner.result import AxesRmse, EffectiveResult, LostTerm, PoseRmse
+from tuner.objective.space import Space
+from tuner.result import EffectiveResult, LostTerm, PoseRmse
 from tuner.search.estimation import OnProgress
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
@@ -37,9 +39,8 @@ from tuner.vehicle import (
     values_of,
     with_values,
 )
+from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import model_of
-from tuner.vehicle.space import Parameter, Space
-from tuner.wording.phrases import listed
 
 FORMAT = "sdf"
 """The export format that says what Gazebo has a place for."""

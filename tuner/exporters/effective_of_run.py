@@ -21,15 +21,16 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.files import ResultFile
 from tuner.core.versions import installed
 from tuner.evaluate.comparison import Comparison
+from tuner.evaluate.rmse import AxesRmse
 from tuner.exporters.effective import STAGES, pose_rmse
 from tuner.exporters.refly import recordings_of
 from tuner.exporters.simulators import Simulator
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.job_flights import Recording
 from tuner.objective.segments import OFFSETS
-from tuner.result import AxesRmse, EffectiveResult, LostTerm, PoseRmse, Run
+from tuner.result import EffectiveResult, LostTerm, PoseRmse, Run
 from tuner.search.continuation import grow
 from tuner.search.estimation import stages_of
+from tuner.search.job_flights import Recording
 from tuner.search.optimiser import Free
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning

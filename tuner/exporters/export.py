@@ -27,9 +27,9 @@ from tuner.exporters.target import (
     not_carried,
     target_of,
 )
+from tuner.report.result_texts import what_is_exported, what_is_lost
 from tuner.result import EXPORTS, ExportRecord, ExportRecords, GateRecord, Run, read_run
 from tuner.vehicle import read_vehicle
-from tuner.wording.result import what_is_exported, what_is_lost
 
 FOLDER = EXPORTS
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Mapping
 
 from tuner.core.errors import InputError
+from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
 from tuner.exporters.draft import Draft, Gate
 from tuner.exporters.hover import hover_command, thrust_to_weight
-from tuner.result import RMSE_UNITS, AxesRmse, Run
+from tuner.result import Run
 from tuner.vehicle import VehicleFile
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.

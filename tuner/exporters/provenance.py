@@ -13,8 +13,8 @@ from tuner.core.errors import InputError
 from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.exporters.target import Target, quantity
 from tuner.result import EffectiveResult, Run
+from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, REGISTRY, VehicleFile, Written, values_of
-from tuner.wording.verdicts import judgement_in_words
 
 Refit = Callable[[Run, Simulator], tuple[VehicleFile, EffectiveResult] | None]
 """Finds the vehicle with which a simulator flies most like a run's; None where it is that one."""

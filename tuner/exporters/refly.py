@@ -11,14 +11,15 @@ from pydantic import ValidationError
 from tuner.config import JobFile, Settings
 from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
-from tuner.objective.job_flights import (
+from tuner.evaluate.rmse import AxesRmse
+from tuner.result import Run, RunResult
+from tuner.search.job_flights import (
     Recording,
     read_usable,
     with_conditions,
     with_inputs_late,
     with_offsets,
 )
-from tuner.result import AxesRmse, Run, RunResult
 from tuner.vehicle import ControllerFile, VehicleFile
 
 

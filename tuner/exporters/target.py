@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 
+from tuner.core import shipped
 from tuner.core.errors import ExportError, did_you_mean
 from tuner.exporters import targets
 from tuner.exporters.draft import Draft
@@ -111,8 +112,8 @@ def target_of(name: str) -> Target:
     ExportError
         There is none.
     """
-    if name not in targets.NAMES:
-        remedy = did_you_mean(name, targets.NAMES)
+    if name not in shipped.EXPORT_TARGETS:
+        remedy = did_you_mean(name, shipped.EXPORT_TARGETS)
         raise ExportError("--format", f"unknown export format '{name}'", remedy)
     target: Target = import_module(f"{targets.__name__}.{name.replace('-', '_')}").TARGET
     return target

@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import RecordingError
+from tuner.core.phrases import clause
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
@@ -25,7 +26,6 @@ from tuner.recordings.inertial import InertialFlight
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import model_of
 from tuner.wording.findings import remedy, sentence
-from tuner.wording.phrases import clause
 
 NUMBERS = (
     ("time_constant_up",),

@@ -16,10 +16,11 @@ from tuner.core.errors import ConfigError
 from tuner.core.findings import Code, Finding
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import measured
+from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
-from tuner.terms.candidates import Groups, candidate_groups, start_of
+from tuner.terms.candidates import candidate_groups, start_of
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, with_values
-from tuner.vehicle.space import extended
+from tuner.vehicle.selection_table import Groups
 
 ENOUGH = 0.9
 """Share of roll's and pitch's angular acceleration from which simulations tell inertia as well."""

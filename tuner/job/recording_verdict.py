@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from tuner.config import Options, Settings, settle
+from tuner.core.phrases import listed
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.inspection import Inspection
 from tuner.recordings.px4 import Advice, advice_of, settings_in_words
 from tuner.recordings.topics import read_sidecar
 from tuner.recordings.ulog import parameters_of
-from tuner.wording.phrases import listed
 
 
 @dataclass(frozen=True)
@@ -119,8 +119,13 @@ def _version() -> str:
     for folder in ("objective", "inertial", "config", "vehicle"):
         for file in sorted((tuner / folder).glob("*.py")):
             total.update(file.read_bytes())
-    for name in ("recording_decision.py", "recording_verdict.py"):
-        total.update((tuner / "job" / name).read_bytes())
+    for name in (
+        "job/recording_decision.py",
+        "job/recording_verdict.py",
+        "search/inlet_choice.py",
+        "search/job_flights.py",
+    ):
+        total.update((tuner / name).read_bytes())
     return total.hexdigest()
 
 

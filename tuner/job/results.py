@@ -25,15 +25,14 @@ from tuner.evaluate.best_fit import (
     offsets_of,
 )
 from tuner.evaluate.held_out import Validation
+from tuner.evaluate.rmse import RMSE_UNITS
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS, whole
 from tuner.objective.inlets import INLETS, window_seconds
-from tuner.objective.job_flights import Recording
 from tuner.objective.segments import OFFSETS
 from tuner.result import (
     BEST_FIT_FILE,
     EFFECTIVE_FILE,
-    RMSE_UNITS,
     CoefficientResult,
     EffectiveResult,
     Ending,
@@ -43,9 +42,9 @@ from tuner.result import (
     Status,
 )
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import Recording
 from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import Job
-from tuner.terms.selection_table import SelectionRow
 from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.uncertainty.sources import Sources
 from tuner.uncertainty.verdict import (
@@ -57,8 +56,9 @@ from tuner.uncertainty.verdict import (
     judge_impossible_inertia,
     judge_regressed,
 )
+from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
-from tuner.wording.verdicts import judgement_in_words
+from tuner.vehicle.selection_table import SelectionRow
 
 METRICS_FILE = "metrics.csv"
 CONTROLLER_FILE = "controller.yaml"

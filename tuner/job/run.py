@@ -17,15 +17,14 @@ from tuner.config import Options, Settings, settle
 from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.findings import Finding
+from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
-from tuner.disturbances.estimation import Examined, examined
 from tuner.equation_error.change import used_up_to_changes
 from tuner.evaluate.best_fit import vehicle_fitted
 from tuner.evaluate.compare import table_of
-from tuner.evaluate.cross_validation import cross_validate, jackknife_errors
-from tuner.evaluate.held_out import Validation, validate
+from tuner.evaluate.held_out import Validation, flights_worse, holding_better, validate
 from tuner.evaluate.input_lag import with_inputs_on_time
 from tuner.exporters.effective import Effective, effective_fit
 from tuner.exporters.effective_of_run import kept_effective
@@ -34,40 +33,34 @@ from tuner.exporters.refly import refly
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
 from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.explanation import Explanation
-from tuner.job.findings import (
-    finer_than_steps,
-    flights_worse,
-    ground_conflicts,
-    holding_better,
-    inputs_late,
-    turning_unexplained,
-    voltage_taken,
-)
 from tuner.job.folder import folder_for
+from tuner.job.listener import SILENT, Listener
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
-from tuner.objective.job_flights import as_logged, read_usable
 from tuner.report import render, write_search, write_traces
 from tuner.report.background import BackgroundDrawing
+from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.search.estimation import OnProgress, parameters_of
+from tuner.search.explanation import Explanation
+from tuner.search.findings import inputs_late, turning_unexplained, voltage_taken
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import Iteration
-from tuner.search.listener import SILENT, Listener
+from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import Progress
 from tuner.terms.balanced_inertia import with_inputs_balanced
 from tuner.terms.first_terms import with_first_terms
+from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.bootstrap import bootstrap, check_bootstrap
+from tuner.uncertainty.cross_validation import cross_validate, jackknife_errors
+from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
-from tuner.uncertainty.ground import sources_of
+from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.sources import Sources
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
 from tuner.wording.findings import remedy, sentence
-from tuner.wording.phrases import clause
-from tuner.wording.result import export_sentence
 
 
 def run(
@@ -121,7 +114,7 @@ def run(
     folder = folder_for(out, resume=resume)
     job, findings = _prepared(settings)
     findings = (*logged, *findings)
-    explanation = Explanation(listener)
+    explanation = Explanation(listener.on_message)
     _check(findings, explanation, force=force)
     found, (selected, fitted, examination) = _fitted(
         job,

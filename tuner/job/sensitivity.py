@@ -16,10 +16,10 @@ from tuner.design.next_flight_json import Proposals
 from tuner.evaluate.best_fit import comparison_of
 from tuner.job.examination_files import write_knowledge, write_next_flight
 from tuner.objective.alternatives import alternatives_of
-from tuner.objective.job_flights import as_logged, read_usable
 from tuner.report import render
 from tuner.report.record import About, Recording, write_traces
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
 from tuner.search.unfitted import unfitted
 from tuner.uncertainty.estimates import Uncertainty

@@ -25,9 +25,9 @@ from tuner.objective.criterion import (
 )
 from tuner.objective.segments import OFFSETS, Segments
 from tuner.objective.simulator import MEMORY, Simulator
+from tuner.objective.space import Space
 from tuner.objective.tunable import Tunable, tunable_of
 from tuner.vehicle.model import Model
-from tuner.vehicle.space import Space
 
 
 class Objective(eqx.Module):

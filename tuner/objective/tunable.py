@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from tuner.objective.space import Coordinates, Space
 from tuner.vehicle.model import Model, coefficients_in, with_coefficients
-from tuner.vehicle.space import Coordinates, Space
 
 
 class Tunable(eqx.Module):

@@ -19,8 +19,8 @@ from rich.text import Text
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError
 from tuner.recordings.cache import cached, digest, load, store
+from tuner.recordings.note_texts import damage_sentence, note_in_words
 from tuner.recordings.notes import Cause, Damage, Note
-from tuner.wording.notes import damage_sentence, note_in_words
 
 if TYPE_CHECKING:
     from tuner.recordings.topics import TopicMap

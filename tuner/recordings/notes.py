@@ -1,6 +1,6 @@
 """What reading a recording found, changed or lost, as codes and numbers.
 
-Sentences are made from them in `tuner.wording.notes`.
+Sentences are made from them in `tuner.recordings.note_texts`.
 """
 
 from __future__ import annotations

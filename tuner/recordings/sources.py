@@ -11,10 +11,10 @@ from typing import Literal
 from tuner.core.errors import RecordingError
 from tuner.recordings.columns import recognised
 from tuner.recordings.formats import is_tabular
+from tuner.recordings.note_texts import reason_in_words
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
-from tuner.wording.notes import reason_in_words
 
 NAMED = 12
 """Columns that a note names, at most."""

@@ -11,16 +11,17 @@ from enum import StrEnum
 from pathlib import Path
 
 from tuner.core.findings import Code, Finding
+from tuner.core.phrases import listed
+from tuner.evaluate.rmse import AxesRmse
 from tuner.ground.bench_json import BenchRecord
+from tuner.ground.texts import bench_in_words
+from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
-from tuner.result import AxesRmse, FlightResult, RunResult
+from tuner.result import FlightResult, RunResult
 from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.uncertainty.verdict import Verdict
-from tuner.wording.bench import bench_in_words
+from tuner.uncertainty.verdict_texts import verdict_in_words
 from tuner.wording.findings import remedy, sentence
-from tuner.wording.phrases import listed
-from tuner.wording.result import metres, simulator_lacks
-from tuner.wording.verdicts import verdict_in_words
 
 AT_NOISE = 1.5
 """Times the noise up to which what remains of a flight is called noise."""

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from tuner.core.disk import write_text
 from tuner.core.spans import span
+from tuner.design.texts import proposals_in_words
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
 from tuner.report.outcome import (
@@ -26,7 +27,6 @@ from tuner.report.outcome import (
 from tuner.report.paper import write_plots
 from tuner.report.section import Section
 from tuner.report.sections import sections_of
-from tuner.wording.proposals import proposals_in_words
 
 REPORT_FILE = "report.html"
 

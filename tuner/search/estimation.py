@@ -11,19 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.findings import Code, Finding
-from tuner.job.findings import findings_at, unmatched
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.checkpoint import fingerprint, load, save
 from tuner.search.continuation import grow
+from tuner.search.findings import findings_at, unmatched
 from tuner.search.fitted import Fitted, Outcome, by_flight
 from tuner.search.loop import with_loop
 from tuner.search.optimiser import Free
 from tuner.search.problem import Job
 from tuner.search.progress import Progress, beginning, criterion_of, point_of
 from tuner.search.stages import Stage, left, plan
-from tuner.vehicle.space import Parameter
+from tuner.vehicle.coefficient import Parameter
 
 CHECKPOINT = "checkpoint.npz"
 SECOND_CHECKPOINT = "checkpoint_hybrid.npz"

@@ -27,13 +27,13 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
+from tuner.objective.space import Coordinates
 from tuner.search.normal_equations import (
     LinearResiduals,
     linear_residuals,
     normal_equations,
     residuals_at,
 )
-from tuner.vehicle.space import Coordinates
 
 
 class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]

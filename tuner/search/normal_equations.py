@@ -28,7 +28,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from tuner.objective.criterion import OFFSET_SD, Criterion, Point, SegmentSums
-from tuner.vehicle.space import Coordinates, Space
+from tuner.objective.space import Coordinates, Space
 
 RIDGE = 1e-13
 """Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""

@@ -12,19 +12,18 @@ from tuner.config import CHANNELS, JobFile, Settings
 from tuner.config.job import ErrorOf, InletName
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.equation_error.estimate import Estimate
-from tuner.evaluate.rmse import limits_of
 from tuner.objective.battery import require_voltage, with_reference_voltage
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by, window_seconds
-from tuner.objective.job_flights import Recording
 from tuner.objective.noise import noise_of
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Segments, on_time, segments_of, window_segments
+from tuner.objective.space import Space, space_of
 from tuner.objective.start import begins_gently
 from tuner.objective.voltage import VOLTAGE
 from tuner.recordings.flight import Flight
+from tuner.search.job_flights import Recording
 from tuner.vehicle import conditions
 from tuner.vehicle.model import model_of, schedule_of
-from tuner.vehicle.space import Space, space_of
 
 #: What a yaw spin that is not held level is compared by: nothing holds its position, so that a gust
 #: or a tilt of a hundredth of a degree moves it by metres without meaning anything.
@@ -34,6 +33,8 @@ OVERLAP = 0.5
 """Share of a window after which the next one begins, where windows start as recorded."""
 CLIPPED = 0.005
 """A recorded command below this is a rotor clipped low."""
+#: Closer to the simulator's floor than this, in m, a recording does not end at the floor.
+CLEARANCE = 0.3
 
 
 @dataclass(frozen=True)
@@ -265,3 +266,19 @@ def _weights(
             of_channel |= {name: 0.0 for name in CHANNELS if name not in SPIN_CHANNELS}
         weights[flight.name] = of_channel
     return weights
+
+
+def limits_of(flights: Sequence[Flight]) -> Limits:
+    """Return the space in which these flights count as flying.
+
+    The simulator's own arena, unless a recording itself comes near its floor or leaves it.
+    """
+    arena = Limits()
+    for flight in flights:
+        place = flight.series["position"]
+        inside = (place.time >= 0) & (place.time <= flight.duration)
+        places = place.values[inside & np.isfinite(place.values).all(axis=1)]
+        low = places[:, 2].min() < arena.floor + CLEARANCE
+        if low or np.abs(places).max() > arena.half_width / 2:
+            return AIRBORNE
+    return arena

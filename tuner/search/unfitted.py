@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.findings import Code, Finding
-from tuner.job.findings import UNMATCHED, loop_findings
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
+from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.loop import GAIN, loop_of, with_loop
 from tuner.search.problem import Job

@@ -119,7 +119,7 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
 
 def _listener(channel: IO[str]) -> Any:
     """Return a listener that writes what it hears as lines of JSON."""
-    from tuner.search.listener import Listener  # noqa: PLC0415
+    from tuner.job.listener import Listener  # noqa: PLC0415
 
     def say(kind: str, **content: object) -> None:
         channel.write(json.dumps({"kind": kind, **content}) + "\n")

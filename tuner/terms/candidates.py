@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -10,11 +10,9 @@ import jax.numpy as jnp
 from tuner.config import JobFile
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
+from tuner.objective.space import Space, extended
 from tuner.vehicle import COEFFICIENTS, VehicleFile, conditions, term_groups, values_of
-from tuner.vehicle.space import Space, extended
-
-Groups = Mapping[str, tuple[str, ...]]
-"""Group -> its coefficients."""
+from tuner.vehicle.selection_table import Groups
 
 PRESENT = 0.5
 """Probability a priori that a vehicle has an effect in a size that flights could tell."""

@@ -14,11 +14,11 @@ import numpy as np
 
 from tuner.objective.battery import require_voltage
 from tuner.objective.inlets import INLETS
+from tuner.objective.space import extended
 from tuner.objective.start import rests
 from tuner.recordings.flight import Flight
 from tuner.search.problem import Job
 from tuner.terms.candidates import candidate_groups, groups_named, start_of
-from tuner.vehicle.space import extended
 
 MARKERS = ("marker_offset", "marker_tilt")
 """The groups of the motion capture's frame."""

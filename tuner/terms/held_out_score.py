@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
 from tuner.objective.many_points import sums_at
+from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.terms.linear import Columns, Linear
-from tuner.vehicle.space import Space
 
 LONGEST_STEP = 1.0
 """Standard deviations of a prior that a coefficient may move in one linear step."""

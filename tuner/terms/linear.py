@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
 from tuner.objective.flight_batches import portion, portions
+from tuner.objective.information import BLOCK, FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
-from tuner.uncertainty.information import BLOCK, FisherInformation, information_from_jacobian
+from tuner.objective.space import Space
 from tuner.uncertainty.stretches import Stretches
 from tuner.vehicle import REGISTRY
-from tuner.vehicle.space import Parameter, Space
+from tuner.vehicle.coefficient import Parameter
 
 Array = NDArray[np.float64]
 Columns = NDArray[np.intp]

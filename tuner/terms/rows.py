@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tuner.terms.score import Score
-from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
 def row_of(

@@ -11,8 +11,8 @@ from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to im
 
 from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen, unit_diagonal
 from tuner.terms.linear import RIDGE, Columns, Linear
-from tuner.terms.selection_table import SelectionCode
 from tuner.terms.steady import chance_of_gusts
+from tuner.vehicle.selection_table import SelectionCode
 
 SIGNIFICANCE = 0.01
 """Probability with which chance alone would add any term at all, over all candidates together."""

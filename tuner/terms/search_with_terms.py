@@ -15,9 +15,10 @@ from tuner.search.estimation import OnProgress, search
 from tuner.search.fitted import Fitted
 from tuner.search.point_estimate import PointEstimate
 from tuner.search.problem import Job
-from tuner.terms.candidates import Groups, candidate_groups, groups_around
+from tuner.terms.candidates import candidate_groups, groups_around
 from tuner.terms.selection import Selection
 from tuner.terms.selection_state import Selected
+from tuner.vehicle.selection_table import Groups
 
 
 def search_with_terms(

@@ -20,11 +20,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from tuner.job.findings import findings_at
+from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import Objective, with_conditions
 from tuner.search.estimation import OnProgress, free_offsets
-from tuner.search.extension import with_groups
+from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.optimiser import Free
@@ -32,7 +32,6 @@ from tuner.search.polish import polished, searched_again
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import (
-    Groups,
     coefficients_in,
     conditions_in,
     groups_in,
@@ -44,15 +43,15 @@ from tuner.terms.candidates import (
     with_terms,
 )
 from tuner.terms.doubt import in_doubt
+from tuner.terms.extension import with_groups
 from tuner.terms.held_out_score import predicted_losses, vector_after
 from tuner.terms.linear import linear_at
 from tuner.terms.rows import row_of
 from tuner.terms.score import Score, score, surviving
 from tuner.terms.selection_state import Selected, Standing, offsets_of
-from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import with_coefficients
-from tuner.wording.phrases import listed
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 MAX_ROUNDS = 4
 """Of additions; each round adds all that gain by more than chance, and prunes."""

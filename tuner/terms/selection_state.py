@@ -12,10 +12,9 @@ from jax import Array
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.terms.candidates import Groups
 from tuner.terms.linear import Linear
 from tuner.terms.score import EARNING
-from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 
 @dataclass(frozen=True)

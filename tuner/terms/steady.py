@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc  # scipy.stats takes a quarter of a second to import
 
+from tuner.objective.information import BLOCK
 from tuner.terms.linear import SECTIONS, Columns, Linear
-from tuner.uncertainty.information import BLOCK
 from tuner.uncertainty.stretches import STRETCH
 
 

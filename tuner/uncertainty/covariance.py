@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Inverse, scaled_root, symmetric_eigen
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.independent import IndependentErrors
-from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.stretches import Stretches, stretches_of
 
 Array = NDArray[np.float64]

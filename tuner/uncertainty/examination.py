@@ -14,11 +14,11 @@ from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
 from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
+from tuner.objective.information import FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
-from tuner.uncertainty.information import FisherInformation, information_from_jacobian
 from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.whiteness import whiteness

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
+from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.size import Size, sized
-from tuner.vehicle.space import Parameter, Space
 
 
 @dataclass(frozen=True)

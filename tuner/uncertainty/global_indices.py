@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
+from tuner.objective.space import Space
 from tuner.uncertainty.global_sensitivity_json import (
     GlobalSensitivity,
     Method,
     SensitivityIndex,
 )
-from tuner.vehicle.space import Space
 
 Array = NDArray[np.float64]
 

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.core.findings import Code, Finding
 from tuner.core.numerics import scaled_inverse, unit_diagonal
+from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.sources import Sources
-from tuner.vehicle.space import Space
+from tuner.uncertainty.sources import CONFLICT, Sources
+from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]
 
@@ -70,3 +74,20 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
 def _error(space: Space, index: int, scaled: float, error: float) -> float:
     value = space.from_scaled(index, float(scaled))
     return float(error * value) if space.is_log[index] else float(error)
+
+
+def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
+    """Return the coefficients of which ground measurements and flights say different things."""
+    return tuple(
+        Finding(
+            Code.GROUND_CONFLICT,
+            "warning",
+            name,
+            {"deviation": source.deviation, "ground": source.ground, "flights": source.flights},
+            (COEFFICIENTS[name].unit,),
+        )
+        for name, source in sources.items()
+        if source.deviation is not None
+        and source.flights is not None
+        and abs(source.deviation) > CONFLICT
+    )

@@ -19,6 +19,7 @@ from types import MappingProxyType
 import jax.numpy as jnp
 import numpy as np
 
+from tuner.core.phrases import listed
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets
@@ -31,7 +32,6 @@ from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
 from tuner.vehicle import COEFFICIENTS
-from tuner.wording.phrases import listed
 
 MAX_ROUNDS = 3
 """Largest number of rounds: what is held may leave something else undetermined."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Inverse
-from tuner.uncertainty.information import FisherInformation
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.overdispersion import allowed_for
 
 Array = NDArray[np.float64]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Point
+from tuner.objective.space import Space
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.sensitivity_json import (
@@ -18,7 +19,6 @@ from tuner.uncertainty.sensitivity_json import (
     OutputSensitivity,
 )
 from tuner.vehicle import COEFFICIENTS
-from tuner.vehicle.space import Space
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import Inverse
-from tuner.uncertainty.information import BLOCK, FisherInformation
+from tuner.objective.information import BLOCK, FisherInformation
 
 Array = NDArray[np.float64]
 

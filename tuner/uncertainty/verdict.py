@@ -1,6 +1,6 @@
 """How well each coefficient is known, and why: codes and numbers, no prose.
 
-Sentences are made from them in `tuner.wording.verdicts`.
+Sentences are made from them in `tuner.uncertainty.verdict_texts`.
 """
 
 from __future__ import annotations

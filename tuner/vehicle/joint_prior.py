@@ -15,7 +15,7 @@ from tuner.core.numerics import symmetric_eigen, unit_diagonal
 from tuner.vehicle.registry import COEFFICIENTS
 
 if TYPE_CHECKING:
-    from tuner.vehicle.space import Parameter
+    from tuner.vehicle.coefficient import Parameter
 
 UNKNOWN = 1e-12
 """Share of the best-known direction's information below which a direction is not measured."""

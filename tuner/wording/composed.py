@@ -9,13 +9,21 @@ from collections.abc import Mapping
 from typing import Any
 
 from tuner.core.findings import Code, Finding
+from tuner.core.phrases import as_sentence, listed
+from tuner.recordings.note_texts import damage_sentence, note_in_words
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
-from tuner.wording.notes import damage_sentence, note_in_words
-from tuner.wording.phrases import as_sentence, listed
-from tuner.wording.result import PREDICTED
 
 WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
 """Words with which an error begins that says something of the file which it names."""
+
+
+PREDICTED: Mapping[str, str] = {
+    "position": "m",
+    "velocity": "m/s",
+    "attitude": "rad",
+    "body_rate": "rad/s",
+}
+"""What predictions are compared by, with its unit."""
 
 
 def recording(finding: Finding) -> str:

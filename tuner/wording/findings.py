@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable, Mapping
 
 from tuner.core.findings import Code, Finding
+from tuner.core.phrases import as_sentence, listed, percent, shorten
 from tuner.vehicle.motor_orders import order_in_words
 from tuner.wording import composed
-from tuner.wording.phrases import as_sentence, listed, percent, shorten
 
 GIVE_VEHICLE = (
     "Give the vehicle with --vehicle and what it weighs with --mass; tune new-vehicle writes a "

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tests.tuner.wording.test_findings import MADE

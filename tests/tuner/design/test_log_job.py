@@ -13,15 +13,15 @@ from tuner.design import log_job as next_log
 from tuner.design import next_log as design
 from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
-from tuner.objective.job_flights import recordings_of
+from tuner.design.texts import next_log_in_words
+from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
 from tuner.search.fitted import Fitted
+from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of, point_of
 from tuner.search.stages import WHOLE, Stage
-from tuner.uncertainty.information import information_at
 from tuner.vehicle import values_of
-from tuner.wording.proposals import next_log_in_words
 
 FREE = ("input_scaling", "zero_position_armed", "motor_constant", "inertia_xx")
 

@@ -18,11 +18,11 @@ from tuner.design.next_flight_json import (
     Proposals,
 )
 from tuner.design.ranking import rank_next_flights
+from tuner.design.texts import proposals_in_words
 from tuner.objective import flown
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.examination import Examination, examine
-from tuner.wording.proposals import proposals_in_words
 
 FREE = ("inertia_xx", "inertia_zz", "input_scaling", "motor_constant", "moment_constant")
 ARENA = Arena(4.0, 3.0, 2.0)

@@ -8,8 +8,8 @@ import numpy as np
 
 from tuner.disturbances.disturbances import LEAST, MOST, STRENGTHS
 from tuner.disturbances.information import hidden, with_hidden, with_strengths
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.estimates import _shares
-from tuner.uncertainty.information import FisherInformation
 
 NAMES = ("inertia_xx", "estimate_latency", "motor_constant", "moment_constant")
 FITTED, HIDDEN = 3, 1

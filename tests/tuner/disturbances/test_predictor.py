@@ -33,11 +33,11 @@ from tuner.disturbances.strengths import Likelihood, slopes_of, steps_from
 from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
 from tuner.objective.flight import beginning_of, trace_of
+from tuner.objective.information import information_at, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.information import information_at, information_from_jacobian
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

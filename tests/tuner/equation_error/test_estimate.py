@@ -14,8 +14,8 @@ from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.measured import measured
 from tuner.equation_error.turning import predicts_turning, regressors
 from tuner.job.accelerations import with_accelerations
-from tuner.objective.job_flights import read_usable
 from tuner.recordings.flight import Series
+from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 
 SECONDS = 7.0

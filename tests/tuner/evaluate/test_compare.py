@@ -14,7 +14,7 @@ from tuner.core.shipped import configs_folder
 from tuner.evaluate.compare import compare, table_of
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.comparison_table import write_table
-from tuner.objective.job_flights import Recording
+from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile
 
 LAPS = np.array([20.0, 40.0])

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from tuner.core.findings import Code
 from tuner.evaluate.input_lag import input_lag, with_inputs_on_time
-from tuner.objective.job_flights import Recording
 from tuner.objective.motor_order import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
+from tuner.search.job_flights import Recording
 
 RATE = 500.0
 

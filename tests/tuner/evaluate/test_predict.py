@@ -7,9 +7,9 @@ import pytest
 
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.predict import UNITS, hold, predict, summary
-from tuner.objective.job_flights import Recording
 from tuner.recordings.flight import Series
 from tuner.recordings.states import AROUND
+from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, with_values
 
 

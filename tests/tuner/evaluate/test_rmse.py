@@ -6,17 +6,11 @@ import pytest
 from sim_jax.crash import AIRBORNE, Limits
 from tuner.config import TrajectorySettings
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import (
-    FlightErrors,
-    SignalErrors,
-    laps_of,
-    limits_of,
-    rmse_of,
-    short_way,
-)
-from tuner.objective.job_flights import Recording
+from tuner.evaluate.rmse import FlightErrors, SignalErrors, laps_of, rmse_of, short_way
 from tuner.objective.trajectory import with_named_reference
 from tuner.recordings.flight import Series
+from tuner.search.job_flights import Recording
+from tuner.search.problem import limits_of
 from tuner.vehicle import ControllerFile, with_values
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")

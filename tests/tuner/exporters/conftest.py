@@ -3,14 +3,8 @@ from pathlib import Path
 import pytest
 
 from tuner.core.shipped import configs_folder
-from tuner.result import (
-    AxesRmse,
-    CoefficientResult,
-    FlightResult,
-    RunResult,
-    SearchResult,
-    read_run,
-)
+from tuner.evaluate.rmse import AxesRmse
+from tuner.result import CoefficientResult, FlightResult, RunResult, SearchResult, read_run
 from tuner.vehicle import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
 
 MODELS = Path(__file__).resolve().parents[3] / "examples" / "models"

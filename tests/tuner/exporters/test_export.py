@@ -9,9 +9,9 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export, exports_of_job
 from tuner.exporters.gates import check
+from tuner.report.result_texts import export_sentence
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
 from tuner.vehicle import read_vehicle
-from tuner.wording.result import export_sentence
 
 TODAY = date(2024, 5, 6)
 

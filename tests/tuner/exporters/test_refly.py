@@ -13,7 +13,6 @@ from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
 from tuner.exporters.simulators import GZ_SIM
-from tuner.objective.job_flights import Recording
 from tuner.result import (
     CoefficientResult,
     FlightResult,
@@ -21,6 +20,7 @@ from tuner.result import (
     SearchResult,
     read_run,
 )
+from tuner.search.job_flights import Recording
 from tuner.vehicle import (
     COEFFICIENTS,
     ControllerFile,

@@ -8,7 +8,7 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
 from tuner.core.errors import ExportError
-from tuner.core.shipped import configs_folder
+from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
 from tuner.exporters.draft import write
 from tuner.exporters.elsewhere import flier
@@ -16,12 +16,11 @@ from tuner.exporters.export import export_vehicle
 from tuner.exporters.hover import hover_command, thrust_to_weight
 from tuner.exporters.simulators import SIMULATORS
 from tuner.exporters.target import Choices, target_of
-from tuner.exporters.targets import NAMES
-from tuner.objective.job_flights import Recording
+from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
 
 TODAY = date(2024, 5, 6)
-EVERY = pytest.mark.parametrize("kind", NAMES)
+EVERY = pytest.mark.parametrize("kind", EXPORT_TARGETS)
 
 
 @EVERY

@@ -13,7 +13,7 @@ from tuner.cli import main
 from tuner.config import TrajectorySettings
 from tuner.exporters.export import export
 from tuner.exporters.refly import refly
-from tuner.ground.job import bench
+from tuner.job.ground import bench
 from tuner.report import render
 from tuner.result import read_run
 from tuner.vehicle import ControllerFile, read_vehicle, values_of

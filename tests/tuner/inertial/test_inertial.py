@@ -11,15 +11,15 @@ from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
 from tuner.core.findings import Code
 from tuner.evaluate.simulate import simulate
-from tuner.ground.job import least_noticed
 from tuner.inertial.ahead import rate_errors
-from tuner.inertial.job import fit_without_pose, without_pose
 from tuner.inertial.signals import stretches_of
-from tuner.objective.job_flights import read_usable
+from tuner.job.ground import least_noticed
+from tuner.job.without_pose import fit_without_pose, without_pose
 from tuner.recordings import inspect_recordings
 from tuner.recordings.inertial import read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE
+from tuner.search.job_flights import read_usable
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, with_values
 from tuner.wording.findings import one_line
 
@@ -152,7 +152,7 @@ def test_a_steady_moment_is_the_vehicles_trim(flown, tmp_path):
 def test_a_fit_that_foretells_worse_says_so(simulation, flown, tmp_path, monkeypatch):
     settings = settings_for(log_file(simulation, tmp_path / "log00"), flown)
     wrong = with_values(flown, {"inertia_xx": 2.0 * values_of(flown)["inertia_xx"]})
-    monkeypatch.setattr("tuner.inertial.job.vehicle_of", lambda *_: wrong)
+    monkeypatch.setattr("tuner.job.without_pose.vehicle_of", lambda *_: wrong)
     fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     (worse,) = [f for f in fitted.result.findings if f.code is Code.RATE_WORSE]
     assert worse.level == "warning"

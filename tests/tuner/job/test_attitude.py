@@ -9,13 +9,13 @@ from tests.tuner.job.test_windows import stage_for
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
 from tuner.core.findings import Code
-from tuner.objective import job_flights as recordings
-from tuner.objective.choice import choose_inlet
 from tuner.objective.inlets import TURNING
-from tuner.objective.job_flights import read_usable, recordings_of
 from tuner.objective.motor_order import MotorOrder
 from tuner.recordings.flight import Series
+from tuner.search import job_flights as recordings
 from tuner.search.estimation import search
+from tuner.search.inlet_choice import choose_inlet
+from tuner.search.job_flights import read_usable, recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle import ControllerFile, values_of, with_values
 from tuner.wording.findings import one_line
@@ -103,7 +103,7 @@ def test_auto_keeps_commands_that_explain_the_turns(dense, updated):
 
 def test_commands_of_motors_in_another_order_need_not_be_logged_faster(dense, updated, monkeypatch):
     seen = MotorOrder((1, 0, 3, 2), reversed_spins=None)
-    monkeypatch.setattr("tuner.objective.choice.motor_order", lambda *_: seen)
+    monkeypatch.setattr("tuner.search.inlet_choice.motor_order", lambda *_: seen)
     command = dense.series["command"]
     turned = Series(command.time, command.values[:, [1, 0, 3, 2]])
     choice = choose_inlet(

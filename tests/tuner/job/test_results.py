@@ -7,9 +7,9 @@ import pytest
 
 from tuner.config import JobFile
 from tuner.job.results import best_values
+from tuner.objective.space import space_of
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.controller import Filters
-from tuner.vehicle.space import space_of
 
 
 @pytest.mark.parametrize(("name", "initial"), [("gyro_cutoff", 30.0), ("fuselage_drag", 0.0)])

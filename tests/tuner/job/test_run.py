@@ -19,14 +19,14 @@ from tuner.config import Options
 from tuner.core.errors import InputError
 from tuner.core.findings import Code
 from tuner.evaluate.comparison import Comparison
+from tuner.job.listener import Listener
 from tuner.job.run import run
-from tuner.objective.job_flights import Recording
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.record import SearchRecord
 from tuner.result import read_run
-from tuner.search.listener import Listener
+from tuner.search.job_flights import Recording
 from tuner.search.point_estimate import PointEstimate
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
 from tuner.wording.findings import sentence

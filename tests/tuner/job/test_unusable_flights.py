@@ -12,18 +12,19 @@ from tuner.config import JobFile, Options, settle
 from tuner.config.job import Search
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.findings import Code, Finding
+from tuner.evaluate.held_out import flights_worse
 from tuner.job.check import said_once
-from tuner.job.findings import flights_worse, turning_unexplained
-from tuner.objective import job_flights as recordings_module
 from tuner.objective.inlets import INLETS, bypassed_by, freed_by
-from tuner.objective.job_flights import read_usable, recordings_of
 from tuner.objective.segments import window_segments
+from tuner.objective.space import space_of
 from tuner.objective.windows import windows_of
 from tuner.recordings.defects import HONEST, sticking_out
 from tuner.recordings.flight import Series
 from tuner.recordings.notes import Note, NoteCode
+from tuner.search import job_flights as recordings_module
+from tuner.search.findings import turning_unexplained
+from tuner.search.job_flights import read_usable, recordings_of
 from tuner.vehicle import ControllerFile
-from tuner.vehicle.space import space_of
 
 
 def without_commands(flight, begin, end):

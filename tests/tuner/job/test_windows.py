@@ -11,8 +11,8 @@ from tuner.core.errors import ConfigError
 from tuner.core.findings import Code
 from tuner.evaluate.comparison import Comparison
 from tuner.job.check import check
-from tuner.objective.job_flights import recordings_of
 from tuner.search.estimation import search
+from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import WHOLE, plan

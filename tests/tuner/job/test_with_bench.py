@@ -7,7 +7,7 @@ import yaml
 
 from tuner.config import Options
 from tuner.core.findings import Code
-from tuner.ground.job import bench
+from tuner.job.ground import bench
 from tuner.job.run import run
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"

@@ -11,8 +11,8 @@ import pytest
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
 from tuner.objective import flown
-from tuner.objective.job_flights import recordings_of
 from tuner.recordings.flight import Series
+from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 
 

@@ -6,10 +6,10 @@ import pytest
 
 from tests.tuner.uncertainty.making import criterion_of, problem, truth, with_data
 from tuner.objective.criterion import OFFSET_SD, Point, units_of
+from tuner.objective.information import information_at
 from tuner.objective.normal import with_conditions
 from tuner.objective.segments import OFFSETS
 from tuner.search.normal_equations import normal_equations
-from tuner.uncertainty.information import information_at
 from tuner.vehicle import conditions
 
 NAMES = ("wind_x", "wind_y", "battery_decline")

@@ -13,7 +13,7 @@ from lanes import joined
 from tuner.config import Options, settle
 from tuner.objective import flown
 from tuner.objective.flight import simulate_segments, trace_of
-from tuner.objective.job_flights import recordings_of
+from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle.model import with_coefficients
 

@@ -8,10 +8,10 @@ from sim_jax.inlet import Inlet, MixedInlet
 from tuner.config import CHANNELS
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
-from tuner.objective.choice import inlet_for
 from tuner.objective.initial_conditions import STATES
 from tuner.objective.inlets import INLETS
 from tuner.recordings.inspector import inlets
+from tuner.search.inlet_choice import inlet_for
 
 
 def test_every_inlet_is_named_alike_in_job_files_and_in_what_inspect_says():

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tuner.core.findings import Code
-from tuner.objective.choice import choose_inlet
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.recordings.flight import Series
+from tuner.search.inlet_choice import choose_inlet
 from tuner.vehicle import ControllerFile
 from tuner.wording.findings import one_line
 

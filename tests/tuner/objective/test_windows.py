@@ -8,13 +8,13 @@ import pytest
 from sim_jax.inlet import ActuatorInlet
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
-from tuner.objective.choice import inlet_for
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 from tuner.objective.segments import window_segments
 from tuner.objective.windows import windows_of
 from tuner.recordings.flight import Series
+from tuner.search.inlet_choice import inlet_for
 
 
 def test_windows_follow_each_other_and_start_where_the_flight_is(flight):

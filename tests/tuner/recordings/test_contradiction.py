@@ -17,12 +17,12 @@ from tuner.cli import main
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
 from tuner.core.findings import Code
-from tuner.objective.job_flights import read_usable
-from tuner.recordings import inspect_recordings, load_flights
+from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import contradiction, noted_contradiction
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
+from tuner.search.job_flights import load_flights, read_usable
 from tuner.wording.findings import one_line
 
 SHARED = Path(__file__).parents[4] / "shared"

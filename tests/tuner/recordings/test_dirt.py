@@ -14,11 +14,12 @@ from tests.tuner.recordings import making
 from tuner.config.trajectory_settings import TrajectorySettings
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_section import build
-from tuner.recordings import Flight, load_flight, load_flights
+from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import correct_frames
+from tuner.recordings.note_texts import damage_sentence
 from tuner.recordings.notes import Cause, Note, NoteCode
-from tuner.wording.notes import damage_sentence
+from tuner.search.job_flights import load_flights
 
 POSE = "/optitrack/pose"
 GYRO = "/mavros/imu/data"

@@ -11,8 +11,8 @@ import pytest
 from tests.tuner.recordings import making
 from tuner.core.errors import RecordingError
 from tuner.recordings import load_flight
+from tuner.recordings.note_texts import note_in_words
 from tuner.recordings.notes import NoteCode
-from tuner.wording.notes import note_in_words
 
 LAB = "name: lab\nformat: ros\nsignals:\n  attitude: /optitrack/pose\n"
 

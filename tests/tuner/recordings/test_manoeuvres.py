@@ -10,10 +10,10 @@ import pytest
 from tests.tuner.recordings import making
 from tuner.config import Options, settle
 from tuner.core.findings import Code
-from tuner.objective.job_flights import read_usable
-from tuner.recordings import inspect_recordings, load_flights
+from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
 from tuner.recordings.missions import FITTED, PIECE, Mission, manoeuvres
+from tuner.search.job_flights import load_flights, read_usable
 
 TIME = np.arange(0.0, 1000.0, 0.02)
 

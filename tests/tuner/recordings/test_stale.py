@@ -5,13 +5,13 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
-from tuner.objective.job_flights import recordings_of
 from tuner.recordings import inspect_recordings
 from tuner.recordings.defects import is_stale, without_stale
 from tuner.recordings.flight import Series
 from tuner.recordings.loader import load_flight
 from tuner.recordings.missions import find_missions
 from tuner.recordings.notes import NoteCode
+from tuner.search.job_flights import recordings_of
 
 TIME = np.arange(0, 10, 0.01)
 

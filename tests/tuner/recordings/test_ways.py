@@ -16,17 +16,17 @@ from tests.tuner.recordings import ways
 from tuner.config import Options, settle
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.objective.explained import levers
-from tuner.objective.job_flights import read_recordings
 from tuner.objective.motor_order import order_findings
 from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.inertial import read_inertial
 from tuner.recordings.matlab import MAGIC
+from tuner.recordings.note_texts import note_in_words
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.suggestion import suggested_map
+from tuner.search.job_flights import read_recordings
 from tuner.vehicle import read_vehicle, with_values
 from tuner.wording.findings import one_line
-from tuner.wording.notes import note_in_words
 
 COLUMNS = {
     "position": ("x", "y", "z"),

@@ -11,7 +11,7 @@ from tuner.core.shipped import find_config
 from tuner.design.log_proposal import LogProposal
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.forces import Forces
-from tuner.evaluate.rmse import FlightErrors, SignalErrors
+from tuner.evaluate.rmse import FlightErrors, PredictedErrors, SignalErrors
 from tuner.report import write_traces
 from tuner.report.record import SearchRecord, Start
 from tuner.result import (
@@ -21,13 +21,11 @@ from tuner.result import (
     FlightResult,
     LostTerm,
     PoseRmse,
-    PredictedErrors,
     RunResult,
     SearchResult,
     Status,
 )
 from tuner.search.iteration import Iteration
-from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.residual import Residual
 from tuner.uncertainty.sensitivity_json import (
@@ -38,8 +36,9 @@ from tuner.uncertainty.sensitivity_json import (
 )
 from tuner.uncertainty.tables import write_files
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
+from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
-from tuner.wording.verdicts import judgement_in_words
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 COMMAND = "tune --flights 'lab/*.bag' </script><b>"
 FLIGHTS = ("swing", "spin")

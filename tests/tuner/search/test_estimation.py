@@ -10,14 +10,15 @@ from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.config import JobFile
 from tuner.config.job import Search
 from tuner.core.findings import Code
-from tuner.job.findings import end_findings, finer_than_steps, unmatched, voltage_taken
+from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import starting_vectors
+from tuner.search.findings import end_findings, unmatched, voltage_taken
 from tuner.search.fitted import Outcome
 from tuner.search.loop import USUAL
 from tuner.search.stages import left, plan
+from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
-from tuner.vehicle.space import space_of
 from tuner.wording.findings import sentence
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")

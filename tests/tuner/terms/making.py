@@ -23,13 +23,13 @@ from tests.tuner.uncertainty.making import (
 from tuner.config import JobFile
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.normal import with_conditions
+from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
 from tuner.search.estimation import free_offsets
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.polish import polished
 from tuner.search.problem import Job
-from tuner.vehicle.space import space_of
 
 BASE = ("motor_constant", "rotor_drag_coefficient", "inertia_xx")
 

@@ -11,7 +11,7 @@ from tuner.config import JobFile
 from tuner.terms.candidates import with_terms
 from tuner.terms.first_terms import hover_tilt, with_first_terms
 from tuner.terms.search_with_terms import with_terms_selected
-from tuner.terms.selection_table import SelectionCode
+from tuner.vehicle.selection_table import SelectionCode
 
 MARKERS = {f"marker_{kind}_{axis}" for kind in ("offset", "tilt") for axis in "xyz"}
 TILT = (0.010, -0.016)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from tuner.objective.information import BLOCK, FisherInformation
 from tuner.terms.linear import linear_of
 from tuner.terms.score import score
-from tuner.uncertainty.information import BLOCK, FisherInformation
 
 FLIGHTS, SECONDS, WINDOW, STRIDE, RATE = 3, 24.0, 0.5, 0.25, 40
 

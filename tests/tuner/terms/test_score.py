@@ -9,7 +9,7 @@ from tuner.terms.held_out_score import lost_by_sections
 from tuner.terms.linear import Linear
 from tuner.terms.rows import row_of
 from tuner.terms.score import Score, _Gain, score, surviving
-from tuner.terms.selection_table import SelectionCode
+from tuner.vehicle.selection_table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))
 FLIGHTS, STRETCHES, SAMPLES = 4, 12, 200

@@ -9,16 +9,16 @@ from tests.tuner.terms.making import BASE, job_with, unfitted_with
 from tests.tuner.uncertainty.making import FLIGHTS
 from tuner.config import JobFile
 from tuner.objective.criterion import units_of
+from tuner.report.result_texts import selection_in_words
 from tuner.terms import search_with_terms as terms
 from tuner.terms import selection
 from tuner.terms.score import Score
 from tuner.terms.search_with_terms import with_terms_selected
 from tuner.terms.selection_state import Standing
-from tuner.terms.selection_table import SelectionCode
 from tuner.uncertainty.estimates import uncertainty_of
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import term_groups
-from tuner.wording.result import selection_in_words
+from tuner.vehicle.selection_table import SelectionCode
 
 DRAG = 0.03
 LINEAR = "linear_drag"

@@ -24,10 +24,10 @@ from tuner.core.shipped import find_config
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
+from tuner.objective.space import space_of
 from tuner.search.fitted import Fitted
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle
 from tuner.vehicle.model import model_of, schedule_of
-from tuner.vehicle.space import space_of
 
 NOISE = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 4.0}
 SECONDS = 6.0

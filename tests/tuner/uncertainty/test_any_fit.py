@@ -9,9 +9,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tuner.core.numerics import scaled_solve
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import _shares
-from tuner.uncertainty.information import FisherInformation
 from tuner.uncertainty.parts import left_out, spread_of
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import covariance_of
-from tuner.uncertainty.information import FisherInformation
 
 COUNT, BLOCKS, LENGTH = 3, 40, 25
 

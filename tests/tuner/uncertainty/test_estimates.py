@@ -8,10 +8,10 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
+from tuner.objective.information import information_at
 from tuner.objective.normal import Objective
 from tuner.search.normal_equations import normal_equations
 from tuner.uncertainty.estimates import Uncertainty, _lags, uncertainty_of
-from tuner.uncertainty.information import information_at
 from tuner.uncertainty.verdict import Verdict
 
 FREE = (

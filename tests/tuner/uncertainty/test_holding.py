@@ -7,10 +7,10 @@ import pytest
 
 from tuner.config import JobFile
 from tuner.terms.selection_state import Selected
-from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.uncertainty import holding
 from tuner.uncertainty.holding import stand_ins_of, with_undetermined_held
 from tuner.uncertainty.verdict import Reason, ReasonCode
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
 def known(error, *, beyond_noise, code=ReasonCode.WIDE_INTERVAL):

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from tuner.objective.alternatives import DRAWS, READINGS
-from tuner.uncertainty.information import FisherInformation
+from tuner.objective.information import FisherInformation
 from tuner.uncertainty.overdispersion import allowed_for
 from tuner.uncertainty.parts import left_out, noise_alone, spread_of
 

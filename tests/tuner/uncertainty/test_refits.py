@@ -8,11 +8,11 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.core.errors import ConfigError
-from tuner.evaluate.cross_validation import Fold, jackknife_errors
+from tuner.report.result_texts import refits_in_words
 from tuner.report.sections.tables import refits
 from tuner.uncertainty.bootstrap import check_bootstrap
+from tuner.uncertainty.cross_validation import Fold, jackknife_errors
 from tuner.uncertainty.refits import _counted
-from tuner.wording.result import refits_in_words
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 

@@ -11,6 +11,7 @@ from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
 from tuner.core.shipped import find_config
+from tuner.objective.space import space_of
 from tuner.objective.tunable import tunable_of
 from tuner.vehicle import (
     COEFFICIENTS,
@@ -23,7 +24,6 @@ from tuner.vehicle import (
 from tuner.vehicle.coefficient_table import markdown_table
 from tuner.vehicle.controller import Filters
 from tuner.vehicle.model import coefficients_in, model_of, with_coefficients
-from tuner.vehicle.space import space_of
 
 PAGE = Path(__file__).parents[3] / "docs" / "reference" / "coefficients.md"
 

@@ -12,13 +12,12 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.findings import Code
 from tuner.core.shipped import configs_folder, find_config
 from tuner.ground.bench_json import BenchRecord, joint_prior
-from tuner.job.findings import ground_conflicts
 from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.space import space_of
 from tuner.search.normal_equations import normal_equations
-from tuner.uncertainty.ground import sources_of
+from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.vehicle import ControllerFile, read_vehicle
 from tuner.vehicle.joint_prior import JointPrior
-from tuner.vehicle.space import space_of
 
 FREE = ("motor_constant", "moment_constant", "actuator_latency")
 COVARIANCE = np.array([[1e-4, -1e-4, 0.0], [-1e-4, 4e-4, 0.0], [0.0, 0.0, 1e-6]])

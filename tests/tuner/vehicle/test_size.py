@@ -15,10 +15,10 @@ from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
 from tuner.config import JobFile
 from tuner.core.shipped import find_config
+from tuner.objective.space import space_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, read_vehicle, with_values
 from tuner.vehicle.model import model_of
 from tuner.vehicle.size import Size, size_of, sized
-from tuner.vehicle.space import space_of
 
 SMALL = Size(mass=0.015, arm=0.2)
 LINEAR = [

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tuner.ground.bench_json import CurveRecord, ExperimentRecord
+from tuner.ground.texts import agreement_in_words, numbers_in_words, remarks_in_words
 from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section, Table
-from tuner.wording.bench import agreement_in_words, numbers_in_words, remarks_in_words
 
 USED = Look(PALETTE[2], marks=True)
 NOT_USED = Look(GREY, marks=True)

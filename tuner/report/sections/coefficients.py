@@ -7,20 +7,20 @@ from collections.abc import Mapping
 from tuner.core.numerics import Z95
 from tuner.report.chart import GREY, PALETTE, Bars, Chart, Panel
 from tuner.report.contents import Contents
+from tuner.report.result_texts import calibration_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.result import CoefficientResult
 from tuner.uncertainty.calibration import calibration
 from tuner.uncertainty.sensitivity_json import CoefficientKnowledge
 from tuner.uncertainty.verdict import Verdict
-from tuner.vehicle import COEFFICIENTS
-from tuner.wording.result import calibration_in_words
-from tuner.wording.verdicts import (
+from tuner.uncertainty.verdict_texts import (
     half_width_in_words,
     judgement_in_words,
     parts_in_words,
     reason_in_words,
     verdict_in_words,
 )
+from tuner.vehicle import COEFFICIENTS
 
 #: Verdict -> class of its badge, sign before it and colour of its bar.
 VERDICTS = {

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
 from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,
@@ -22,9 +23,10 @@ from tuner.report.chart import (
 )
 from tuner.report.contents import Contents
 from tuner.report.outcome import flights_table, outcome
+from tuner.report.result_texts import starts_in_words
 from tuner.report.section import Cell, Section, Table, short
-from tuner.result import RMSE_UNITS, AxesRmse, FlightResult, RunResult
-from tuner.wording.result import PREDICTED, starts_in_words
+from tuner.result import FlightResult, RunResult
+from tuner.wording.composed import PREDICTED
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
 CURVES = {

@@ -6,7 +6,7 @@ from tuner.report.chart import GREY, PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section, Table
 from tuner.uncertainty.sensitivity_json import Knowledge
-from tuner.wording.verdicts import direction_in_words
+from tuner.uncertainty.verdict_texts import direction_in_words
 
 NOTICED = 0.05
 """Percent of bias for each percent of a fixed coefficient below which it is not listed."""

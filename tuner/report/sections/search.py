@@ -5,8 +5,8 @@ from __future__ import annotations
 from tuner.report.chart import FITTED, INITIAL, PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.record import SearchRecord
+from tuner.report.result_texts import ending_sentence
 from tuner.report.section import Section
-from tuner.wording.result import ending_sentence
 
 
 def search(contents: Contents) -> Section | None:

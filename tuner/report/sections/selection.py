@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from tuner.core.phrases import listed
 from tuner.report.chart import FITTED, GREY, Bars, Chart, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Cell, Section, Table
-from tuner.terms.selection_table import SelectionRow
-from tuner.wording.phrases import listed
-from tuner.wording.result import (
+from tuner.report.result_texts import (
     gain_in_words,
     nearly_kept,
     reason_in_words,
     selection_in_words,
 )
+from tuner.report.section import Cell, Section, Table
+from tuner.vehicle.selection_table import SelectionRow
 
 
 def selection(contents: Contents) -> Section | None:

@@ -6,14 +6,14 @@ import hashlib
 import json
 from collections.abc import Mapping
 
+from tuner.core.phrases import percent
+from tuner.design.texts import next_log_in_words
 from tuner.report.contents import Contents
+from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.uncertainty.sources import CONFLICT
 from tuner.vehicle import COEFFICIENTS
 from tuner.wording.findings import remedy, sentence
-from tuner.wording.phrases import percent
-from tuner.wording.proposals import next_log_in_words
-from tuner.wording.result import effective_in_words, refits_in_words, rmse_in_words
 
 #: Settings that other sections show.
 SHOWN = ("command", "origin", "starts")

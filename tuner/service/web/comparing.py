@@ -8,14 +8,8 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from tuner.core.files import MAX_BYTES
-from tuner.result import (
-    RMSE_UNITS,
-    CoefficientResult,
-    ExportRecord,
-    ExportRecords,
-    FlightResult,
-    RunResult,
-)
+from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.result import CoefficientResult, ExportRecord, ExportRecords, FlightResult, RunResult
 from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError

@@ -9,13 +9,13 @@ from functools import cache
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
+from tuner.recordings.note_texts import damage_sentence, note_in_words
 from tuner.recordings.notes import Cause, Damage, Note
 from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
 from tuner.service.tables import State
 from tuner.service.web.words import on_the_web
-from tuner.wording.notes import damage_sentence, note_in_words
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
 STATES: Mapping[str, tuple[str, str]] = {

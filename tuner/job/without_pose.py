@@ -14,17 +14,17 @@ from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.core.findings import Code, Finding
 from tuner.ground.combine import Combination, combine
-from tuner.ground.job import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.ground.measurement import Measurement
 from tuner.ground.scales import value_of
 from tuner.inertial.ahead import AHEAD, rate_errors
 from tuner.inertial.measurement import agreeing, measure_inertial
 from tuner.inertial.signals import stretches_of
 from tuner.job.folder import folder_for
-from tuner.objective.job_flights import left_out_of
+from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
+from tuner.job.listener import SILENT, Listener
 from tuner.objective.motor_order import columns_of_rotors, in_rotor_order
 from tuner.recordings.inertial import InertialFlight, read_inertial
-from tuner.search.listener import SILENT, Listener
+from tuner.search.job_flights import left_out_of
 from tuner.vehicle import VehicleFile, values_of, with_values
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")

@@ -4,8 +4,8 @@ import re
 
 import pytest
 
+from tuner.recordings.note_texts import PASSED_OVER, TEXTS, note_in_words
 from tuner.recordings.notes import Note, NoteCode
-from tuner.wording.notes import PASSED_OVER, TEXTS, note_in_words
 
 NUMBERS = dict.fromkeys(
     ["seconds", "longest", "lower", "upper", "agreement", "upright", "left", "number", "drift"], 0.5

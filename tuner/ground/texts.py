@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from tuner.core.phrases import listed
 from tuner.ground.bench_json import BenchRecord, ExperimentRecord
 from tuner.ground.combine import DISAGREE
 from tuner.ground.scales import error_of, value_of
 from tuner.vehicle import COEFFICIENTS
-from tuner.wording.phrases import listed
 
 #: Code of a remark -> sentence, with its numbers in braces.
 REMARKS: Mapping[str, str] = {

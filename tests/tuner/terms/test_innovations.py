@@ -12,17 +12,17 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
-from tuner.disturbances import term_selection as innovations
-from tuner.disturbances.term_selection import Innovations
+from tuner.objective.information import FisherInformation
+from tuner.objective.space import Space, extended, space_of
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.terms.candidates import Groups, start_of
+from tuner.terms import innovations
+from tuner.terms.candidates import start_of
+from tuner.terms.innovations import Innovations
 from tuner.terms.linear import linear_of
 from tuner.terms.selection_state import Selected
-from tuner.terms.selection_table import SelectionCode, SelectionRow
-from tuner.uncertainty.information import FisherInformation
 from tuner.vehicle import COEFFICIENTS, term_groups
-from tuner.vehicle.space import Space, extended, space_of
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 NOBODY = cast(Any, None)
 MODEL = ("inertia_xx", "estimate_latency")

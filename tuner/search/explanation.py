@@ -9,7 +9,6 @@ from typing import TypeVar
 from tuner.core.errors import EngineError, OutputError
 from tuner.core.findings import Code, Finding
 from tuner.core.spans import span
-from tuner.search.listener import Listener
 from tuner.wording.findings import one_line
 
 logger = logging.getLogger(__name__)
@@ -22,8 +21,8 @@ class Explanation:
 
     Parameters
     ----------
-    listener
-        Gets each finding at once.
+    on_message
+        Gets each finding at once, as a line.
 
     Attributes
     ----------
@@ -31,8 +30,8 @@ class Explanation:
         Those that came up after the search.
     """
 
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
+    def __init__(self, on_message: Callable[[str], None]) -> None:
+        self._on_message = on_message
         self._told: list[Finding] = []
         self.findings: tuple[Finding, ...] = ()
 
@@ -41,7 +40,7 @@ class Explanation:
         for finding in findings:
             if finding not in self._told:
                 self._told.append(finding)
-                self._listener.on_message(one_line(finding))
+                self._on_message(one_line(finding))
 
     def notice(self, findings: Sequence[Finding]) -> None:
         """Keep findings, and report them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tuner.design.next_flight_json import Proposal, Proposals
-from tuner.wording.proposals import proposals_in_words
+from tuner.design.texts import proposals_in_words
 
 
 def proposals(*flights: Proposal) -> Proposals:

@@ -13,7 +13,7 @@ from tuner.core.errors import ConfigError
 from tuner.core.files import csv_text
 from tuner.engine import Report
 from tuner.evaluate.best_fit import best_values, comparison_of
-from tuner.result import RMSE_UNITS, AxesRmse
+from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import Iteration
 from tuner.search.problem import Job

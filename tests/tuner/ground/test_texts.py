@@ -4,7 +4,7 @@ from pathlib import Path
 import tuner.ground
 import tuner.inertial
 from tuner.ground.bench_json import ExperimentRecord, RemarkRecord
-from tuner.wording.bench import REMARKS, numbers_in_words, remarks_in_words
+from tuner.ground.texts import REMARKS, numbers_in_words, remarks_in_words
 
 
 def test_every_remark_has_a_sentence():

@@ -17,7 +17,6 @@ from tuner.core.errors import InputError, RecordingError, did_you_mean
 from tuner.core.findings import Code, Finding
 from tuner.core.yaml_section import build
 from tuner.objective.allocation import with_commands
-from tuner.objective.choice import FED_BY, choose_inlet
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.motor_order import flight_in_rotor_order
 from tuner.objective.speed_unit import with_speeds_in_si
@@ -29,6 +28,7 @@ from tuner.recordings.frames import noted_contradiction
 from tuner.recordings.loader import load_flights
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
+from tuner.search.inlet_choice import FED_BY, choose_inlet
 from tuner.vehicle import check_mixer
 from tuner.vehicle.px4_parameters import PLACES, with_parameters
 

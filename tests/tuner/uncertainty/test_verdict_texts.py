@@ -7,7 +7,7 @@ import pytest
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict
-from tuner.wording.verdicts import (
+from tuner.uncertainty.verdict_texts import (
     direction_in_words,
     judgement_in_words,
     parts_in_words,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from tuner.config import JobFile
 from tuner.core.errors import ConfigError
 from tuner.vehicle import ControllerFile, VehicleFile, initial_values
+from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.registry import COEFFICIENTS
 from tuner.vehicle.size import Size, size_of, sized
@@ -24,50 +23,6 @@ from tuner.vehicle.size import Size, size_of, sized
 AS_TABLED = Size()
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One coordinate of the search: a coefficient, or several that are tied to it.
-
-    Attributes
-    ----------
-    name
-        The coefficient; for a tie, the first of the group.
-    ratios
-        Coefficient -> multiple of this parameter's value (1 for itself).
-    initial, lower, upper
-        In the coefficient's unit; the initial value is strictly inside.
-    scale
-        ``log`` or ``linear``.
-    prior_mean, prior_sd
-        In the scaled coordinate (logarithm or number).
-    prior_given
-        Whether the user gave the prior, or it is the weak default that only steadies the search.
-    unit_step
-        The change of the scaled coordinate that is one in the search's coordinate, mid-range.
-    usual
-        Of a linear coefficient, how large it usually is for such a vehicle; zero for others.
-    moved
-        Set where the start lay on or outside a bound and was moved: the value that it had.
-    """
-
-    name: str
-    ratios: Mapping[str, float]
-    initial: float
-    lower: float
-    upper: float
-    scale: Literal["log", "linear"]
-    prior_mean: float
-    prior_sd: float
-    prior_given: bool
-    unit_step: float
-    usual: float = 0.0
-    moved: float | None = None
-
-    def scaled(self, value: float) -> float:
-        """Return the scaled coordinate of a value."""
-        return float(np.log(value)) if self.scale == "log" else value
 
 
 class Coordinates(eqx.Module):

@@ -1,13 +1,17 @@
 """The table of a selection, as ``result.json`` holds it: codes and numbers, no prose.
 
-Sentences are made from them in `tuner.wording.result`.
+Sentences are made from them in `tuner.report.result_texts`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
 
 from tuner.core.files import Part
+
+Groups = Mapping[str, tuple[str, ...]]
+"""Group -> its coefficients."""
 
 
 class SelectionCode(StrEnum):

@@ -40,6 +40,7 @@ from tuner.uncertainty.verdict import (
     ReasonCode,
     Verdict,
 )
+from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import (
     COEFFICIENTS,
     VehicleFile,
@@ -49,7 +50,6 @@ from tuner.vehicle import (
     write_vehicle,
 )
 from tuner.vehicle.size import size_of, sized
-from tuner.wording.verdicts import judgement_in_words
 
 RELINEARISATIONS = 3
 """Times that yaw spins are linearised at the motor constant that all experiments give."""

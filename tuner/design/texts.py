@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from tuner.core.phrases import listed
 from tuner.design.log_proposal import LogProposal
 from tuner.design.next_flight_json import Proposals
-from tuner.wording.phrases import listed
 
 WORTH_FLYING = 0.9
 """An interval that a flight leaves wider than this share of what it was is not narrowed."""

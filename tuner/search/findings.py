@@ -8,30 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.findings import Code, Finding, Level
-from tuner.evaluate.held_out import Validation
-from tuner.evaluate.predict import UNITS
-from tuner.evaluate.rmse import FlightErrors, Pose
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.segments import CLOCKS, OFFSETS
 from tuner.search.fitted import Fitted
 from tuner.search.loop import Loop, loop_of
 from tuner.search.problem import Job
-from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.sources import CONFLICT, Sources
-from tuner.vehicle import COEFFICIENTS, VehicleFile
+from tuner.vehicle import VehicleFile
 
 UNMATCHED = 10.0
 """Multiple of the noise beyond which a channel counts as not matched."""
-STEPS_MATTER = 1e-4
-"""s of a lag: the shipped recordings, flown at 4 kHz, are met best by one 0.14 ms too short."""
 EXPLAINED = 0.9
 """Share of the turning below which moments of inertia are said to be effective ones."""
 LATE = 1e-3
 """s of an input's lateness from which it is said."""
-WORSE = 0.01
-"""Share by which a flight may be met worse than before the fit without a word."""
-MET_BY: Mapping[Pose, str] = {"position": "m", "attitude": "degrees"}
-"""What a flight is judged by, with its unit."""
 ODD = 3.0
 """A flight this many times further off than the middle one is the odd one out."""
 
@@ -121,23 +110,6 @@ def loop_findings(job: Job, loop: Loop, level: Level) -> Iterator[Finding]:
         yield Finding(Code.SEES_MARKERS, level, "sees_markers", {"seen": loop.sees_markers})
 
 
-def ground_conflicts(sources: Mapping[str, Sources]) -> tuple[Finding, ...]:
-    """Return the coefficients of which ground measurements and flights say different things."""
-    return tuple(
-        Finding(
-            Code.GROUND_CONFLICT,
-            "warning",
-            name,
-            {"deviation": source.deviation, "ground": source.ground, "flights": source.flights},
-            (COEFFICIENTS[name].unit,),
-        )
-        for name, source in sources.items()
-        if source.deviation is not None
-        and source.flights is not None
-        and abs(source.deviation) > CONFLICT
-    )
-
-
 def inputs_late(job: Job) -> tuple[Finding, ...]:
     """Return which fitted flights' inputs are stamped late against their states."""
     return tuple(
@@ -170,69 +142,6 @@ def turning_unexplained(job: Job, explained: Mapping[str, float]) -> tuple[Findi
         return ()
     numbers = {"explained": share}
     return (Finding(Code.TURNING_UNEXPLAINED, "warning", "moments of inertia", numbers),)
-
-
-def flights_worse(
-    initial: Mapping[str, FlightErrors], best: Mapping[str, FlightErrors]
-) -> tuple[Finding, ...]:
-    """Return which flights the fitted coefficients meet worse than the initial ones, or crash.
-
-    Parameters
-    ----------
-    initial, best
-        Flight -> errors of a simulation with the initial, and with the fitted coefficients.
-    """
-    findings = []
-    for flight in best:
-        crashed = best[flight].crash_time
-        if crashed is not None:
-            if initial[flight].crash_time is None:
-                numbers = {"seconds": crashed}
-                findings.append(Finding(Code.FLIGHT_CRASHES, "warning", flight, numbers))
-            continue
-        for what, unit in MET_BY.items():
-            before, after = initial[flight].length(what), best[flight].length(what)
-            if after > (1.0 + WORSE) * before:
-                numbers = {"before": before, "after": after}
-                findings.append(
-                    Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
-                )
-    return tuple(findings)
-
-
-def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
-    """Return what of a flight is predicted no better than by leaving it as it is, in the mean."""
-    findings = []
-    for recording in job.recordings:
-        name = recording.flight.name
-        pairs = zip(
-            validation.predicted_best.get(name, ()),
-            validation.predicted_holding.get(name, ()),
-            strict=True,
-        )
-        for best, held in pairs:
-            numbers = {"seconds": best.seconds}
-            for quantity in UNITS:
-                of_best, of_held = getattr(best, quantity), getattr(held, quantity)
-                if of_best is not None and of_held is not None and of_best > of_held:
-                    numbers |= {quantity: of_best, f"{quantity}_held": of_held}
-            lost = tuple(quantity for quantity in UNITS if quantity in numbers)
-            if lost:
-                findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
-    return tuple(findings)
-
-
-def finer_than_steps(uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Warn of lags that are known more finely than simulators of other physics steps agree."""
-    names = [
-        name
-        for name, estimate in uncertainty.estimates.items()
-        if COEFFICIENTS[name].unit == "s" and 0.0 < estimate.std_error < STEPS_MATTER
-    ]
-    if not names:
-        return ()
-    numbers = {"seconds": STEPS_MATTER}
-    return (Finding(Code.FINER_THAN_STEPS, "warning", ", ".join(names), numbers),)
 
 
 def voltage_taken(given: VehicleFile, best: VehicleFile) -> tuple[Finding, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tuner.core.numerics import huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
-from tuner.vehicle.space import Space
+from tuner.objective.space import Space
 
 Array = NDArray[np.float64]
 

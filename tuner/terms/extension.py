@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.core.findings import Finding
-from tuner.job.findings import findings_at
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
+from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.loop import loop_of, with_loop
 from tuner.search.problem import Job
-from tuner.terms.candidates import Groups, coefficients_in, conditions_in, with_terms
+from tuner.terms.candidates import coefficients_in, conditions_in, with_terms
 from tuner.terms.selection_state import offsets_of
+from tuner.vehicle.selection_table import Groups
 
 
 def extended(

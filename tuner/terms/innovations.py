@@ -16,25 +16,19 @@ from numpy.typing import NDArray
 
 from tuner.disturbances.information import hidden
 from tuner.disturbances.predictor import Predictor
-from tuner.job.findings import findings_at
-from tuner.search.extension import extended, with_groups
+from tuner.objective.space import Space
+from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.terms.candidates import (
-    Groups,
-    is_stand_in,
-    names_in,
-    presence_of,
-    start_of,
-)
+from tuner.terms.candidates import is_stand_in, names_in, presence_of, start_of
 from tuner.terms.doubt import SMALLEST, in_doubt
+from tuner.terms.extension import extended, with_groups
 from tuner.terms.held_out_score import vector_after
 from tuner.terms.linear import Columns, Linear, linear_of
 from tuner.terms.score import EARNING, surviving
 from tuner.terms.selection_state import Selected
-from tuner.terms.selection_table import SelectionCode, SelectionRow
 from tuner.vehicle import conditions
-from tuner.vehicle.space import Space
+from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 Array = NDArray[np.float64]
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from tuner.core.numerics import Z95
+from tuner.core.phrases import listed, percent, quantity
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
 from tuner.vehicle import scale_group
-from tuner.wording.phrases import listed, percent, quantity
 
 NEGLIGIBLE = 0.01
 """Share of the largest part of an error below which another is not worth a word."""

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tuner.config import Settings
-    from tuner.evaluate.cross_validation import Fold
     from tuner.search.iteration import Iteration
     from tuner.search.point_estimate import PointEstimate
+    from tuner.uncertainty.cross_validation import Fold
 
 
 @dataclass(frozen=True)

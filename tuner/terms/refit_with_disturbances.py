@@ -10,28 +10,28 @@ from functools import partial
 import numpy as np
 
 from tuner.core.findings import Code, Finding
+from tuner.core.phrases import listed
 from tuner.disturbances.information import hidden
 from tuner.disturbances.predictor import Predictor
 from tuner.disturbances.recorded import FLIGHT_CONTROLLER
 from tuner.disturbances.refit import STEPS, with_least_innovations
-from tuner.disturbances.term_selection import Innovations
-from tuner.job.explanation import Explanation
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets
+from tuner.search.explanation import Explanation
 from tuner.search.fitted import Fitted
 from tuner.search.optimiser import Free
 from tuner.search.polish import polished
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.terms.candidates import is_stand_in
+from tuner.terms.innovations import Innovations
 from tuner.terms.search_with_terms import candidates_of
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.full_problem import full_problem_of
 from tuner.uncertainty.holding import with_undetermined_held
-from tuner.wording.phrases import listed
 
 CONTRADICTS = 4.0
 """Standard errors by which no coefficient may move. Those of least squares are known from some ten

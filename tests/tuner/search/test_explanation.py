@@ -10,11 +10,11 @@ import pytest
 from tuner.config import Options
 from tuner.core.errors import OutputError
 from tuner.core.findings import LARGEST, Code, Finding
-from tuner.disturbances import estimation as disturbances
-from tuner.job.explanation import Explanation
+from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.result import read_run
-from tuner.search.listener import SILENT, Listener
+from tuner.search.explanation import Explanation
+from tuner.terms import refit_with_disturbances as disturbances
 from tuner.uncertainty.verdict import Verdict
 from tuner.wording.findings import one_line
 
@@ -33,7 +33,7 @@ def fails(*_: object, **__: object) -> None:
 
 def test_a_part_that_fails_is_named_and_the_rest_goes_on() -> None:
     told: list[str] = []
-    explanation = Explanation(Listener(on_message=told.append))
+    explanation = Explanation(told.append)
     assert explanation.part("intervals", lambda: 1, None) == 1
     assert explanation.part("intervals", fails, None) is None
     (finding,) = explanation.findings
@@ -47,12 +47,12 @@ def test_a_full_disk_is_no_part() -> None:
         raise OutputError("folder", "is full", "free some space")
 
     with pytest.raises(OutputError):
-        Explanation(SILENT).part("intervals", full, None)
+        Explanation(lambda _: None).part("intervals", full, None)
 
 
 def test_a_finding_is_told_once() -> None:
     told: list[str] = []
-    explanation = Explanation(Listener(on_message=told.append))
+    explanation = Explanation(told.append)
     finding = Finding(Code.SPINS_REVERSED, "warning", "motors")
     explanation.tell([finding])
     explanation.notice([finding])

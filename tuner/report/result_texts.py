@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from math import sqrt
 from pathlib import Path
 
 from tuner.core.errors import InputError
-from tuner.result import (
-    RMSE_UNITS,
-    EffectiveResult,
-    Ending,
-    FlightResult,
-    LostTerm,
-    PoseRmse,
-    RunResult,
-)
-from tuner.terms.selection_table import SelectionCode, SelectionRow
+from tuner.core.phrases import listed, percent
+from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.result import EffectiveResult, Ending, FlightResult, LostTerm, PoseRmse, RunResult
 from tuner.uncertainty.calibration import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
-from tuner.wording.phrases import listed, percent
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 NEARLY = 0.01
 """Share of the loss from which a term that is left out is worth naming."""
@@ -210,15 +203,6 @@ def selection_in_words(rows: Sequence[SelectionRow]) -> str:
     if not kept:
         return "The flights do not call for any term beyond Gazebo's motor model."
     return f"Added to Gazebo's motor model: {listed(kept)}."
-
-
-PREDICTED: Mapping[str, str] = {
-    "position": "m",
-    "velocity": "m/s",
-    "attitude": "rad",
-    "body_rate": "rad/s",
-}
-"""What predictions are compared by, with its unit."""
 
 
 def starts_in_words(flights: Sequence[FlightResult]) -> tuple[str, ...]:

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tuner.config import JobFile
-from tuner.disturbances import estimation as disturbances
 from tuner.disturbances.disturbances import USUAL
-from tuner.disturbances.estimation import ROUGHLY, with_disturbances
 from tuner.disturbances.refit import STEPS
 from tuner.search.fitted import COLOURED, Fitted
 from tuner.search.problem import Job
+from tuner.terms import refit_with_disturbances as disturbances
+from tuner.terms.refit_with_disturbances import ROUGHLY, with_disturbances
 from tuner.terms.selection_state import Selected
 
 NOBODY = cast(Any, None)

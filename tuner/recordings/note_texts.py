@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from tuner.core.phrases import listed
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
-from tuner.wording.phrases import listed
 
 #: Code -> text with the note's count and numbers in braces; ``first`` and ``second`` for one of its
 #: names, ``others`` for all but the first, ``samples`` for the count with all signals,

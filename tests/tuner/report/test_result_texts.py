@@ -4,11 +4,7 @@ import pytest
 
 from benchmarks.calibration import KINDS
 from tests.tuner.exporters.test_export import EFFECTIVE
-from tuner.result import PoseRmse
-from tuner.terms.selection_table import SelectionCode, SelectionRow
-from tuner.uncertainty.calibration import LEVELS, Calibration, Held, calibration
-from tuner.vehicle import Written
-from tuner.wording.result import (
+from tuner.report.result_texts import (
     calibration_in_words,
     effective_in_words,
     gain_in_words,
@@ -17,6 +13,10 @@ from tuner.wording.result import (
     selection_in_words,
     what_is_lost,
 )
+from tuner.result import PoseRmse
+from tuner.uncertainty.calibration import LEVELS, Calibration, Held, calibration
+from tuner.vehicle import Written
+from tuner.vehicle.selection_table import SelectionCode, SelectionRow
 
 
 def test_the_second_answer_is_said_with_what_it_costs():

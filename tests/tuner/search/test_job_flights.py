@@ -7,7 +7,7 @@ import pytest
 
 from tuner.config import JobFile, Options, settle
 from tuner.core.errors import InputError, RecordingError
-from tuner.objective.job_flights import (
+from tuner.search.job_flights import (
     Recording,
     read_recordings,
     read_usable,
