@@ -10,7 +10,7 @@ from tuner.core import runtime
 REPORT = """
 import json, os
 {before}
-from tuner import runtime
+from tuner.core import runtime
 runtime.configure()
 import jax, jax.numpy as jnp
 print(json.dumps(dict(
