@@ -52,7 +52,7 @@ def counts(root: Path) -> dict[str, float]:
 
 def walk(recording: Path) -> dict[str, int]:
     """Return through which files a recording becomes a flight: files, stays, returns."""
-    from tuner.recordings.load import load_flight  # noqa: PLC0415 (the walk begins here)
+    from tuner.recordings.loader import load_flight  # noqa: PLC0415 (the walk begins here)
 
     stays: list[str] = []
 

@@ -21,7 +21,6 @@ from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
-from tuner.equation_error.change import used_up_to_changes
 from tuner.evaluate.best_fit import vehicle_fitted
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.held_out import Validation, flights_worse, holding_better, validate
@@ -48,6 +47,7 @@ from tuner.search.iteration import Iteration
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.search.problem import Job, job_of
 from tuner.search.progress import Progress
+from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.balanced_inertia import with_inputs_balanced
 from tuner.terms.first_terms import with_first_terms
 from tuner.terms.refit_with_disturbances import Examined, examined

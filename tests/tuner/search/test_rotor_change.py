@@ -8,10 +8,10 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.core.findings import Code
-from tuner.equation_error.change import WINDOW, change_of, used_up_to_changes
 from tuner.job.run import _prepared
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings
+from tuner.search.rotor_change import WINDOW, change_of, used_up_to_changes
 
 ROOT = Path(__file__).parents[3]
 BROKEN = 20.0
