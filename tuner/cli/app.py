@@ -43,6 +43,7 @@ COMMANDS = {
     "compare": (
         "Tabulate the RMSE of several coefficient sets on recordings; nothing is fitted.",
         "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --out c.html",
+        "tune compare --flights lab/*.bag --vehicle hovergames runs/x/best_fit.yaml --plot c.png",
     ),
     "export": (
         "Write the coefficients of a run, or of a vehicle file, for a simulator.",
@@ -62,7 +63,7 @@ COMMANDS = {
     ),
     "report": (
         "Render the report of a run again.",
-        "tune report runs/demo",
+        "tune report runs/demo --open",
     ),
     "bench": (
         "Estimate coefficients from ground measurements: pendulum, stands, steps, hovers, spins.",
@@ -102,8 +103,9 @@ COMMANDS = {
         "tune watch-folder lab/ --server http://lab:8000",
     ),
     "simulate": (
-        "Simulate a trajectory and write the flight as CSV or ROS 1 bag.",
+        "Simulate a trajectory and write the flight as CSV or ROS 1 bag, or draw it.",
         "tune simulate --vehicle hovergames_updated --trajectory circle --speed 3 --out c.csv",
+        "tune simulate --vehicle runs/x/best_fit.yaml --trajectory lemniscate --out l.png",
         "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
     ),
 }

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tuner.cli.options import (
     ControllerChoice,
@@ -16,6 +17,9 @@ from tuner.cli.options import (
     Topics,
 )
 
+if TYPE_CHECKING:
+    from tuner.evaluate.rmse import FlightErrors
+
 
 def compare(
     *,
@@ -27,6 +31,7 @@ def compare(
     namespace: Namespace = None,
     out: Annotated[list[Path] | None, Many] = None,
     laps: Switch = False,
+    plot: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate the recorded flights with several coefficient sets and tabulate the RMSE.
@@ -39,6 +44,8 @@ def compare(
         Write the table into these files: .csv, .json or .html.
     laps
         Show each lap on the terminal, too.
+    plot
+        Draw the position errors over time into this FILE.png, .svg or .pdf.
     """
     from tuner.cli.progress import listening
     from tuner.cli.tables import print_comparison
@@ -47,13 +54,24 @@ def compare(
     configure()
     from tuner.config import Options
     from tuner.evaluate.compare import compare as compare_vehicles
+    from tuner.report.figures import comparison_figure
+    from tuner.report.paper import check_figure, write_figure
+
+    written = list(out or ())
+    if plot is not None:
+        check_figure(plot)
+        written.append(plot)
+
+    def draw(flown: Mapping[str, Mapping[str, FlightErrors]]) -> None:
+        if plot is not None:
+            write_figure(comparison_figure(flown), plot)
 
     options = Options(
         flights, controller=controller, config=config, topics=topics, namespace=namespace
     )
     with listening(quiet=quiet) as listener:
         table, settings = compare_vehicles(
-            options, vehicle, out or (), on_message=listener.on_message
+            options, vehicle, out or (), on_flown=draw, on_message=listener.on_message
         )
     if not quiet:
-        print_comparison(table, settings, laps=laps, written=out or ())
+        print_comparison(table, settings, laps=laps, written=written)

@@ -35,7 +35,7 @@ def simulate(
     trajectory
         Fly this shape, such as circle, from rest; a name that does not exist lists all of them.
     out
-        Write FILE.csv, or FILE.bag with the topics of a MAVROS lab.
+        Write FILE.csv, or FILE.bag with the topics of a MAVROS lab; .png, .svg and .pdf draw it.
     radius
         Set the radius in m.
     omega
@@ -61,10 +61,17 @@ def simulate(
     from tuner.core.runtime import configure
 
     configure()
+    from tuner.core.errors import InputError
     from tuner.engine import engine_for
     from tuner.evaluate.plan import fly, grid_of
-    from tuner.evaluate.write import write_flights
+    from tuner.evaluate.write import Summary, summary_of, write_flights
+    from tuner.report.paper import SUFFIXES, check_figure, write_figure
 
+    drawn = out.suffix in SUFFIXES
+    if drawn and (sweep or forces):
+        raise InputError(out, "a figure is of one flight, without forces", "write a .csv")
+    if drawn:
+        check_figure(out)
     flights = fly(
         vehicle,
         controller,
@@ -83,6 +90,13 @@ def simulate(
         forces=forces is not None,
     )
     with engine_for(workers, cluster):
-        summaries = write_flights(flights, out, forces=forces)
+        if drawn:
+            from tuner.report.figures import flight_figure
+
+            flight = next(flights)
+            write_figure(flight_figure(flight, f"{vehicle}: {trajectory}"), out)
+            summaries: tuple[Summary, ...] = (summary_of(flight),)
+        else:
+            summaries = write_flights(flights, out, forces=forces)
     if not quiet:
         print_flights(summaries, out)

@@ -27,6 +27,7 @@ def compare(
     vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
     out: Sequence[Path] = (),
     *,
+    on_flown: Callable[[Mapping[str, Mapping[str, FlightErrors]]], None] = lambda _: None,
     on_message: Callable[[str], None] = lambda _: None,
 ) -> tuple[Table, Settings]:
     """Simulate recorded flights with several vehicles, and tabulate the RMSE of each.
@@ -39,6 +40,8 @@ def compare(
         Vehicle files or names of shipped ones; or label -> one of those, or a vehicle.
     out
         Files to write, by suffix .csv, .json or .html.
+    on_flown
+        Called with vehicle -> flight -> errors.
     on_message
         Called with a line on each flight that is left out, or simulated otherwise than asked.
 
@@ -64,7 +67,9 @@ def compare(
     for finding in (*logged, *noticed):
         on_message(one_line(finding))
     comparison = Comparison(recordings, settings.controller, window=settings.job.search.window)
-    table = table_of({label: comparison.fly(vehicle) for label, vehicle in sets.items()})
+    flown = {label: comparison.fly(vehicle) for label, vehicle in sets.items()}
+    table = table_of(flown)
+    on_flown(flown)
     for path in out:
         write_table(table, path)
     return table, settings

@@ -1,4 +1,4 @@
-"""Charts as files for papers: SVG, or PNG where a path ends so."""
+"""Charts as files: SVG for papers, or as what a path ends in."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tuner.core.disk import file_name, inside, make_folder, write_text
+from tuner.core.disk import check_file, file_name, inside, make_folder, whole_file, write_text
+from tuner.core.errors import InputError
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
 if TYPE_CHECKING:
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLOTS = "plots"
+SUFFIXES = (".png", ".svg", ".pdf")
+"""Of files that hold a figure."""
 WIDTH = 6.3
 """Inches: the text width of a page with usual margins."""
 LEGEND_COLUMNS = 5
@@ -46,9 +49,32 @@ def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
     with mpl.rc_context(SETTINGS):
         for chart in charts:
             path = plot_file(folder, chart)
-            write_text(path, _svg(chart))
+            write_text(path, _drawn(chart, "svg").decode())
             written.append(path)
     return tuple(written)
+
+
+def check_figure(path: Path) -> None:
+    """Refuse a file that no figure can be written to, before anything is computed.
+
+    Raises
+    ------
+    InputError
+        Its suffix is none of `SUFFIXES`, or it cannot be written.
+    """
+    if path.suffix not in SUFFIXES:
+        what = f"a figure cannot be written as '{path.suffix}'"
+        raise InputError(path, what, f"name one of {', '.join(SUFFIXES)}")
+    check_file(path)
+
+
+def write_figure(chart: Chart, path: Path) -> None:
+    """Write a chart into a file, as what its name ends in."""
+    import matplotlib as mpl  # noqa: PLC0415 (a second to import)
+
+    mpl.use("Agg", force=False)
+    with mpl.rc_context(SETTINGS), whole_file(path) as unfinished:
+        unfinished.write_bytes(_drawn(chart, path.suffix[1:]))
 
 
 def plot_file(folder: Path, chart: Chart) -> Path:
@@ -56,7 +82,7 @@ def plot_file(folder: Path, chart: Chart) -> Path:
     return inside(folder, f"{PLOTS}/{file_name(chart.key, '.svg')}")
 
 
-def _svg(chart: Chart) -> str:
+def _drawn(chart: Chart, kind: str) -> bytes:
     from matplotlib import pyplot as plt  # noqa: PLC0415
 
     count = len(chart.panels)
@@ -83,8 +109,9 @@ def _svg(chart: Chart) -> str:
         )
     if only_lines:
         _leave_margins(figure, legend_rows=math.ceil(len(names) / LEGEND_COLUMNS) if named else 0)
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Title": chart.title})
+    buffer = io.BytesIO()
+    dated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind, {})
+    figure.savefig(buffer, format=kind, dpi=200, metadata={"Title": chart.title, **dated})
     plt.close(figure)
     return buffer.getvalue()
 
