@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tuner.config import Options
-from tuner.config.job import Method
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
+from tuner.options import ExaminationOptions, Options, RecordingOptions, taking
 from tuner.recordings.loader import load_flight
 from tuner.result import Run, read_run
-from tuner.vehicle import ControllerFile, VehicleFile
+from tuner.vehicle import VehicleFile
 from tuner.vehicle_api import Named, export, simulate, text_of
 
 if TYPE_CHECKING:
@@ -32,68 +31,18 @@ __all__ = [
 ]
 
 
-def fit(
-    flights: Sequence[Named],
-    *,
-    holdout: Sequence[str] | None = None,
-    vehicle: Named | VehicleFile | None = None,
-    controller: Named | ControllerFile | None = None,
-    mass: float | None = None,
-    config: Named | None = None,
-    free: Sequence[str] | None = None,
-    fixed: Sequence[str] | None = None,
-    method: Method | None = None,
-    seed: int | None = None,
-    topics: Named | None = None,
-    namespace: str | None = None,
-    bench: Named | None = None,
-    out: Named | None = None,
-    resume: bool = False,
-    force: bool = False,
-    cross_validate: bool = False,
-    bootstrap: int | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
-) -> Run:
+@taking(Options)
+def fit(flights: Sequence[Named], **options: Any) -> Run:
     """Fit the coefficients of a vehicle to recordings, as ``tune --flights`` does.
 
     Parameters
     ----------
     flights
         Recordings, or globs.
-    holdout
-        Flights that are evaluated, never fitted.
-    vehicle
-        Where the search starts: a vehicle, its file, or the name of a shipped one.
-    controller
-        What flew: a controller, its file, or the name of a shipped one.
-    mass
-        kg, the weighed take-off mass instead of the vehicle's.
-    config
-        Job file; None takes the ``tune.yaml`` beside the flights, if there is one.
-    free, fixed
-        Coefficients: fit exactly the former, or the usual ones except the latter.
-    method, seed
-        Of the search.
-    topics, namespace
-        As of `load_flight`.
-    bench
-        Result folder of ``tune bench``: the search starts from its vehicle, with its prior.
-    out
-        Result folder; None makes one under ``runs/``.
-    resume
-        Whether to continue from the folder's checkpoint.
-    force
-        Whether to search even where the check before the search reports a failure.
-    cross_validate
-        Whether to fit without each flight in turn as well, into ``cross_validation.csv``, for the
-        jackknife's standard errors.
-    bootstrap
-        How many refits to flights drawn with replacement are made, into ``bootstrap.csv``, for the
-        standard errors that follow; None for none.
-    workers, cluster
-        Local processes, or the cluster file or scheduler, that compute what is independent; the
-        numbers are the same. A script that names them needs ``if __name__ == "__main__":``.
+    options
+        Those of `tune` by their names, as ``cross_validate=True``: all fields of `Options`. ``fit``
+        and ``fix`` are called ``free`` and ``fixed``; ``vehicle`` and ``controller`` may be such a
+        thing itself. A script that names ``workers`` needs ``if __name__ == "__main__":``.
 
     Returns
     -------
@@ -108,43 +57,24 @@ def fit(
     configure()
     from tuner.job.run import run  # noqa: PLC0415 (jax)
 
-    options = Options.of(
-        flights,
-        holdout=holdout,
-        vehicle=vehicle,
-        controller=controller,
-        mass=mass,
-        config=config,
-        fit=free,
-        fix=fixed,
-        method=method,
-        seed=seed,
-        topics=topics,
-        namespace=namespace,
-        bench=bench,
-    )
-    with engine_for(workers, cluster):
+    given = Options.of(flights, **options)
+    with engine_for(given.workers, given.cluster):
         folder, _ = run(
-            options,
-            out=None if out is None else Path(out),
-            resume=resume,
-            force=force,
-            cross_validated=cross_validate,
-            refits=bootstrap,
-            command=f"tuner.fit from Python: {options.flights}",
+            given,
+            out=given.out,
+            resume=given.resume,
+            command=f"tuner.fit from Python: {given.flights}",
         )
     return read_run(folder)
 
 
+@taking(RecordingOptions)
 def compare(
     flights: Sequence[Named],
     vehicles: Sequence[Named] | Mapping[str, Named | VehicleFile],
     *,
-    controller: Named | ControllerFile | None = None,
-    config: Named | None = None,
-    topics: Named | None = None,
-    namespace: str | None = None,
     out: Sequence[Named] = (),
+    **options: Any,
 ) -> Table:
     """Simulate recorded flights with several vehicles and tabulate the RMSE, as ``tune compare``.
 
@@ -154,10 +84,10 @@ def compare(
         Recordings, or globs.
     vehicles
         Files or names of shipped ones; or label -> one of those, or a vehicle.
-    controller, config, topics, namespace
-        As of `fit`.
     out
         Files to write, by suffix .csv, .json or .html.
+    options
+        ``controller``, ``config``, ``topics`` and ``namespace`` as of `fit`.
 
     Returns
     -------
@@ -172,34 +102,23 @@ def compare(
     configure()
     from tuner.evaluate.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
-    options = Options.of(
-        flights, controller=controller, config=config, topics=topics, namespace=namespace
-    )
+    given = RecordingOptions.of(flights, **options)
     labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
     sets: dict[str, str | VehicleFile] = {k: text_of(v) for k, v in labelled.items()}
-    table, _ = compare_vehicles(options, sets, [Path(path) for path in out])
+    table, _ = compare_vehicles(Options(**vars(given)), sets, [Path(path) for path in out])
     return table
 
 
+@taking(ExaminationOptions)
 def sensitivity(
     flights: Sequence[Named],
     *,
-    vehicle: Named | VehicleFile | None = None,
-    controller: Named | ControllerFile | None = None,
-    mass: float | None = None,
-    config: Named | None = None,
-    free: Sequence[str] | None = None,
-    fixed: Sequence[str] | None = None,
-    topics: Named | None = None,
-    namespace: str | None = None,
     arena: Sequence[float] | None = None,
     global_method: Literal["morris", "sobol"] | None = None,
     samples: int | None = None,
     span: float = 30.0,
     profile: Sequence[str] | None = None,
-    out: Named | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
+    **options: Any,
 ) -> SensitivityResult:
     """Report what recordings say about each coefficient of a vehicle, as ``tune sensitivity`` does.
 
@@ -207,10 +126,6 @@ def sensitivity(
     ----------
     flights
         Recordings, or globs.
-    vehicle, controller, mass, config, topics, namespace
-        As of `fit`; nothing is fitted, held-out flights are examined like the others.
-    free, fixed
-        Coefficients that are judged as if they were fitted together, as of `fit`.
     arena
         m from wall to wall along x and y, about the origin, and up: what the next flight must fit
         into. None takes what the recorded flights took, and a little more.
@@ -222,10 +137,10 @@ def sensitivity(
         Percent by which coefficients are varied for them where the job file gives no bounds.
     profile
         Coefficients whose likelihood is profiled: the others are fitted again along a grid.
-    out
-        Folder that tables and report are written into; None makes one under ``runs/``.
-    workers, cluster
-        As of `fit`.
+    options
+        ``vehicle``, ``controller``, ``mass``, ``config``, ``free``, ``fixed``, ``topics``,
+        ``namespace``, ``out``, ``workers`` and ``cluster`` as of `fit`. Nothing is fitted: the
+        coefficients that would be are judged, and held-out flights examined like the others.
 
     Returns
     -------
@@ -243,20 +158,10 @@ def sensitivity(
     from tuner.job.folder import folder_for  # noqa: PLC0415
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
-    options = Options.of(
-        flights,
-        vehicle=vehicle,
-        controller=controller,
-        mass=mass,
-        config=config,
-        fit=free,
-        fix=fixed,
-        topics=topics,
-        namespace=namespace,
-    )
-    with engine_for(workers, cluster):
+    given = ExaminationOptions.of(flights, **options)
+    with engine_for(given.workers, given.cluster):
         return examine_vehicle(
-            options,
+            Options(**vars(given)),
             SensitivityRequest(
                 arena=arena,
                 global_method=global_method,
@@ -264,8 +169,8 @@ def sensitivity(
                 span=span / 100.0,
                 profiles=tuple(profile or ()),
             ),
-            out=folder_for(None if out is None else Path(out)),
-            command=f"tuner.sensitivity from Python: {options.flights}",
+            out=folder_for(given.out),
+            command=f"tuner.sensitivity from Python: {given.flights}",
         )
 
 

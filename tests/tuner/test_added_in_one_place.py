@@ -1,18 +1,22 @@
 """What is added in one place is seen all the way through.
 
 A coefficient is its row in the registry, a force is its function in the tuple of terms, an export
-target is a module: nothing else knows of them beforehand. No row of an effect is without its use.
+target is a module, an option is a field with its help: nothing else knows of them beforehand. No
+row of an effect is without its use.
 """
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import ModuleType
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from annotated_types import Interval
+from cyclopts import App
 
 import tuner
 from sim_jax.environment import Environment
@@ -24,12 +28,15 @@ from sim_jax.terms import total
 from sim_jax.vector import Vec3
 from tests.memory import BEFORE_A_FIT, give_back
 from tests.sim_jax.support import controller, moving_start, vec, vehicle, wobble
-from tuner.config import JobFile
+from tuner.cli.options import EACH, EVERY
+from tuner.config import JobFile, settle
 from tuner.core import shipped
-from tuner.core.errors import ExportError
+from tuner.core.errors import ConfigError, ExportError
+from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.write import write_flights
 from tuner.exporters.draft import Draft, differences
 from tuner.exporters.target import Target, registered
+from tuner.options import FILES, Options
 from tuner.recordings.inspection import inspect_recordings
 from tuner.vehicle import (
     EFFECTS,
@@ -77,6 +84,41 @@ def sail_drag(vehicle, motion, rotor_speed, air):  # noqa: ARG001 (all terms tak
     v = air.velocity
     speed = safe_sqrt(v.x * v.x + v.y * v.y + v.z * v.z)
     return Wrench(v * (-vehicle.effects[NAME] * speed), Vec3.zeros(v.x))
+
+
+@dataclass(frozen=True, kw_only=True)
+class MoreOptions(Options):
+    """Those of `tune`, and one more, of which the job file has a key."""
+
+    starts: Annotated[int, Interval(ge=1, le=8)] | None = None
+    """Search from this many points."""
+
+
+def test_an_option_is_one_field_for_the_command_line_python_the_job_file_and_http(tmp_path, capsys):
+    app = App(name="tune", default_parameter=EVERY, result_action="return_value")
+
+    @app.default
+    def command(*, options: Annotated[MoreOptions, EACH]):
+        return options
+
+    app(["--help"])
+    assert "--starts INT Search from this many points." in " ".join(capsys.readouterr().out.split())
+    bag = tmp_path / "a.bag"
+    bag.touch()
+    (tmp_path / "tune.yaml").write_text("search: {starts: 2, seed: 7}\n")
+    typed = app(["--flights", str(bag), "--starts", "3"])
+    assert typed == MoreOptions.of([bag], starts=3)
+    settled = settle(typed).job.search
+    assert (settled.starts, settled.seed) == (3, 7)
+    with pytest.raises(ConfigError, match="command line: starts is 9; it should be at most 8"):
+        settle(MoreOptions.of([bag], starts=9))
+    with pytest.raises(ConfigError, match=r"stats: is no option; did you mean 'starts'\?"):
+        MoreOptions.of([bag], stats=3)
+    of_http = section_of(MoreOptions, leaving=FILES)
+    assert build(of_http, {"starts": 3}, "the request").starts == 3
+    with pytest.raises(ConfigError, match="starts is '3'; it should be a whole number"):
+        build(of_http, {"starts": "3"}, "the request")
+    assert not set(FILES) & set(of_http.model_fields)
 
 
 @pytest.fixture

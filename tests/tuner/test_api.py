@@ -19,10 +19,14 @@ from tuner.vehicle import ControllerFile, with_values
 
 #: Function -> its command, and what each calls by another name or has alone.
 PEERS = {
-    api.fit: (tune_command, {"free": "fit", "fixed": "fix"}, {"quiet", "dry_run", "profile"}),
-    api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps"}),
+    api.fit: (
+        tune_command,
+        {"free": "fit", "fixed": "fix"},
+        {"quiet", "verbose", "dry_run", "profile"},
+    ),
+    api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps", "plot"}),
     api.simulate: (simulate_command, {"grid": "sweep"}, {"quiet", "out"}),
-    api.sensitivity: (sensitivity_command, {"free": "fit", "fixed": "fix"}, {"quiet"}),
+    api.sensitivity: (sensitivity_command, {"free": "fit", "fixed": "fix"}, {"quiet", "verbose"}),
     api.export: (export_command, {}, {"quiet"}),
 }
 

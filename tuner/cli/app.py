@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from cyclopts import App
 
+from tuner.cli.options import EVERY
 from tuner.cli.tune import tune
 
 SUMMARY = "Fit the coefficients of a multirotor simulator to recorded flights."
@@ -26,6 +27,7 @@ app = App(
     help=SUMMARY,
     help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
     help_format="plaintext",
+    default_parameter=EVERY,
     version=version,
     result_action="return_value",
     exit_on_error=False,

@@ -6,16 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tuner.cli.options import (
-    ControllerChoice,
-    Flights,
-    JobChoice,
-    Many,
-    Namespace,
-    Quiet,
-    Switch,
-    Topics,
-)
+from tuner.cli.options import EACH, Quiet
+from tuner.options import Options, RecordingOptions
 
 if TYPE_CHECKING:
     from tuner.evaluate.rmse import FlightErrors
@@ -23,14 +15,10 @@ if TYPE_CHECKING:
 
 def compare(
     *,
-    flights: Flights,
-    vehicle: Annotated[list[str], Many],
-    controller: ControllerChoice = None,
-    config: JobChoice = None,
-    topics: Topics = None,
-    namespace: Namespace = None,
-    out: Annotated[list[Path] | None, Many] = None,
-    laps: Switch = False,
+    recordings: Annotated[RecordingOptions, EACH],
+    vehicle: list[str],
+    out: list[Path] | None = None,
+    laps: bool = False,
     plot: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
@@ -52,7 +40,6 @@ def compare(
     from tuner.core.runtime import configure
 
     configure()
-    from tuner.config import Options
     from tuner.evaluate.compare import compare as compare_vehicles
     from tuner.report.figures import comparison_figure
     from tuner.report.paper import check_figure, write_figure
@@ -66,9 +53,7 @@ def compare(
         if plot is not None:
             write_figure(comparison_figure(flown), plot)
 
-    options = Options(
-        flights, controller=controller, config=config, topics=topics, namespace=namespace
-    )
+    options = Options(**vars(recordings))
     with listening(quiet=quiet) as listener:
         table, settings = compare_vehicles(
             options, vehicle, out or (), on_flown=draw, on_message=listener.on_message

@@ -7,21 +7,23 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from tuner.cli.options import Namespace, Switch, Topics, VehicleChoice
+from tuner.cli.options import EACH
+from tuner.options import ReadingOptions
 
 
 def inspect(
     *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
-    topics: Topics = None,
-    namespace: Namespace = None,
-    vehicle: VehicleChoice = None,
-    json: Switch = False,
-    suggest: Switch = False,
+    reading: Annotated[ReadingOptions, EACH] = ReadingOptions(),
+    vehicle: str | None = None,
+    json: bool = False,
+    suggest: bool = False,
 ) -> None:
     """Report whether recordings can be fitted, how, and what they hold; nothing is simulated.
 
     Parameters
     ----------
+    vehicle
+        Start from this vehicle file or shipped vehicle. Default: the job file's, else hovergames.
     json
         Print JSON instead of tables.
     suggest
@@ -43,11 +45,10 @@ def inspect(
     from tuner.recordings.inspection import as_json, inspect_recordings
 
     inspections, errors = inspect_recordings(
-        find_flights(flights), topics=topics, namespace=namespace or ""
+        find_flights(flights), topics=reading.topics, namespace=reading.namespace or ""
     )
     verdicts = {
-        seen.path: verdict_of(seen, topics=topics, namespace=namespace, vehicle=vehicle)
-        for seen in inspections
+        seen.path: verdict_of(seen, **vars(reading), vehicle=vehicle) for seen in inspections
     }
     if json:
         print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from tuner.cli.options import FitOptions, Quiet, Switch
+from tuner.cli.options import EACH, Quiet
+from tuner.options import FitOptions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -81,15 +82,12 @@ def _folds(rows: list[dict[str, Any]]) -> Any:
 
 def submit(
     *,
-    fitted: FitOptions,
+    fitted: Annotated[FitOptions, EACH],
     server: Server = None,
     token: Token = None,
-    wait: Switch = False,
+    wait: bool = False,
     out: Path | None = None,
     name: str = "",
-    force: Switch = False,
-    cross_validate: Switch = False,
-    bootstrap: int | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Send recordings to a server and have it fit them, as tune does on this machine.
@@ -102,12 +100,6 @@ def submit(
         With --wait, fetch the result into this folder. Default: runs/ and the time.
     name
         Call the job so in lists.
-    force
-        Search even where the check before the search reports a failure.
-    cross_validate
-        Also fit without each flight in turn.
-    bootstrap
-        Also fit so many times to flights drawn with replacement.
     """
     from tuner.cli.progress import listening
     from tuner.cli.results import print_run
@@ -116,13 +108,7 @@ def submit(
 
     with client_of(server, token) as client:
         folder = folder_for(out) if wait else None
-        job = client.submit(
-            fitted.options(),
-            name=name,
-            force=force,
-            cross_validate=cross_validate,
-            bootstrap=bootstrap,
-        )
+        job = client.submit(fitted, name=name)
         if folder is None:
             print(job if quiet else f"job {job}: {client.url}/jobs/{job}")
             return
@@ -146,7 +132,7 @@ def jobs(
     vehicle: str | None = None,
     state: Literal["queued", "running", "done", "failed", "cancelled"] | None = None,
     after: str | None = None,
-    json: Switch = False,
+    json: bool = False,
 ) -> None:
     """List the jobs of a server, the newest first, fifty at a time.
 
@@ -260,7 +246,7 @@ def watch_folder(
     settle: Annotated[
         float, Parameter(help="Take a recording once it has not changed for s.")
     ] = 10,
-    once: Switch = False,
+    once: bool = False,
 ) -> None:
     """Submit a job whenever new recordings in a folder have settled.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from tuner.cli.options import Many
+from tuner.cli.options import EVERY
 
 if TYPE_CHECKING:
     from tuner.service.database import Database
@@ -26,6 +26,7 @@ serve = App(
     help="Run the tuning service: jobs of many people, over HTTP and as pages in a browser.",
     help_epilogue="\n".join(f"Example: {example}" for example in EXAMPLES),
     help_format="plaintext",
+    default_parameter=EVERY,
     result_action="return_value",
     exit_on_error=False,
     print_error=False,
@@ -52,7 +53,7 @@ def _serve(
     data: Data = None,
     database: DatabaseUrl = None,
     tokens: Literal["auto", "always"] = "auto",
-    allow_host: Annotated[tuple[str, ...], Many] = (),
+    allow_host: tuple[str, ...] = (),
     store: str | None = None,
     workers: int = 2,
     cluster: str | None = None,

@@ -5,15 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tuner.cli.options import Cluster, ControllerName, Many, Quiet, VehicleName, Workers
+from tuner.cli.options import EACH, Quiet
+from tuner.options import EngineOptions
 
 
 def simulate(
     *,
     trajectory: str,
     out: Path,
-    vehicle: VehicleName = "hovergames",
-    controller: ControllerName = "hovergames",
+    vehicle: str = "hovergames",
+    controller: str = "hovergames",
     radius: float = 2.0,
     omega: float = 0.7,
     speed_scale: float = 2.1,
@@ -21,11 +22,10 @@ def simulate(
     yaw_rate: float = 2.0,
     duration: float = 40.0,
     rate: float = 100.0,
-    sweep: Annotated[list[str] | None, Many] = None,
+    sweep: list[str] | None = None,
     precision: Literal["float32", "float64"] = "float64",
     forces: Path | None = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
+    engine: Annotated[EngineOptions, EACH] = EngineOptions(),
     quiet: Quiet = False,
 ) -> None:
     """Simulate a vehicle and its controller on a trajectory, and write the flight.
@@ -36,6 +36,10 @@ def simulate(
         Fly this shape, such as circle, from rest; a name that does not exist lists all of them.
     out
         Write FILE.csv, or FILE.bag with the topics of a MAVROS lab; .png, .svg and .pdf draw it.
+    vehicle
+        Fly this vehicle file, or a shipped one by its name, say hovergames_updated.
+    controller
+        Fly this controller file, or a shipped one by its name: hovergames_sitl.
     radius
         Set the radius in m.
     omega
@@ -89,7 +93,7 @@ def simulate(
         precision=precision,
         forces=forces is not None,
     )
-    with engine_for(workers, cluster):
+    with engine_for(engine.workers, engine.cluster):
         if drawn:
             from tuner.report.figures import flight_figure
 

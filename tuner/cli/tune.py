@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
+from typing import Annotated
 
-from tuner.cli.options import TYPED, Cluster, FitOptions, Quiet, Switch, Verbose, Workers
+from tuner.cli.options import EACH, TYPED, Quiet, Verbose
+from tuner.options import Options
 
 
 def tune(
     *,
-    fitted: FitOptions,
-    bench: str | None = None,
-    out: Path | None = None,
-    resume: Switch = False,
-    force: Switch = False,
-    cross_validate: Switch = False,
-    bootstrap: int | None = None,
-    workers: Workers = None,
-    cluster: Cluster = None,
-    dry_run: Switch = False,
-    profile: Switch = False,
+    options: Annotated[Options, EACH],
+    dry_run: bool = False,
+    profile: bool = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -28,21 +21,6 @@ def tune(
 
     Parameters
     ----------
-    bench
-        Start from these ground measurements, a result folder of tune bench, and fit with them as
-        prior; conflicts between ground and flights are named.
-    out
-        Write into this result folder. Default: runs/ and the time.
-    resume
-        Continue the search that was interrupted in the result folder from its checkpoint.
-    force
-        Search even where the check before the search reports a failure.
-    cross_validate
-        Also fit without each flight in turn, tabulate how well the other flights predict it, and
-        give the jackknife's standard errors.
-    bootstrap
-        Also fit so many times to flights drawn with replacement, and give the standard errors that
-        follow.
     dry_run
         Print the job script that would bring the cluster file's workers, and do nothing.
     profile
@@ -52,7 +30,7 @@ def tune(
     from tuner.engine.choose import engine_for, job_script_for
 
     if dry_run:
-        print(job_script_for(cluster))
+        print(job_script_for(options.cluster))
         return
     began = time.perf_counter()
     from tuner.cli.profile import profiling
@@ -69,7 +47,6 @@ def tune(
             from tuner.job.run import run
             from tuner.job.without_pose import fit_without_pose, without_pose
 
-        options = fitted.options(bench=bench)
         with span("reading"):
             bare, left_out = without_pose(settle(options))
         if bare:
@@ -78,7 +55,7 @@ def tune(
                     settle(options),
                     bare,
                     left_out=left_out,
-                    out=out,
+                    out=options.out,
                     listener=listener,
                     command=TYPED.get(),
                 )
@@ -86,14 +63,12 @@ def tune(
             if not quiet:
                 print_bench(measured, verbose=verbose)
             return
-        with engine_for(workers, cluster), listening(quiet=quiet, verbose=verbose) as listener:
+        engine = engine_for(options.workers, options.cluster)
+        with engine, listening(quiet=quiet, verbose=verbose) as listener:
             folder, result = run(
                 options,
-                out=out,
-                resume=resume,
-                force=force,
-                cross_validated=cross_validate,
-                refits=bootstrap,
+                out=options.out,
+                resume=options.resume,
                 listener=listener,
                 command=TYPED.get(),
             )

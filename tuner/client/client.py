@@ -10,14 +10,12 @@ from urllib.parse import quote
 
 from tuner.client.connection import Connection
 from tuner.client.job_request import request_of
-from tuner.config import Options
-from tuner.config.job import Method
 from tuner.core.disk import inside, make_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.job.folder import folder_for
+from tuner.options import FitOptions, taking
 from tuner.recordings.cache import digest
 from tuner.result import Run, read_run
-from tuner.vehicle import ControllerFile, VehicleFile
 
 Named = str | Path
 Event = tuple[str, dict[str, Any]]
@@ -40,39 +38,22 @@ class Client:
         """The server's address."""
         return self._connection.url
 
+    @taking(FitOptions)
     def fit(
-        self,
-        flights: Sequence[Named],
-        *,
-        holdout: Sequence[str] | None = None,
-        vehicle: Named | VehicleFile | None = None,
-        controller: Named | ControllerFile | None = None,
-        mass: float | None = None,
-        config: Named | None = None,
-        free: Sequence[str] | None = None,
-        fixed: Sequence[str] | None = None,
-        method: Method | None = None,
-        seed: int | None = None,
-        topics: Named | None = None,
-        namespace: str | None = None,
-        out: Named | None = None,
-        force: bool = False,
-        cross_validate: bool = False,
-        bootstrap: int | None = None,
-        name: str = "",
+        self, flights: Sequence[Named], *, name: str = "", out: Named | None = None, **options: Any
     ) -> Run:
         """Fit the coefficients of a vehicle to recordings, on the server; see `tuner.fit`.
 
         Parameters
         ----------
-        flights, holdout, vehicle, controller, mass, config, free, fixed, method, seed, topics
+        flights
             As of `tuner.fit`; paths are of this machine.
-        namespace, force, cross_validate, bootstrap
-            As well.
-        out
-            Folder that the result is fetched into; None makes one under ``runs/``.
         name
             What the server's lists call the job.
+        out
+            Folder that the result is fetched into; None makes one under ``runs/``.
+        options
+            As of `tuner.fit`: all fields of `tuner.options.FitOptions`.
 
         Returns
         -------
@@ -86,35 +67,17 @@ class Client:
         ServerFaultError
             The server could not finish the job.
         """
-        options = Options.of(
-            flights,
-            holdout=holdout,
-            vehicle=vehicle,
-            controller=controller,
-            mass=mass,
-            config=config,
-            fit=free,
-            fix=fixed,
-            method=method,
-            seed=seed,
-            topics=topics,
-            namespace=namespace,
-        )
+        given = FitOptions.of(flights, **options)
         folder = folder_for(None if out is None else Path(out))
-        job = self.submit(
-            options, name=name, force=force, cross_validate=cross_validate, bootstrap=bootstrap
-        )
+        job = self.submit(given, name=name)
         self.wait(job)
         return self.fetch(job, folder)
 
     def submit(
         self,
-        options: Options,
+        options: FitOptions,
         *,
         name: str = "",
-        force: bool = False,
-        cross_validate: bool = False,
-        bootstrap: int | None = None,
         key: str | None = None,
         on_upload: Callable[[Path], None] = lambda _: None,
     ) -> str:
@@ -126,8 +89,6 @@ class Client:
             As of the command line.
         name
             What lists call the job.
-        force, cross_validate, bootstrap
-            As of `fit`.
         key
             Of this submission: with the same key there is one job; None makes one up.
         on_upload
@@ -139,8 +100,7 @@ class Client:
             The input cannot be used, or the server cannot be reached.
         """
         recordings, request = request_of(options)
-        request |= {"name": name, "force": force, "cross_validate": cross_validate}
-        request["bootstrap"] = bootstrap
+        request["name"] = name
         request["recordings"] = [self.upload(path, on_upload) for path in recordings]
         names = (path.name for path in recordings)
         request["names"] = dict(zip(request["recordings"], names, strict=True))

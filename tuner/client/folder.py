@@ -11,10 +11,10 @@ from pathlib import Path
 from pydantic import Field
 
 from tuner.client.client import Client
-from tuner.config import Options
 from tuner.core.disk import exists
 from tuner.core.errors import InputError
 from tuner.core.files import ResultFile
+from tuner.options import FitOptions
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +97,7 @@ def _new(folder: Path) -> dict[Path, Marks]:
 def _submit(client: Client, folder: Path, new: Mapping[Path, Marks]) -> str:
     """Submit one job of recordings, note it, and return a line about it."""
     key = hashlib.sha256(repr([(str(path.absolute()), *new[path]) for path in new]).encode())
-    job = client.submit(Options([str(path) for path in new]), key=key.hexdigest())
+    job = client.submit(FitOptions([str(path) for path in new]), key=key.hexdigest())
     before = Submitted.read_if_any(folder) or Submitted()
     done = {path.name: (*marks, job) for path, marks in new.items()}
     Submitted(recordings=before.recordings | done).write(folder)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from tuner.config import Options, Settings, settle
+from tuner.config import Settings, settle
 from tuner.core.errors import InputError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
 from tuner.core.yaml_section import Section
+from tuner.options import FILES, FitOptions, Options
 from tuner.recordings.topics import load_topic_map
 from tuner.vehicle import read_vehicle
 from tuner.vehicle.controller import read_controller
 
 
-def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:
+def request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any]]:
     """Return the recordings to send and the request that names them, but for their ids.
 
     Raises
@@ -24,21 +26,14 @@ def request_of(options: Options) -> tuple[tuple[Path, ...], dict[str, Any]]:
     InputError
         A path, name or value cannot be used, here or by any server.
     """
-    if options.bench is not None:
-        raise InputError("--bench", "is not taken by a server", "fit with tune on this machine")
-    settled = settle(options)
-    request: dict[str, Any] = {
-        "settings": _settings(settled),
-        "vehicle": _content_of("vehicles", read_vehicle, options.vehicle, Path()),
-        "controller": _content_of("controllers", read_controller, options.controller, Path()),
-        "holdout": None if options.holdout is None else list(settled.job.holdout),
-        "mass": options.mass,
-        "fit": None if options.fit is None else list(options.fit),
-        "fix": None if options.fix is None else list(options.fix),
-        "method": options.method,
-        "seed": options.seed,
-        "namespace": options.namespace,
-    }
+    settled = settle(Options(**vars(options)))
+    names = (field.name for field in fields(FitOptions) if field.name not in FILES)
+    request = {name: getattr(options, name) for name in names}
+    request["settings"] = _settings(settled)
+    request["vehicle"] = _content_of("vehicles", read_vehicle, options.vehicle, Path())
+    request["controller"] = _content_of("controllers", read_controller, options.controller, Path())
+    if options.holdout is not None:
+        request["holdout"] = list(settled.job.holdout)
     if options.topics is not None:
         request["settings"]["topics"] = _topics(find_config("topics", options.topics, Path()))
     return settled.flights, {key: value for key, value in request.items() if value is not None}

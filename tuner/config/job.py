@@ -20,6 +20,7 @@ from tuner.core.yaml_section import (
     read_model,
     refuse,
 )
+from tuner.options import Method
 from tuner.vehicle import COEFFICIENTS, conditions, term_groups
 
 #: Recorded signals whose residuals a fit can weigh, in this order everywhere.
@@ -28,7 +29,6 @@ CHANNELS = ("position", "attitude", "body_rate", "rotor_speed", "command", "acce
 #: Where a recording can be fed into the simulated loop, the upstream places first.
 InletName = Literal["reference", "body_rate", "actuator", "rotor_speed", "attitude"]
 InletChoice = Literal["auto", InletName]
-Method = Literal["auto", "gradient", "cma", "hybrid"]
 ErrorOf = Literal["auto", "output", "prediction"]
 
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from pydantic import ValidationError
 
-from tuner.config.job import JobFile, Method, read_job
+from tuner.config.job import JobFile, Search, read_job
 from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.recording_paths import find_flights
 from tuner.core.shipped import Kind, find_config
 from tuner.core.validation import config_error
+from tuner.core.yaml_section import build, section_of
 from tuner.ground.bench_json import joint_prior
+from tuner.options import FILES, IN_JOB_FILE, Options
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.values import check_names, with_values
@@ -25,55 +27,6 @@ from tuner.vehicle.vehicle import VehicleFile, read_vehicle
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"
-
-
-@dataclass(frozen=True)
-class Options:
-    """The options of the command line; None stands for an option that was not given.
-
-    Attributes
-    ----------
-    flights
-        Recordings, or quoted globs.
-    holdout
-        Names or paths of flights that are evaluated, never fitted.
-    vehicle, controller
-        Paths, names of shipped files, or, from Python, what such a file holds.
-    mass
-        kg.
-    config
-        The job file.
-    fit, fix
-        Coefficients: exactly those to fit, or those to leave alone.
-    method, seed
-        Of the search.
-    topics, namespace
-        The topic map, and the prefix of the recorded topics.
-    bench
-        Result folder of ground measurements: the fit starts from its vehicle, and it is a prior.
-    """
-
-    flights: Sequence[str]
-    holdout: Sequence[str] | None = None
-    vehicle: str | VehicleFile | None = None
-    controller: str | ControllerFile | None = None
-    mass: float | None = None
-    config: str | None = None
-    fit: Sequence[str] | None = None
-    fix: Sequence[str] | None = None
-    method: Method | None = None
-    seed: int | None = None
-    topics: str | None = None
-    namespace: str | None = None
-    bench: str | None = None
-
-    @classmethod
-    def of(cls, flights: Sequence[str | Path], **given: Any) -> Options:
-        """Return options as a caller from Python gives them: paths may stand for text."""
-        words: dict[str, Any] = {
-            name: str(value) if isinstance(value, Path) else value for name, value in given.items()
-        }
-        return cls([str(path) for path in flights], **words)
 
 
 @dataclass(frozen=True)
@@ -113,7 +66,7 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     Parameters
     ----------
     options
-        Of the command line.
+        Of the command line, or as Python and HTTP give them.
     fits
         Whether a fit follows, for which some flight must not be held out.
 
@@ -122,6 +75,8 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     InputError
         A path, name or value cannot be used.
     """
+    given = {name: value for name, value in vars(options).items() if name not in FILES}
+    build(section_of(type(options), leaving=FILES), given, "command line")
     flights = find_flights(options.flights)
     job_path = Path(options.config).expanduser() if options.config else find_job_file(flights)
     job = read_job(job_path) if job_path else JobFile()
@@ -243,23 +198,27 @@ def _override(job: JobFile, options: Options, holdout: tuple[str, ...]) -> JobFi
     """Return the job file's settings with the command line's over them."""
     check_names(options.fit or (), "--fit")
     check_names(options.fix or (), "--fix")
-    changes: dict[str, object] = {"holdout": holdout}
     if options.fit is not None and options.fix is not None:
         raise ConfigError("--fit", "cannot stand beside --fix", "give one of them")
+    given = {
+        IN_JOB_FILE.get(option, option): value
+        for option, value in vars(options).items()
+        if value is not None and option not in FILES
+    }
+    changes: dict[str, object] = {key: given[key] for key in JobFile.model_fields if key in given}
+    changes |= {"holdout": holdout}
     if options.fit is not None:
         changes |= {"free": tuple(dict.fromkeys(options.fit)), "fixed": ()}
     elif options.fix is not None and job.free is not None:
-        changes["free"] = tuple(name for name in job.free if name not in options.fix)
+        changes |= {"free": tuple(name for name in job.free if name not in options.fix)}
+        del changes["fixed"]
     elif options.fix is not None:
         changes["fixed"] = tuple(dict.fromkeys((*job.fixed, *options.fix)))
-    if options.mass is not None:
-        changes["mass"] = options.mass
-    if options.namespace is not None:
-        changes["namespace"] = options.namespace
     if options.topics is not None:
         changes["topics"] = find_config("topics", options.topics, Path())
-    search = {"method": options.method, "seed": options.seed}
-    changes["search"] = job.search.replace(**{k: v for k, v in search.items() if v is not None})
+    changes["search"] = job.search.replace(
+        **{key: given[key] for key in Search.model_fields if key in given}
+    )
     return job.replace(**changes)
 
 

@@ -2,12 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Self,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from annotated_types import Ge, Gt
-from pydantic import AllowInfNan, BaseModel, ConfigDict, Strict, ValidationError, model_validator
+from pydantic import (
+    AllowInfNan,
+    BaseModel,
+    ConfigDict,
+    Strict,
+    ValidationError,
+    create_model,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 from tuner.core.errors import did_you_mean
@@ -85,3 +105,41 @@ def build(kind: type[M], values: Mapping[str, object], where: str) -> M:
         return kind.model_validate(values)
     except ValidationError as error:
         raise config_error(error, Path(where)) from None
+
+
+def section_of(options: type, *, leaving: Collection[str] = (), text: Any = str) -> type[Section]:
+    """Return a model that checks the fields of a dataclass.
+
+    Parameters
+    ----------
+    options
+        The dataclass.
+    leaving
+        Fields that are not the model's.
+    text
+        What stands for ``str``, as a shorter text.
+    """
+    hints = get_type_hints(options, include_extras=True)
+    chosen = {
+        field.name: (
+            _checked(hints[field.name], text),
+            ... if field.default is MISSING else field.default,
+        )
+        for field in fields(options)
+        if field.name not in leaving
+    }
+    return create_model(options.__name__, __base__=Section, **chosen)  # type: ignore[call-overload, no-any-return]
+
+
+def _checked(hint: Any, text: Any) -> Any:
+    """Return a type of which no value of another type is made."""
+    if hint is str:
+        return text
+    if hint in (bool, int, float):
+        return Annotated[hint, Strict()]
+    inner = [_checked(part, text) for part in get_args(hint)]
+    if get_origin(hint) is Annotated:
+        return Annotated[_checked(get_args(hint)[0], text), *hint.__metadata__]
+    if get_origin(hint) in (Union, UnionType):
+        return Union[*inner]
+    return tuple.__class_getitem__((inner[0], ...)) if get_origin(hint) is Sequence else hint

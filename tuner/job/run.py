@@ -53,7 +53,7 @@ from tuner.terms.first_terms import with_first_terms
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
-from tuner.uncertainty.bootstrap import bootstrap, check_bootstrap
+from tuner.uncertainty.bootstrap import bootstrap
 from tuner.uncertainty.cross_validation import cross_validate, jackknife_errors
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
@@ -68,9 +68,6 @@ def run(
     *,
     out: Path | None = None,
     resume: bool = False,
-    force: bool = False,
-    cross_validated: bool = False,
-    refits: int | None = None,
     listener: Listener = SILENT,
     command: str = "",
 ) -> tuple[Path, RunResult]:
@@ -84,12 +81,6 @@ def run(
         Result folder; None makes one under ``runs/`` named by the time.
     resume
         Go on from the folder's checkpoint.
-    force
-        Search although the check before it failed.
-    cross_validated
-        Also leave each fitted flight out in turn.
-    refits
-        How many refits to flights drawn with replacement are made; None for none.
     listener
         Whom to report to.
     command
@@ -107,15 +98,13 @@ def run(
     OutputError
         The result folder cannot be written to; a search goes on from there with ``resume``.
     """
-    if refits is not None:
-        check_bootstrap(refits)
     settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
     job, findings = _prepared(settings)
     findings = (*logged, *findings)
     explanation = Explanation(listener.on_message)
-    _check(findings, explanation, force=force)
+    _check(findings, explanation, force=options.force)
     found, (selected, fitted, examination) = _fitted(
         job,
         findings,
@@ -124,7 +113,7 @@ def run(
         listener,
         command=command,
         resume=resume,
-        force=force,
+        force=options.force,
     )
     job, drawing = selected.job, BackgroundDrawing()
     fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
@@ -177,15 +166,8 @@ def run(
         log = partial(what_to_log, job, fitted, examination.known, vehicle)
         next_log = explanation.part("what to log", log, next_log)
     result = written(effective, next_log)
-    if cross_validated or refits is not None:
-        result = _with_refits(
-            (job, fitted),
-            result,
-            folder,
-            cross_validated=cross_validated,
-            refits=refits,
-            listener=listener,
-        )
+    if options.cross_validate or options.bootstrap is not None:
+        result = _with_refits((job, fitted), result, folder, options, listener)
     if examination is not None:
         of_fit = folder, job, examination, fitted
         explanation.part("knowledge", partial(write_knowledge, *of_fit), None)
@@ -358,9 +340,7 @@ def _with_refits(
     fit: tuple[Job, Fitted],
     result: RunResult,
     folder: Path,
-    *,
-    cross_validated: bool,
-    refits: int | None,
+    options: Options,
     listener: Listener,
 ) -> RunResult:
     """Return the result with the standard errors of refits to other flights, and write it again."""
@@ -370,14 +350,14 @@ def _with_refits(
 
     jackknife: dict[str, float] = {}
     bootstrapped: dict[str, float] = {}
-    if cross_validated:
+    if options.cross_validate:
         with span("cross-validation"):
             folds = cross_validate(*fit, folder, on_iteration)
         listener.on_folds(folds)
         jackknife = jackknife_errors(folds)
-    if refits is not None:
+    if options.bootstrap is not None:
         with span("bootstrap"):
-            bootstrapped = bootstrap(*fit, refits, folder, on_iteration)
+            bootstrapped = bootstrap(*fit, options.bootstrap, folder, on_iteration)
     result = with_errors_of_refits(result, jackknife, bootstrapped)
     result.write(folder)
     return result

@@ -20,7 +20,7 @@ from typing import IO, Any
 from tuner.core.disk import digest_of, inside
 from tuner.result import RunResult
 from tuner.service.queue import Claim, Outcome
-from tuner.service.request import FLIGHTS, Asked
+from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits
 from tuner.service.store import Store, full_disk
 from tuner.service.tables import State
@@ -46,7 +46,7 @@ class UnwantedError(Exception):
     """The attempt holds its job no more, or its server is ending."""
 
 
-def prepare(folder: Path, claim: Claim, store: Store) -> Asked:
+def prepare(folder: Path, claim: Claim, store: Store) -> CheckedRequest:
     """Lay out the folder of a job, as far as an earlier attempt has not.
 
     Raises
@@ -54,7 +54,7 @@ def prepare(folder: Path, claim: Claim, store: Store) -> Asked:
     NoSpaceError
         The disk is full.
     """
-    asked = Asked.model_validate(claim.request)
+    asked = CheckedRequest.model_validate(claim.request)
     with full_disk():
         shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
         (folder / FLIGHTS).mkdir(parents=True)
@@ -67,7 +67,7 @@ def prepare(folder: Path, claim: Claim, store: Store) -> Asked:
 def attempt(
     folder: Path,
     claim: Claim,
-    asked: Asked,
+    asked: CheckedRequest,
     *,
     limits: Limits,
     cores: Sequence[int],

@@ -7,17 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from annotated_types import Interval, Len
+from annotated_types import Len
 from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
-from tuner.config import Options, settle
-from tuner.config.job import JobFile, Method
+from tuner.config import settle
+from tuner.config.job import JobFile
 from tuner.config.settings import is_among
 from tuner.core.disk import inside
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.shipped import Kind, configs_folder
 from tuner.core.yaml_document import dump_yaml
-from tuner.core.yaml_section import Flag, Number, Section, Whole, build, refuse
+from tuner.core.yaml_section import Section, build, refuse, section_of
+from tuner.options import FILES, FitOptions, Options
 from tuner.recordings.topics import TopicMap
 from tuner.service.naming import last_part, recording_name, stems
 from tuner.vehicle import ControllerFile, VehicleFile
@@ -41,12 +42,15 @@ def _one_line(text: str) -> str:
 M = TypeVar("M", bound=Section)
 Word = Annotated[str, Len(max_length=200), AfterValidator(_one_line)]
 Named = Word | dict[str, JsonValue]
-Refits = Annotated[Whole, Interval(ge=2, le=1000)]
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+OptionsOfJob = section_of(FitOptions, leaving=FILES, text=Word)
+"""The options of `tune` that name no file."""
 
 
-class JobRequest(Section):
+class JobRequest(OptionsOfJob, Section):  # type: ignore[misc, valid-type]
     """A job: recordings, what is to be fitted to them, and options that win over the settings.
+
+    The options are those of `tune`.
 
     Attributes
     ----------
@@ -54,8 +58,6 @@ class JobRequest(Section):
         Ids of uploaded recordings.
     names
         What this job calls some of them, by id: file names. Else as they were first uploaded.
-    holdout
-        Names of flights that are evaluated, never fitted; None takes those of the settings.
     vehicle, controller
         A shipped file's name, or what such a file holds, as JSON. A vehicle may also be named that
         an earlier job was of.
@@ -63,8 +65,6 @@ class JobRequest(Section):
         The keys of ``tune.yaml``.
     name
         What lists call the job.
-    mass, fit, fix, method, seed, namespace, cross_validate, bootstrap, force
-        As the options of `tune`.
     """
 
     model_config = ConfigDict(
@@ -75,23 +75,13 @@ class JobRequest(Section):
 
     recordings: Annotated[tuple[Digest, ...], Len(min_length=1, max_length=1000)]
     names: dict[Digest, Annotated[str, Len(max_length=1000)]] = Field(default_factory=dict)
-    holdout: tuple[Word, ...] | None = None
     vehicle: Named | None = None
     controller: Named | None = None
     settings: dict[str, JsonValue] = Field(default_factory=dict)
     name: Word = ""
-    mass: Number | None = None
-    fit: tuple[Word, ...] | None = None
-    fix: tuple[Word, ...] | None = None
-    method: Method | None = None
-    seed: Whole | None = None
-    namespace: Word | None = None
-    cross_validate: Flag = False
-    bootstrap: Refits | None = None
-    force: Flag = False
 
 
-class Asked(Section):
+class CheckedRequest(OptionsOfJob, Section):  # type: ignore[misc, valid-type]
     """A request that was checked, as the job table keeps it: nothing in it is a path.
 
     Attributes
@@ -106,16 +96,6 @@ class Asked(Section):
     controller: str | ControllerFile | None = None
     topics: str | TopicMap | None = None
     settings: dict[str, JsonValue] = Field(default_factory=dict)
-    holdout: tuple[str, ...] | None = None
-    mass: Number | None = None
-    fit: tuple[str, ...] | None = None
-    fix: tuple[str, ...] | None = None
-    method: Method | None = None
-    seed: Whole | None = None
-    namespace: str | None = None
-    cross_validate: Flag = False
-    bootstrap: Refits | None = None
-    force: Flag = False
 
     def lay_out(self, folder: Path) -> None:
         """Write the files that `options` names, beside the recordings in ``folder/flights``.
@@ -133,27 +113,20 @@ class Asked(Section):
 
     def options(self, folder: Path, flights: Sequence[str]) -> Options:
         """Return what `tune` would have been called with, for files in ``folder/flights``."""
-        job_file = folder / FLIGHTS / JOB_FILE
         topics = str(folder / "topics.yaml") if isinstance(self.topics, TopicMap) else self.topics
         return Options(
             [str(folder / FLIGHTS / name) for name in flights],
-            holdout=self.holdout,
             vehicle=self.vehicle,
             controller=self.controller,
-            mass=self.mass,
-            config=str(job_file) if self.settings else None,
-            fit=self.fit,
-            fix=self.fix,
-            method=self.method,
-            seed=self.seed,
+            config=str(folder / FLIGHTS / JOB_FILE) if self.settings else None,
             topics=topics,
-            namespace=self.namespace,
+            **{option: getattr(self, option) for option in OptionsOfJob.model_fields},
         )
 
 
 def checked(
     request: JobRequest, flights: Sequence[str], earlier: Mapping[str, Mapping[str, Any]]
-) -> tuple[Asked, str, frozenset[str]]:
+) -> tuple[CheckedRequest, str, frozenset[str]]:
     """Check a request, and return it with its vehicle's name and the held-out flights.
 
     Parameters
@@ -182,19 +155,13 @@ def checked(
     of = named["vehicle"]
     if isinstance(of, str) and of in earlier and of not in _shipped("vehicles"):
         named["vehicle"] = dict(earlier[of])
-    asked = Asked(
+    options = {option: getattr(request, option) for option in OptionsOfJob.model_fields}
+    asked = CheckedRequest(
+        **options | {"holdout": _holdout(options["holdout"], flights)},
         vehicle=_named("vehicle", named["vehicle"], VehicleFile, earlier),
         controller=_named("controller", named["controller"], ControllerFile),
         topics=_topics(named["topics"]),
         settings=settings,
-        holdout=_holdout(request.holdout, flights),
-        **{
-            key: getattr(request, key)
-            for key in ("mass", "fit", "fix", "method", "seed", "namespace")
-        },
-        cross_validate=request.cross_validate,
-        bootstrap=request.bootstrap,
-        force=request.force,
     )
     with tempfile.TemporaryDirectory(prefix="tune-check-") as name:
         folder = Path(name)

@@ -23,7 +23,7 @@ from pydantic import BaseModel
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
 from tuner.service.limiting import limit_process
-from tuner.service.request import Asked
+from tuner.service.request import CheckedRequest
 from tuner.service.settings import Limits, size_in_words
 
 RESULT = Path("result")
@@ -52,7 +52,7 @@ class Assignment(BaseModel):
     job: str
     folder: Path
     flights: tuple[str, ...]
-    asked: Asked
+    asked: CheckedRequest
     cores: tuple[int, ...] = ()
     limits: Limits = Limits()
 
@@ -100,9 +100,6 @@ def _fit(assignment: Assignment, channel: IO[str]) -> dict[str, Any]:
             asked.options(Path(), assignment.flights),
             out=RESULT,
             resume=(RESULT / "checkpoint.npz").exists(),
-            force=asked.force,
-            cross_validated=asked.cross_validate,
-            refits=asked.bootstrap,
             listener=_listener(channel),
             command=f"job {assignment.job} of a tuning service",
         )

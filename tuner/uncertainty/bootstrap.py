@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.disk import write_text
-from tuner.core.errors import ConfigError
 from tuner.core.files import csv_text
 from tuner.engine import Report
 from tuner.evaluate.best_fit import best_values
@@ -23,8 +22,6 @@ from tuner.search.problem import Job
 from tuner.uncertainty.refits import Whole, check_flights, coefficients_of, in_engine, refitted
 
 BOOTSTRAP_FILE = "bootstrap.csv"
-FEWEST = 2
-"""Refits that have a spread."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +59,7 @@ def bootstrap(
     ------
     RecordingError
         There are fewer than two flights to fit.
-    ConfigError
-        So few refits have no spread.
     """
-    check_bootstrap(refits)
     check_flights(job, "--bootstrap", "draws from a single flight")
     flights = [flight.name for flight in job.fitted]
     draws = _draws(len(flights), refits, job.settings.job.search.seed)
@@ -78,18 +72,6 @@ def bootstrap(
     header = ("refit", *(f"drawn_{name}" for name in flights), *by_name)
     write_text(folder / BOOTSTRAP_FILE, csv_text(header, rows))
     return {name: float(np.std(column, ddof=1)) for name, column in by_name.items()}
-
-
-def check_bootstrap(refits: int) -> None:
-    """Refuse a number of refits that has no spread.
-
-    Raises
-    ------
-    ConfigError
-        There are fewer than two.
-    """
-    if refits < FEWEST:
-        raise ConfigError("--bootstrap", f"is {refits}", "give two refits or more; 50 are usual")
 
 
 def _draws(flights: int, refits: int, seed: int) -> list[_Draw]:

@@ -116,6 +116,8 @@ def test_vehicle_and_flights_of_the_job_file_count_from_its_folder(lab, monkeypa
         ({"mass": -1.0}, "mass is -1.0; it should be more than 0"),
         ({"mass": float("nan")}, "mass is nan"),
         ({"seed": -1}, "seed is -1"),
+        ({"bootstrap": 1}, "bootstrap is 1; it should be at least 2"),
+        ({"fit": "mass"}, "fit is 'mass'; it should be a list"),
         ({"fit": ["mass"], "fix": ["mass"]}, "cannot stand beside --fix"),
         ({"fit": ["mas"]}, "--fit: unknown coefficient 'mas'; did you mean 'mass'?"),
         ({"vehicle": "nosuch"}, "neither a file nor one of the shipped vehicles"),

@@ -177,7 +177,7 @@ def short_job():
 def test_refits_to_other_flights_predict_give_errors_and_leave_the_fit(tmp_path):
     bags = [str(FLIGHTS / f"{name}.bag") for name in ("yaw_spin_3rps", "circle_3mps")]
     folder, result = run(
-        Options(bags, **SHORT), out=tmp_path / "run", cross_validated=True, refits=3
+        Options(bags, cross_validate=True, bootstrap=3, **SHORT), out=tmp_path / "run"
     )
     rows = [line.split(",") for line in (folder / "cross_validation.csv").read_text().splitlines()]
     assert [row[0] for row in rows] == ["left_out", "yaw_spin_3rps", "circle_3mps", "spread"]

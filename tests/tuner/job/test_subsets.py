@@ -42,9 +42,9 @@ def test_a_draw_of_what_is_fitted_ends_in_a_result(
         f"free: [{', '.join(free)}]\nterms: {random.choice(TERMS)}\n"
         f"disturbances: none\ninlet: {INLETS[draw % len(INLETS)]}\n"
     )
-    options = Options(flights=bags, vehicle="hovergames_updated", config=str(job))
+    options = Options(flights=bags, vehicle="hovergames_updated", config=str(job), force=True)
     try:
-        run(options, out=folder, force=True)
+        run(options, out=folder)
     except InputError:  # in one line
         return
     result = read_run(folder).result

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
-from tuner.core.errors import ConfigError
 from tuner.report.result_texts import refits_in_words
 from tuner.report.sections.tables import refits
-from tuner.uncertainty.bootstrap import check_bootstrap
 from tuner.uncertainty.cross_validation import Fold, jackknife_errors
 from tuner.uncertainty.refits import _counted
 
@@ -41,11 +39,6 @@ def test_a_flight_counts_as_often_as_it_was_drawn():
     jax.tree.map(
         lambda a, b: np.testing.assert_array_equal(a, b * of_first), often.squares, once.squares
     )
-
-
-def test_a_single_refit_is_refused():
-    with pytest.raises(ConfigError, match=r"--bootstrap: is 1; give two refits or more"):
-        check_bootstrap(1)
 
 
 def result_with(**errors):

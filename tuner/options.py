@@ -1,0 +1,169 @@
+"""The options of `tune`: the one list of which its command line, Python and HTTP are made.
+
+An option is a field of one of these classes: its type with its bounds, its default and, below it,
+its help. Where a job file has a key of the same name, the option wins over that key. Nothing here
+is slow to import, for `tune --help` shows it at once.
+"""
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+
+from annotated_types import Ge, Gt, Interval
+
+from tuner.core.errors import ConfigError, did_you_mean
+
+if TYPE_CHECKING:
+    from tuner.vehicle import ControllerFile, VehicleFile
+
+    Vehicle = str | VehicleFile
+    Controller = str | ControllerFile
+else:  # a command line names them; from Python they may be what such a file holds
+    Vehicle = Controller = str
+
+F = TypeVar("F", bound=Callable[..., object])
+Names = Sequence[str]
+Method = Literal["auto", "gradient", "cma", "hybrid"]
+
+FILES = ("flights", "vehicle", "controller", "config", "topics")
+"""Options that name files, or what they hold."""
+IN_JOB_FILE: Mapping[str, str] = {"fit": "free", "fix": "fixed"}
+"""Option -> what the job file, and Python, call it where that differs."""
+
+
+@dataclass(frozen=True)
+class FlightOptions:
+    """Recordings, and what flew."""
+
+    flights: Names
+    """Use these recordings: paths as the shell expands them, or a quoted glob."""
+    _: KW_ONLY
+    controller: Controller | None = None
+    """Simulate this controller (file or shipped). Default: the job file's, else hovergames."""
+    config: str | None = None
+    """Read settings from this job file. Default: tune.yaml beside the flights, if there is one."""
+
+    @classmethod
+    def of(cls, flights: Sequence[str | Path], **given: Any) -> Self:
+        """Return options as Python gives them: ``free`` and ``fixed``, and paths for text.
+
+        Raises
+        ------
+        ConfigError
+            There is no such option.
+        """
+        option_of = {IN_JOB_FILE.get(field.name, field.name): field.name for field in fields(cls)}
+        for name in given:
+            if name not in option_of:
+                raise ConfigError(name, "is no option", did_you_mean(name, option_of))
+        words = {
+            option_of[name]: str(value) if isinstance(value, Path) else value
+            for name, value in given.items()
+        }
+        if words.get("out") is not None:
+            words["out"] = Path(words["out"])
+        return cls([str(path) for path in flights], **words)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingOptions:
+    """How recordings are read."""
+
+    topics: str | None = None
+    """Find signals by this topic map (file or shipped). Default: the one that finds the most."""
+    namespace: str | None = None
+    """Expect this prefix before the topics that the topic map names."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions(ReadingOptions, FlightOptions):
+    """Recordings, what flew, and how they are read."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VehicleOptions(RecordingOptions):
+    """Recordings, and the vehicle whose coefficients they show."""
+
+    vehicle: Vehicle | None = None
+    """Start from this vehicle (file or shipped). Default: the job file's, else hovergames."""
+    mass: Annotated[float, Gt(0)] | None = None
+    """Use this weighed take-off mass in kg instead of the vehicle file's."""
+    fit: Names | None = None
+    """Fit, or judge, exactly these coefficients."""
+    fix: Names | None = None
+    """Fit, or judge, the usual coefficients except these."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FitOptions(VehicleOptions):
+    """What is fitted to which flights, on this machine or on a server."""
+
+    holdout: Names | None = None
+    """Evaluate these flights without fitting them."""
+    method: Method | None = None
+    """Search with this method. Default: the job file's, else auto."""
+    seed: Annotated[int, Ge(0)] | None = None
+    """Start the random numbers from this seed. Default: the job file's, else 0."""
+    force: bool = False
+    """Search even where the check before the search reports a failure."""
+    cross_validate: bool = False
+    """Also fit without each flight in turn: how it is predicted, and jackknife standard errors."""
+    bootstrap: Annotated[int, Interval(ge=2, le=1000)] | None = None
+    """Also fit this many times to flights drawn with replacement, for standard errors; say 50."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """Where independent work is computed; the numbers are the same."""
+
+    workers: int | None = None
+    """Compute what is independent in this many local processes, a core each."""
+    cluster: str | None = None
+    """Compute what is independent on a Dask cluster: a cluster file, or tcp://HOST:8786."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(EngineOptions):
+    """Where results are computed, and where they are written."""
+
+    out: Path | None = None
+    """Write into this folder. Default: runs/ and the time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExaminationOptions(RunOptions, VehicleOptions):
+    """Coefficients that are examined on recordings, nothing fitted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(RunOptions, FitOptions):
+    """All options of a fit on this machine."""
+
+    bench: str | None = None
+    """Start from these ground measurements, a folder of tune bench, and take them as prior."""
+    resume: bool = False
+    """Continue the search that was interrupted in the result folder from its checkpoint."""
+
+
+def taking(options: type[FlightOptions]) -> Callable[[F], F]:
+    """Show the fields of a class in the signature of a function of ``**options``."""
+
+    def shown(function: F) -> F:
+        signature = inspect.signature(function)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        more = [
+            inspect.Parameter(
+                IN_JOB_FILE.get(field.name, field.name),
+                inspect.Parameter.KEYWORD_ONLY,
+                default=field.default,
+                annotation=field.type,
+            )
+            for field in fields(options)
+            if field.name not in signature.parameters
+        ]
+        function.__signature__ = signature.replace(parameters=[*own, *more])  # type: ignore[attr-defined]
+        return function
+
+    return shown
