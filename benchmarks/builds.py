@@ -17,15 +17,14 @@ from benchmarks.contest import STRIDE, Contest, simple
 from tuner.config import Options, settle
 from tuner.config.job import JobFile
 from tuner.core.errors import InputError
-from tuner.evaluate.best_fit import controller_flown, vehicle_fitted
+from tuner.evaluate.held_out import controller_flown, vehicle_fitted
 from tuner.evaluate.predict import Predictions, predict
 from tuner.objective.inlets import INLETS
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
-from tuner.terms.first_terms import with_first_terms
-from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.uncertainty.holding import with_undetermined_held
 
 INLET = "actuator"

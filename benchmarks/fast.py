@@ -18,10 +18,10 @@ from benchmarks.table import Section, figure
 from tuner.config import Options, settle
 from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.regression import adding, convolved
-from tuner.equation_error.turning import regressors
 from tuner.job.run import run
 from tuner.recordings.flight import Flight
 from tuner.result import RunResult
+from tuner.search.inlet_choice import regressors
 from tuner.search.job_flights import read_usable
 from tuner.vehicle import VehicleFile
 

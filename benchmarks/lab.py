@@ -24,17 +24,15 @@ from sim_jax.schedule import Schedule
 from tuner.config import Options, settle
 from tuner.engine import Report, engine_for
 from tuner.job.listener import SILENT
-from tuner.objective.battery import log_voltage_of
-from tuner.objective.voltage import VOLTAGE
+from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Array, Flight
 from tuner.search.explanation import Explanation
 from tuner.search.fitted import Fitted
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import Job, job_of
-from tuner.terms.first_terms import with_first_terms
 from tuner.terms.refit_with_disturbances import examined
-from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.vehicle import COEFFICIENTS, values_of

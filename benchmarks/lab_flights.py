@@ -31,8 +31,8 @@ from sim_jax.trim import in_trim
 from tuner.config import TrajectorySettings
 from tuner.core.disk import write_text
 from tuner.core.shipped import find_config
-from tuner.evaluate.bag import write_bag
 from tuner.evaluate.simulate import Simulation
+from tuner.evaluate.write import write_bag
 from tuner.objective.trajectory import Published, published
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle, term_groups, with_values
 from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed

@@ -85,7 +85,7 @@ def _cross_validation() -> tuple[dict[str, _Folds], list[str]]:
     from tuner.search.estimation import search  # noqa: PLC0415
     from tuner.search.job_flights import read_recordings  # noqa: PLC0415
     from tuner.search.problem import job_of  # noqa: PLC0415
-    from tuner.uncertainty.cross_validation import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
+    from tuner.uncertainty.refits import CROSS_VALIDATION_FILE, cross_validate  # noqa: PLC0415
 
     settings = settle(Options([str(path) for path in sorted(FOLDER.glob("*.bag"))]))
     job = job_of(settings, read_recordings(settings))

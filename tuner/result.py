@@ -13,9 +13,8 @@ from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile
 from tuner.core.findings import Finding
 from tuner.design.log_proposal import LogProposal
-from tuner.evaluate.rmse import AxesRmse, PredictedErrors
-from tuner.uncertainty.error_parts import ErrorParts
-from tuner.uncertainty.sources import Sources
+from tuner.evaluate.records import AxesRmse, PredictedErrors
+from tuner.uncertainty.records import ErrorParts, Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
 from tuner.vehicle.selection_table import SelectionRow

@@ -64,7 +64,7 @@ def simulate(
     rate
         Hz of the result.
     grid
-        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.evaluate.plan.grid_of`
+        Coefficient -> (B,) values: B vehicles fly side by side. `tuner.evaluate.simulate.grid_of`
         makes every combination of several ranges.
     precision
         What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
@@ -84,7 +84,7 @@ def simulate(
         Something cannot be flown.
     """
     configure()
-    from tuner.evaluate.plan import fly  # noqa: PLC0415 (jax)
+    from tuner.evaluate.simulate import fly  # noqa: PLC0415 (jax)
 
     shape = {
         "name": trajectory,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.gusts import BARS, Draw, section, truth
-from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.records import ErrorParts
 
 
 def drawn(off: float, *, followed: bool) -> Draw:

@@ -11,9 +11,9 @@ from benchmarks.lab import Trial, _rows, _voltages, section
 from benchmarks.lab_flights import METER, drawn
 from sim_jax.numeric import GRAVITY
 from sim_jax.schedule import Schedule
-from tuner.objective.voltage import VOLTAGE
+from tuner.objective.battery import VOLTAGE
 from tuner.recordings.flight import Series
-from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.records import ErrorParts
 from tuner.vehicle import term_groups, values_of
 
 SEEDS = range(8)

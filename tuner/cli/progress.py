@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
     from tuner.config import Settings
     from tuner.job.listener import Listener
-    from tuner.search.iteration import Iteration
-    from tuner.search.point_estimate import PointEstimate
+    from tuner.search.iteration import Iteration, PointEstimate
 
 
 SEARCHED = (

@@ -55,8 +55,7 @@ def client_of(server: str | None, token: str | None) -> Iterator[Client]:
 
 def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> None:
     """Pass what happens to a job on to a listener, as a run on this machine does."""
-    from tuner.search.iteration import Iteration
-    from tuner.search.point_estimate import PointEstimate
+    from tuner.search.iteration import Iteration, PointEstimate
 
     for kind, content in events:
         if kind == "message":
@@ -71,8 +70,8 @@ def show(events: Iterable[tuple[str, dict[str, Any]]], listener: Listener) -> No
 
 
 def _folds(rows: list[dict[str, Any]]) -> Any:
-    from tuner.evaluate.rmse import AxesRmse
-    from tuner.uncertainty.cross_validation import Fold  # (jax)
+    from tuner.evaluate.records import AxesRmse
+    from tuner.uncertainty.refits import Fold  # (jax)
 
     return [
         Fold(row["left_out"], {}, None if row["rmse"] is None else AxesRmse(**row["rmse"]))

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from tuner.job.ground import BenchResult
     from tuner.job.sensitivity import SensitivityResult
     from tuner.result import RunResult
-    from tuner.search.point_estimate import PointEstimate
-    from tuner.uncertainty.cross_validation import Fold
+    from tuner.search.iteration import PointEstimate
+    from tuner.uncertainty.refits import Fold
 
 WIDTH, LINES = 100, 30
 """What a finished job takes of a terminal at most, without --verbose."""
@@ -245,7 +245,7 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
 
 def folds_table(folds: Sequence[Fold]) -> object:
     """Return how well each flight is predicted by the fit to the others."""
-    from tuner.evaluate.rmse import RMSE_UNITS
+    from tuner.evaluate.records import RMSE_UNITS
 
     rows = [
         (

@@ -67,7 +67,7 @@ def simulate(
     configure()
     from tuner.core.errors import InputError
     from tuner.engine import engine_for
-    from tuner.evaluate.plan import fly, grid_of
+    from tuner.evaluate.simulate import fly, grid_of
     from tuner.evaluate.write import Summary, summary_of, write_flights
     from tuner.report.paper import SUFFIXES, check_figure, write_figure
 

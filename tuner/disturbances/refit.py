@@ -25,8 +25,8 @@ from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.recorded import gathered
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.loss import gauss_newton, robust
 from tuner.objective.normal import Objective
+from tuner.objective.residuals import gauss_newton, robust
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.search.normal_equations import normal_equations

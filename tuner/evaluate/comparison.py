@@ -23,7 +23,7 @@ from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
 from tuner.evaluate.forces import Forces, acting, in_order
 from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, short_way
-from tuner.evaluate.simulation_table import roll_pitch_yaw
+from tuner.evaluate.write import roll_pitch_yaw
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
 from tuner.objective.flight import MOTION, TURNED
@@ -43,8 +43,8 @@ from tuner.objective.space import Space
 from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
 from tuner.recordings.flight import Array
-from tuner.search.free_starts import FAR
 from tuner.search.job_flights import Recording
+from tuner.search.least_squares import FAR
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_mixer

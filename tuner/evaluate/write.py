@@ -1,19 +1,309 @@
-"""Simulated flights into a file, and what is worth knowing of each."""
+"""Simulated flights on disk: tables and bags as a recording would be."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import nullcontext
-from dataclasses import dataclass
+import csv
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rosbags.rosbag1 import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tuner.core.disk import check_file
+from tuner.core.disk import check_file, whole_file
 from tuner.core.errors import InputError
-from tuner.evaluate.bag import write_bag
+from tuner.evaluate.forces import COMPONENTS
 from tuner.evaluate.simulate import Simulation
-from tuner.evaluate.simulation_table import flights_below_each_other, write_csv, write_forces
+from tuner.recordings.flight import Array
+
+#: ns since 1970 of the first sample; a fixed one, so that the same flight gives the same file.
+EPOCH = 1_577_836_800_000_000_000
+RPM_PER_RAD_S = 60.0 / (2.0 * np.pi)
+#: µs of PWM at command 0, and from there to command 1.
+PWM_LOW, PWM_SPAN = 1000, 1000
+#: s of hover at the first point before the set-points begin, as labs record them.
+HOVER_BEFORE = 2.0
+BATTERY = "/mavros/battery"
+ONLY_IN_FLIGHT = ("/mavros/setpoint_raw/attitude", "/mavros/rc/out")
+#: Mask of a reference that holds position, velocity and acceleration.
+NO_JERK_NO_SNAP = 2
+#: Mask of a set-point that is a body rate.
+NO_ATTITUDE = 128
+
+#: Message types of MAVROS and of the controllers, which ROS itself does not bring along.
+DEFINITIONS = {
+    "mavros_msgs/msg/RCOut": "std_msgs/Header header\nuint16[] channels\n",
+    "mavros_msgs/msg/RPM": "std_msgs/Header header\nuint8 index\nfloat32 frequency\n",
+    "mavros_msgs/msg/AttitudeTarget": (
+        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Quaternion orientation\n"
+        "geometry_msgs/Vector3 body_rate\nfloat32 thrust\n"
+    ),
+    "controller_msgs/msg/FlatTarget": (
+        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Vector3 position\n"
+        "geometry_msgs/Vector3 velocity\ngeometry_msgs/Vector3 acceleration\n"
+        "geometry_msgs/Vector3 jerk\ngeometry_msgs/Vector3 snap\n"
+    ),
+}
+
+TOPICS = {
+    "/optitrack/pose": "geometry_msgs/msg/PoseStamped",
+    "/mavros/local_position/pose": "geometry_msgs/msg/PoseStamped",
+    "/mavros/local_position/velocity_local": "geometry_msgs/msg/TwistStamped",
+    "/mavros/imu/data": "sensor_msgs/msg/Imu",
+    "/mavros/rpm": "mavros_msgs/msg/RPM",
+    "/mavros/rc/out": "mavros_msgs/msg/RCOut",
+    "/mavros/setpoint_raw/attitude": "mavros_msgs/msg/AttitudeTarget",
+    "/reference/flatsetpoint": "controller_msgs/msg/FlatTarget",
+    "/trajectory_publisher/lap_completed": "std_msgs/msg/Int32",
+    BATTERY: "sensor_msgs/msg/BatteryState",
+}
+
+
+def write_bag(simulation: Simulation, path: Path) -> None:
+    """Write a flight as MAVROS, a motion capture system and the trajectory publisher record one.
+
+    What comes before time zero is hover, without set-points and commands; where nothing does, two
+    seconds at the first point come first. Every message carries the time at which it is true;
+    nothing is late, or noisier than the flight. Commands are PWM in whole µs, as autopilots send
+    them. The file appears whole.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    with whole_file(path) as unfinished:
+        unfinished.unlink()  # the writer refuses a file that exists
+        _write(simulation, unfinished)
+
+
+def _write(simulation: Simulation, path: Path) -> None:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    messages = _Messages(store.types)
+    with Writer(path) as writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=store)
+            for topic, kind in TOPICS.items()
+            if topic != BATTERY or "battery_voltage" in simulation.signals
+        }
+        for topic, nanoseconds, message in _in_time(simulation, messages):
+            raw = store.serialize_ros1(message, TOPICS[topic])
+            writer.write(connections[topic], nanoseconds, raw)
+
+
+def _in_time(simulation: Simulation, messages: _Messages) -> Iterator[tuple[str, int, Any]]:
+    """Yield topic, time in ns and message of the hover before the flight, then of the flight."""
+    flown, step = simulation.time >= 0.0, float(simulation.time[1] - simulation.time[0])
+    mission, hover = _rows(simulation, flown), _rows(simulation, ~flown)
+    if not len(hover.time):
+        hover = _rows(simulation, np.zeros(round(HOVER_BEFORE / step), int))
+    for number in range(len(hover.time)):
+        nanoseconds = EPOCH + round(number * step * 1e9)
+        for topic, message in messages.at(hover, number, nanoseconds):
+            if topic not in ONLY_IN_FLIGHT:
+                yield topic, nanoseconds, message
+    for index, seconds in enumerate(mission.time):
+        nanoseconds = EPOCH + round((len(hover.time) * step + float(seconds)) * 1e9)
+        for topic, message in messages.at(mission, index, nanoseconds):
+            yield topic, nanoseconds, message
+
+
+def _rows(simulation: Simulation, rows: NDArray[Any]) -> Simulation:
+    """Return some samples of a simulation."""
+    signals = {name: values[rows] for name, values in simulation.signals.items()}
+    return replace(simulation, time=simulation.time[rows], signals=signals)
+
+
+class _Messages:
+    """Makes the messages of one instant."""
+
+    def __init__(self, types: Mapping[str, Any]) -> None:
+        self._types = types
+        self._still = self._make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+
+    def at(self, flight: Simulation, index: int, nanoseconds: int) -> Iterator[tuple[str, Any]]:
+        """Yield topic and message for every topic that has one then."""
+        now = {name: values[index].tolist() for name, values in flight.signals.items()}
+        stamp = self._make("builtin_interfaces/msg/Time", *divmod(nanoseconds, 1_000_000_000))
+        world = self._make("std_msgs/msg/Header", index, stamp, "map")
+        body = self._make("std_msgs/msg/Header", index, stamp, "base_link")
+        w, x, y, z = now["attitude"]
+        attitude = self._make("geometry_msgs/msg/Quaternion", x, y, z, w)
+        place = self._make("geometry_msgs/msg/Point", *now["position"])
+        pose = self._make("geometry_msgs/msg/Pose", place, attitude)
+        stamped = self._make("geometry_msgs/msg/PoseStamped", world, pose)
+        yield "/optitrack/pose", stamped
+        yield "/mavros/local_position/pose", stamped
+        twist = self._make(
+            "geometry_msgs/msg/Twist", self._vector(now["velocity"]), self._vector(now["body_rate"])
+        )
+        yield (
+            "/mavros/local_position/velocity_local",
+            self._make("geometry_msgs/msg/TwistStamped", world, twist),
+        )
+        yield "/mavros/imu/data", self._imu(body, attitude, now)
+        for rotor, speed in enumerate(now["rotor_speed"]):
+            yield (
+                "/mavros/rpm",
+                self._make("mavros_msgs/msg/RPM", body, rotor, speed * RPM_PER_RAD_S),
+            )
+        pwm = np.array([PWM_LOW + round(PWM_SPAN * u) for u in now["command"]], dtype=np.uint16)
+        yield "/mavros/rc/out", self._make("mavros_msgs/msg/RCOut", body, pwm)
+        yield (
+            "/mavros/setpoint_raw/attitude",
+            self._make(
+                "mavros_msgs/msg/AttitudeTarget",
+                body,
+                NO_ATTITUDE,
+                self._make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+                self._vector(now["rate_setpoint"]),
+                now["thrust_setpoint"][0],
+            ),
+        )
+        names = ("reference_position", "reference_velocity", "reference_acceleration")
+        parts = [self._vector(now[name]) for name in names]
+        yield (
+            "/reference/flatsetpoint",
+            self._make(
+                "controller_msgs/msg/FlatTarget",
+                world,
+                NO_JERK_NO_SNAP,
+                *parts,
+                self._still,
+                self._still,
+            ),
+        )
+        if "battery_voltage" in now and np.isfinite(now["battery_voltage"][0]):
+            yield BATTERY, self._battery(world, now["battery_voltage"][0])
+        laps = flight.signals["lap"][:, 0]
+        if index and laps[index] != laps[index - 1]:
+            yield (
+                "/trajectory_publisher/lap_completed",
+                self._make("std_msgs/msg/Int32", int(laps[index])),
+            )
+
+    def _battery(self, header: Any, volts: float) -> Any:
+        unknown, none = float("nan"), np.zeros(0, np.float32)
+        amounts = (unknown,) * 6  # temperature, current, charge, capacity, design and share of it
+        state = (0, 0, 0, True)  # power supply unknown, battery present
+        return self._make(
+            "sensor_msgs/msg/BatteryState", header, volts, *amounts, *state, none, none, "", ""
+        )
+
+    def _imu(self, header: Any, attitude: Any, now: Mapping[str, list[float]]) -> Any:
+        unknown = np.zeros(9)
+        return self._make(
+            "sensor_msgs/msg/Imu",
+            header,
+            attitude,
+            unknown,
+            self._vector(now["body_rate"]),
+            unknown,
+            self._vector(now["acceleration"]),
+            unknown,
+        )
+
+    def _vector(self, values: Sequence[float]) -> Any:
+        return self._make("geometry_msgs/msg/Vector3", *values)
+
+    def _make(self, kind: str, *fields: object) -> Any:
+        return self._types[kind](*fields)
+
+
+Append = Callable[[Mapping[str, float], Sequence[str], Sequence[Array]], None]
+
+_XYZ = ("x", "y", "z")
+#: Signal -> the columns that hold it, in the order of the file.
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "position": _XYZ,
+    "velocity": ("vx", "vy", "vz"),
+    "attitude": ("qw", "qx", "qy", "qz"),
+    "roll_pitch_yaw": ("roll", "pitch", "yaw"),
+    "body_rate": ("wx", "wy", "wz"),
+    "rotor_speed": tuple(f"rotor_speed_{rotor}" for rotor in range(1, 5)),
+    "command": tuple(f"command_{rotor}" for rotor in range(1, 5)),
+    "thrust_setpoint": ("thrust_setpoint",),
+    "reference_position": tuple(f"ref_{axis}" for axis in _XYZ),
+    "reference_velocity": tuple(f"ref_v{axis}" for axis in _XYZ),
+    "reference_acceleration": tuple(f"ref_a{axis}" for axis in _XYZ),
+}
+
+
+def write_csv(simulations: Iterable[Simulation], path: Path) -> None:
+    """Write flights below each other.
+
+    Units: s, m, m/s (world), degrees for roll, pitch, yaw, rad/s (body), rad/s, commands and thrust
+    set-point 0..1; the quaternion is body to world.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    names = [name for columns in COLUMNS.values() for name in columns]
+    with flights_below_each_other(path) as append:
+        for simulation in simulations:
+            signals = {
+                **simulation.signals,
+                "roll_pitch_yaw": roll_pitch_yaw(simulation.signals["attitude"]),
+            }
+            columns = (simulation.time, *(signals[name] for name in COLUMNS))
+            append(simulation.coefficients, names, columns)
+
+
+def write_forces(simulation: Simulation, append: Append) -> None:
+    """Append what acted along a flight, one column per term and component, as ``thrust_fz``."""
+    if simulation.forces is not None:
+        time, of_term = simulation.forces.time, simulation.forces.of_term
+        names = [f"{term}_{component}" for term in of_term for component in COMPONENTS]
+        append(simulation.coefficients, names, (time, *of_term.values()))
+
+
+@contextmanager
+def flights_below_each_other(path: Path) -> Iterator[Append]:
+    """Write a CSV of flights: what is yielded appends one.
+
+    It takes the coefficients that were varied for the flight, which are the first columns, the
+    names of its columns behind ``time``, and time and columns. The file appears whole.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    with (
+        whole_file(path) as unfinished,
+        unfinished.open("w", newline="", encoding="utf-8") as file,
+    ):
+        writer = csv.writer(file)
+        begun = False
+
+        def append(
+            varied: Mapping[str, float], names: Sequence[str], columns: Sequence[Array]
+        ) -> None:
+            nonlocal begun
+            if not begun:
+                writer.writerow([*varied, "time", *names])
+                begun = True
+            rows = np.column_stack(columns).tolist()
+            writer.writerows([*varied.values(), *row] for row in rows)
+
+        yield append
+
+
+def roll_pitch_yaw(attitude: Array) -> Array:
+    """Return (N, 3) degrees of (N, 4) quaternions w, x, y, z: turned by yaw, pitch, then roll."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
+
+    turns = Rotation.from_quat(attitude, scalar_first=True)
+    angles: Array = turns.as_euler("ZYX", degrees=True)[:, ::-1]
+    return angles
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import ConfigError
 from tuner.core.phrases import listed
-from tuner.evaluate.best_fit import comparison_of, controller_flown
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import AxesRmse, FlightErrors
+from tuner.evaluate.held_out import comparison_of, controller_flown
+from tuner.evaluate.records import AxesRmse
+from tuner.evaluate.rmse import FlightErrors
 from tuner.exporters.target import target_of
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS

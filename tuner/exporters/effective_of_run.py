@@ -21,7 +21,7 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.files import ResultFile
 from tuner.core.versions import installed
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import STAGES, pose_rmse
 from tuner.exporters.refly import recordings_of
 from tuner.exporters.simulators import Simulator

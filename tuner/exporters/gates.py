@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 
 from tuner.core.errors import InputError
-from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.exporters.draft import Draft, Gate
 from tuner.exporters.hover import hover_command, thrust_to_weight
 from tuner.result import Run

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from tuner.config import JobFile, Settings
 from tuner.core.errors import InputError
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.result import Run, RunResult
 from tuner.search.job_flights import (
     Recording,

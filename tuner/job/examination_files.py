@@ -14,10 +14,8 @@ from tuner.design.ranking import rank_next_flights
 from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted
 from tuner.search.problem import SPIN_CHANNELS, Job
-from tuner.uncertainty.examination import Examination
-from tuner.uncertainty.knowledge import knowledge_of
-from tuner.uncertainty.sensitivity_json import Knowledge
-from tuner.uncertainty.tables import write_files
+from tuner.uncertainty.examination import Examination, knowledge_of
+from tuner.uncertainty.sensitivity_json import Knowledge, write_files
 
 MARGIN = 1.0
 """Length added to what the recorded flights took, to make an arena of it; m."""

@@ -49,7 +49,7 @@ from tuner.vehicle import (
     with_values,
     write_vehicle,
 )
-from tuner.vehicle.size import size_of, sized
+from tuner.vehicle.vehicle import size_of, sized
 
 RELINEARISATIONS = 3
 """Times that yaw spins are linearised at the motor constant that all experiments give."""

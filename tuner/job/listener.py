@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from tuner.config import Settings
-    from tuner.search.iteration import Iteration
-    from tuner.search.point_estimate import PointEstimate
-    from tuner.uncertainty.cross_validation import Fold
+    from tuner.search.iteration import Iteration, PointEstimate
+    from tuner.uncertainty.refits import Fold
 
 
 @dataclass(frozen=True)

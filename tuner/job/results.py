@@ -16,7 +16,8 @@ from tuner.core.numerics import Z95
 from tuner.core.versions import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
 from tuner.design.log_proposal import LogProposal
-from tuner.evaluate.best_fit import (
+from tuner.evaluate.held_out import (
+    Validation,
     best_values,
     conditions_of,
     controller_flown,
@@ -24,8 +25,7 @@ from tuner.evaluate.best_fit import (
     initial_of,
     offsets_of,
 )
-from tuner.evaluate.held_out import Validation
-from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS, whole
 from tuner.objective.inlets import INLETS, window_seconds
@@ -46,7 +46,7 @@ from tuner.search.job_flights import Recording
 from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import Job
 from tuner.uncertainty.estimates import Estimate, Uncertainty
-from tuner.uncertainty.sources import Sources
+from tuner.uncertainty.records import Sources
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,

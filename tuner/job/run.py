@@ -21,10 +21,15 @@ from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.log_job import what_to_log
 from tuner.design.log_proposal import LogProposal
-from tuner.evaluate.best_fit import vehicle_fitted
 from tuner.evaluate.compare import table_of
-from tuner.evaluate.held_out import Validation, flights_worse, holding_better, validate
-from tuner.evaluate.input_lag import with_inputs_on_time
+from tuner.evaluate.held_out import (
+    Validation,
+    flights_worse,
+    holding_better,
+    validate,
+    vehicle_fitted,
+)
+from tuner.evaluate.predict import with_inputs_on_time
 from tuner.exporters.effective import Effective, effective_fit
 from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.export import exports_of_job
@@ -49,16 +54,14 @@ from tuner.search.problem import Job, job_of
 from tuner.search.progress import Progress
 from tuner.search.rotor_change import used_up_to_changes
 from tuner.terms.balanced_inertia import with_inputs_balanced
-from tuner.terms.first_terms import with_first_terms
 from tuner.terms.refit_with_disturbances import Examined, examined
-from tuner.terms.search_with_terms import search_with_terms
+from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.terms.selection_state import Selected
-from tuner.uncertainty.bootstrap import bootstrap
-from tuner.uncertainty.cross_validation import cross_validate, jackknife_errors
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
-from tuner.uncertainty.sources import Sources
+from tuner.uncertainty.records import Sources
+from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
 from tuner.wording.findings import remedy, sentence
 

@@ -9,10 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.inlet import ReferenceInlet
-from tuner.objective.battery import log_voltage_of
+from tuner.objective.battery import log_voltage_of, read_again
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-from tuner.objective.voltage import read_again
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight
 

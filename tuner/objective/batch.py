@@ -11,10 +11,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from tuner.engine import Report, current
-from tuner.objective.criterion import Criterion, Point, SegmentData
-from tuner.objective.loss import robust
+from tuner.objective.criterion import Criterion, Point, SegmentData, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.objective.residuals import residuals
+from tuner.objective.residuals import residuals, robust
 
 CHUNK = 16
 """Vectors simulated side by side: enough to fill the processor, few enough for its memory."""
@@ -86,3 +85,34 @@ def _evaluated(
             by_axis[block.segments] += np.einsum("fnk,fnk->fk", block.errors, block.errors)
         squares[name] = np.moveaxis(by_axis.reshape(count, segments, -1), -1, 1)
     return Batch(loss.reshape(count, segments), squares, flown.crash_time.reshape(count, segments))
+
+
+_Problem = Callable[[], tuple[Objective, Criterion, bool]]
+
+
+def sums_at(
+    objective: Objective, points: Point, criterion: Criterion, *, derivatives: bool = True
+) -> SegmentSums:
+    """Return every segment's contribution at S points, as `Objective.sums_of` does.
+
+    The engine in force computes them, a task each; one alone stays here.
+    """
+    if len(points.coefficients) == 1:
+        return objective.sums_of(points, criterion, derivatives=derivatives)
+    engine = current()
+    problem = engine.share((objective, criterion, derivatives))
+    alone = [
+        Point(coefficients[None], offsets[None])
+        for coefficients, offsets in zip(points.coefficients, points.offsets, strict=True)
+    ]
+    parts = engine.map(_sums, [(problem, point) for point in alone])
+    joined: SegmentSums = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return joined
+
+
+def _sums(task: tuple[_Problem, Point], _report: Report) -> SegmentSums:
+    problem, point = task
+    objective, criterion, derivatives = problem()
+    flown = objective.sums_of(point, criterion, derivatives=derivatives)
+    sums: SegmentSums = jax.tree.map(np.asarray, flown)
+    return sums

@@ -2,20 +2,232 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Float
+from scipy.interpolate import BSpline, make_smoothing_spline
 
 from sim_jax.numeric import Scalar
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
-from tuner.objective.voltage import VOLTAGE, voltages_of
+from tuner.core.numerics import robust_sd
 from tuner.objective.windows import Window
-from tuner.recordings.flight import Flight
+from tuner.recordings.flight import Array as Numbers
+from tuner.recordings.flight import Flight, Series
 from tuner.vehicle import VehicleFile
+
+VOLTAGE = "battery_voltage"
+OFTEN = 20.0
+"""Hz to which faster readings are averaged first."""
+FEWEST = 5
+"""Readings that a smoothing spline needs; fewer are joined by lines."""
+TREND = 10.0
+"""s, the load's sag is what varies faster than such a polynomial trend follows."""
+IDLE = 0.1
+"""Rotor speed at no command over that at full command, as armed motors idle (thesis 5.2)."""
+LAG = 0.03
+"""s by which rotors follow their commands, about; the sag follows the rotors."""
+SPIKE = 3.0
+"""Robust standard deviations of a load that commands tell beyond which a reading does not speak of
+the resistance: rotors do not follow a saturated command as they follow others."""
+
+
+@dataclass(frozen=True)
+class Voltage:
+    """A battery's voltage over a flight, without its meter's noise.
+
+    Attributes
+    ----------
+    time
+        (n,) s.
+    volts, without_load
+        (n,) V at the terminals, and what they would be if no rotor turned.
+    """
+
+    time: Numbers
+    volts: Numbers
+    without_load: Numbers
+
+
+def voltages_of(flights: Sequence[Flight]) -> list[Voltage | None]:
+    """Return each flight's voltage, None where it was not recorded.
+
+    All flights share one resistance, in V per unit of load; where the voltage does not fall with
+    the load by more than chance lets it, the decline alone is smoothed.
+    """
+    readings = [
+        _averaged(flight.series[VOLTAGE]) if flight.has(VOLTAGE) else None for flight in flights
+    ]
+    signal, loads = _loads(flights)
+    resistance = _resistance(
+        [
+            (reading, load)
+            for reading, load in zip(readings, loads, strict=True)
+            if reading is not None and load is not None
+        ],
+        spikes_count=signal == "rotor_speed",
+    )
+    return [
+        None if reading is None else _smoothed(reading, load, resistance)
+        for reading, load in zip(readings, loads, strict=True)
+    ]
+
+
+def read_again(flights: Sequence[Flight], random: np.random.Generator) -> list[Flight]:
+    """Return flights whose voltmeter was read once more, with errors like those that it made.
+
+    What a reading is off from `voltages_of` it is off again, to one side or the other (the wild
+    bootstrap: Wu, "Jackknife, bootstrap and other resampling methods in regression analysis",
+    1986).
+    """
+    others = []
+    for flight, curve in zip(flights, voltages_of(flights), strict=True):
+        if curve is None:
+            others.append(flight)
+            continue
+        readings = flight.series[VOLTAGE]
+        expected = np.interp(readings.time, curve.time, curve.volts)[:, None]
+        sides = random.choice([-1.0, 1.0], size=readings.values.shape)
+        other = Series(readings.time, expected + sides * (readings.values - expected))
+        others.append(replace(flight, series={**flight.series, VOLTAGE: other}))
+    return others
+
+
+def _loads(flights: Sequence[Flight]) -> tuple[str, list[Series | None]]:
+    """Return the mean cube of each flight's rotor speeds, or of its motor commands, over time.
+
+    And of which.
+
+    Rotor speeds where all rotors of all flights were recorded. Over the mean of all flights, so
+    that a load (n, 1) is about one; None where a flight holds neither.
+    """
+    for signal in ("rotor_speed", "command"):
+        cubes = [_mean_cube(flight, signal) for flight in flights]
+        known = [cube for cube in cubes if cube is not None]
+        if known and (signal == "command" or len(known) == len(flights)):
+            mean = float(np.mean(np.concatenate([cube.values for cube in known])))
+            return signal, [cube and Series(cube.time, cube.values / mean) for cube in cubes]
+    return "", [None] * len(flights)
+
+
+def _mean_cube(flight: Flight, signal: str) -> Series | None:
+    """Return the mean over the rotors (n, 1) of the cube of speeds, where all were recorded.
+
+    Motor commands are followed as rotors follow them.
+    """
+    if not flight.has(signal):
+        return None
+    series = flight.series[signal]
+    known = np.isfinite(series.values).all(axis=1)
+    time, speeds = series.time[known], np.abs(series.values[known])
+    if signal == "command" and len(time):
+        speeds = _followed(time, speeds + IDLE)
+    cubes = np.mean(speeds**3, axis=1, keepdims=True)
+    return Series(time, cubes) if cubes.sum() > 0.0 else None
+
+
+def _followed(time: Numbers, values: Numbers) -> Numbers:
+    """Return values (n, k) that move steadily between stamps, after a first-order lag of `LAG`.
+
+    Recorders take what was sent last: held from one stamp to the next, the values would be half a
+    gap late.
+    """
+    gaps = np.diff(time)
+    keep, slope = np.exp(-gaps / LAG)[:, None], np.diff(values, axis=0) / gaps[:, None]
+    behind = np.zeros_like(values)  # of the lag, at every stamp
+    for row in range(1, len(values)):
+        steady = -LAG * slope[row - 1]
+        behind[row] = steady + keep[row - 1] * (behind[row - 1] - steady)
+    return values + behind
+
+
+def _resistance(pairs: Sequence[tuple[Series, Series]], *, spikes_count: bool) -> float:
+    """Return by how many V the voltage falls per unit of load, from readings and loads.
+
+    Each flight's decline is a polynomial that both are cleared of. ``spikes_count``: whether loads
+    are known in spikes as well. Flights that hardly vary their
+    load tell it badly, and one that saturates for a moment sags by far more than they do: so it is
+    shrunk by the share of chance in its square (positive-part James and Stein 1961), rather than
+    taken for nothing where it is not sure.
+    """
+    falls, varied = [np.empty(0)], [np.empty(0)]
+    for reading, load in pairs:
+        drawn = np.interp(reading.time, load.time, _charge(load))
+        trend = _polynomials(drawn, _order(reading.time))
+        if len(reading.time) < trend.shape[1] + FEWEST:
+            continue
+        there = np.interp(reading.time, load.time, load.values[:, 0])
+        both = np.stack([reading.values[:, 0], there], axis=1)
+        left = both - trend @ np.linalg.lstsq(trend, both, rcond=None)[0]
+        spread = float(robust_sd(left[:, 1]))
+        calm = spikes_count | (np.abs(left[:, 1]) <= SPIKE * max(spread, 1e-12))
+        falls.append(-left[calm, 0])
+        varied.append(left[calm, 1])
+    fall, vary = np.concatenate(falls), np.concatenate(varied)
+    information = float(vary @ vary)
+    if not information > 0.0:
+        return 0.0
+    resistance = float(vary @ fall) / information
+    chance = float(np.mean((fall - resistance * vary) ** 2)) / information
+    return resistance - chance / resistance if resistance**2 > chance and resistance > 0.0 else 0.0
+
+
+def _smoothed(reading: Series, load: Series | None, resistance: float) -> Voltage:
+    """Return a voltage without most of its noise, on the load's stamps where they count."""
+    if load is None or resistance == 0.0:
+        decline = _spline(reading.time, reading.values[:, 0])(reading.time)
+        return Voltage(reading.time, decline, decline)
+    sag = resistance * load.values[:, 0]
+    without = reading.values[:, 0] + np.interp(reading.time, load.time, sag)
+    decline = _spline(reading.time, without)(np.clip(load.time, reading.time[0], reading.time[-1]))
+    return Voltage(load.time, decline - sag, decline)
+
+
+def _charge(load: Series) -> Numbers:
+    """Return the load's integral (n,): a battery declines by the charge that was drawn."""
+    means = 0.5 * (load.values[1:, 0] + load.values[:-1, 0])
+    return np.concatenate([[0.0], np.cumsum(means * np.diff(load.time))])
+
+
+def _order(time: Numbers) -> int:
+    """Return the largest degree of a decline over some time."""
+    return 1 + int(np.ceil(float(np.ptp(time)) / TREND))
+
+
+def _polynomials(span: Numbers, order: int) -> Numbers:
+    """Return Legendre's polynomials over a span, (n, order + 1)."""
+    middle, half = 0.5 * (span[0] + span[-1]), max(0.5 * (span[-1] - span[0]), 1e-9)
+    place = np.clip((span - middle) / half, -1.0, 1.0)
+    return np.asarray(np.polynomial.legendre.legvander(place, order))
+
+
+def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
+    """Return the curve through noisy values, its stiffness chosen by cross-validation."""
+    if len(time) < FEWEST:
+        return lambda at: np.asarray(np.interp(at, time, values))
+    spline = _spline_of(time.tobytes(), values.astype(float).tobytes())
+    return lambda at: np.asarray(spline(at))
+
+
+@lru_cache(maxsize=256)
+def _spline_of(time: bytes, values: bytes) -> BSpline:
+    """Return the spline of float64 samples; a fit, its check and its exports ask for the same."""
+    return make_smoothing_spline(np.frombuffer(time), np.frombuffer(values))
+
+
+def _averaged(series: Series) -> Series:
+    """Return the known readings (n, 1), the means of those that follow faster than `OFTEN`."""
+    known = np.isfinite(series.values[:, 0]) & (series.values[:, 0] > 0)
+    time, values = series.time[known], series.values[known, 0]
+    bins = np.floor((time - time[0]) * OFTEN + 1e-6).astype(int)
+    _, which, count = np.unique(bins, return_inverse=True, return_counts=True)
+    time, values = (np.bincount(which, weights=samples) / count for samples in (time, values))
+    return Series(time, values[:, None])
 
 
 def with_reference_voltage(vehicle: VehicleFile, flights: Sequence[Flight]) -> VehicleFile:

@@ -1,7 +1,7 @@
 """Which recorded signal is fed into the simulated loop, and as what.
 
 Each inlet of the simulator (`sim_jax.inlet`) has one class here, a
-`tuner.objective.recorded_inlet.RecordedInlet`: it says what a recording must hold to feed it, what
+`tuner.objective.recorded_inputs.RecordedInlet`: it says what a recording must hold to feed it, what
 the simulation then cannot be compared with, and how the recording is laid out. An inlet is added by
 one more class; `INLETS` lists them.
 """
@@ -30,8 +30,8 @@ from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from tuner.config.job import InletName
-from tuner.objective.recorded_inlet import RecordedInlet
 from tuner.objective.recorded_inputs import (
+    RecordedInlet,
     reference_points,
     with_body_rate,
     zeroed,

@@ -26,8 +26,7 @@ from tuner.objective.criterion import (
 )
 from tuner.objective.flown import Flown, fly
 from tuner.objective.initial_conditions import eliminated
-from tuner.objective.loss import gauss_newton, robust
-from tuner.objective.residuals import Reading, residuals
+from tuner.objective.residuals import Reading, gauss_newton, residuals, robust
 from tuner.objective.segments import OFFSETS
 from tuner.objective.tunable import Tunable
 

@@ -18,7 +18,7 @@ from tuner.vehicle import ControllerFile, VehicleFile, initial_values
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.registry import COEFFICIENTS
-from tuner.vehicle.size import Size, size_of, sized
+from tuner.vehicle.vehicle import Size, size_of, sized
 
 AS_TABLED = Size()
 OFF_BOUND = 0.05

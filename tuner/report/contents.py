@@ -9,13 +9,12 @@ from pathlib import Path
 from tuner.core.disk import exists, file_name
 from tuner.core.errors import InputError
 from tuner.design.next_flight_json import Proposals
-from tuner.evaluate.comparison_table import Table
+from tuner.evaluate.compare import Table
 from tuner.ground.bench_json import BenchRecord
 from tuner.recordings.flight import Array
 from tuner.report.record import About, Recording, SearchRecord, read_traces
 from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
-from tuner.uncertainty.global_sensitivity_json import GlobalSensitivity
-from tuner.uncertainty.profiles_json import Profiles
+from tuner.uncertainty.records import GlobalSensitivity, Profiles
 from tuner.uncertainty.sensitivity_json import Knowledge
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tuner.core.findings import Code, Finding
 from tuner.core.phrases import listed
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.ground.bench_json import BenchRecord
 from tuner.ground.texts import bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed, percent
-from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import EffectiveResult, Ending, FlightResult, LostTerm, PoseRmse, RunResult
 from tuner.uncertainty.calibration import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written

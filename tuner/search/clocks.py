@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_inverse, scaled_solve
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.normal_equations import normal_equations

@@ -19,9 +19,8 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.clocks import clocks_that_differ
 from tuner.search.evolution import CmaEs
-from tuner.search.free_starts import starts_asked_for
 from tuner.search.iteration import Iteration
-from tuner.search.least_squares import LeastSquares
+from tuner.search.least_squares import LeastSquares, starts_asked_for
 from tuner.search.loop import GAIN, with_loop
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
 from tuner.search.progress import Progress, criterion_of

@@ -35,3 +35,24 @@ class Iteration(Part):
     accepted: bool
     horizon: float
     damping: FiniteOrNone = None
+
+
+class PointEstimate(Part):
+    """A coefficient where a search ended.
+
+    Attributes
+    ----------
+    name
+        Of the coefficient.
+    unit
+        Of both numbers.
+    initial
+        Value in the vehicle or controller file.
+    estimate
+        Value where the search ended.
+    """
+
+    name: str
+    unit: str
+    initial: float
+    estimate: float

@@ -12,12 +12,44 @@ import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
-from tuner.objective.criterion import Point
+from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.search.free_starts import are_far, starts_asked_for
 from tuner.search.levenberg_marquardt import Step, advance, begin, on_host, proposed
 from tuner.search.optimiser import Iterate, Onward, Optimiser, StageProblem
 from tuner.search.weights import NEAR, worst_channels
+
+FAR = 5.0
+"""Standard deviations beyond which no start is believed to lie."""
+MOVED = 0.3
+"""Standard deviations by which a start may differ from the one about which it was linearised."""
+
+
+def starts_asked_for(
+    sums: SegmentSums | None, best: int, before: NDArray[np.float64] | None
+) -> NDArray[np.float64] | None:
+    """Return the segments' starts (L, F) that one of S points asks for.
+
+    Parameters
+    ----------
+    sums
+        At the points; None where they were not computed.
+    best
+        Number of the point.
+    before
+        (L, F) starts about which was linearised; None where they are known.
+    """
+    if before is None or sums is None or sums.states is None:
+        return before
+    asked = np.asarray(sums.states[best])
+    return np.clip(np.where(np.isfinite(asked), asked, before), -FAR, FAR)
+
+
+def are_far(starts: NDArray[np.float64] | None, reference: NDArray[np.float64] | None) -> bool:
+    """Return whether a linear model about some starts (L, F) is not to be trusted at others."""
+    if starts is None or reference is None:
+        return False
+    return bool(np.abs(starts - reference).max(initial=0.0) > MOVED)
+
 
 HANDED_ON = 0.01
 """Share of the loss: where a stage's normal equations promise no more, their step is not tried in

@@ -24,8 +24,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
-from tuner.objective.many_points import sums_at
 from tuner.objective.normal import Objective
 from tuner.objective.space import Coordinates
 from tuner.search.normal_equations import (

@@ -25,8 +25,8 @@ from tuner.core.findings import Code, Finding, Level
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Point, SegmentSums
-from tuner.objective.many_points import sums_at
 from tuner.objective.tunable import Tunable
 from tuner.search.fitted import Fitted
 from tuner.search.least_squares import LeastSquares

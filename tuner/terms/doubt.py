@@ -10,8 +10,7 @@ import numpy as np
 from tuner.core.numerics import scaled_solve, symmetric_eigen
 from tuner.terms.linear import RIDGE, Array, Columns, Linear
 from tuner.uncertainty.covariance import scatter
-from tuner.uncertainty.overdispersion import allowed_for
-from tuner.uncertainty.stretches import STRETCH
+from tuner.uncertainty.overdispersion import STRETCH, allowed_for
 
 HIDDEN, SMALLEST = 0.4, 0.1
 """Of the standard error with which the flights tell a term, and of its usual size (its prior's

@@ -15,8 +15,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_solve
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums
-from tuner.objective.many_points import sums_at
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.terms.linear import Columns, Linear

@@ -20,9 +20,15 @@ from tuner.objective.space import Space
 from tuner.search.findings import findings_at
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
-from tuner.terms.candidates import is_stand_in, names_in, presence_of, start_of
+from tuner.terms.candidates import (
+    is_stand_in,
+    names_in,
+    presence_of,
+    start_of,
+    with_free,
+    with_groups,
+)
 from tuner.terms.doubt import SMALLEST, in_doubt
-from tuner.terms.extension import extended, with_groups
 from tuner.terms.held_out_score import vector_after
 from tuner.terms.linear import Columns, Linear, linear_of
 from tuner.terms.score import EARNING, surviving
@@ -67,7 +73,7 @@ class Innovations:
     def of(selected: Selected, fitted: Fitted, predictor: Predictor) -> Innovations:
         """Return what the innovations of a predictor say at a fit, gains as they are."""
         names = [name for group in _outside(selected).values() for name in group]
-        _, wide = extended(selected.job, fitted, names)
+        _, wide = with_free(selected.job, fitted, names)
         beside = replace(predictor, simulator=wide.objective.simulator)
         information = beside.information(wide.objective, wide.point, fitted.criterion)
         space, vector = wide.objective.space, np.asarray(wide.point.coefficients)

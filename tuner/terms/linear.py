@@ -22,7 +22,7 @@ from tuner.objective.flight_batches import portion, portions
 from tuner.objective.information import BLOCK, FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
-from tuner.uncertainty.stretches import Stretches
+from tuner.uncertainty.overdispersion import Stretches
 from tuner.vehicle import REGISTRY
 from tuner.vehicle.coefficient import Parameter
 

@@ -40,15 +40,14 @@ from tuner.terms.candidates import (
     presence_of,
     reads_recording,
     start_of,
+    with_groups,
     with_terms,
 )
 from tuner.terms.doubt import in_doubt
-from tuner.terms.extension import with_groups
 from tuner.terms.held_out_score import predicted_losses, vector_after
 from tuner.terms.linear import linear_at
-from tuner.terms.rows import row_of
 from tuner.terms.score import Score, score, surviving
-from tuner.terms.selection_state import Selected, Standing, offsets_of
+from tuner.terms.selection_state import Selected, Standing, offsets_of, row_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from tuner.core.numerics import Inverse, scaled_root, symmetric_eigen
 from tuner.objective.information import FisherInformation
-from tuner.uncertainty.independent import IndependentErrors
-from tuner.uncertainty.stretches import Stretches, stretches_of
+from tuner.uncertainty.overdispersion import IndependentErrors, Stretches, stretches_of
 
 Array = NDArray[np.float64]
 

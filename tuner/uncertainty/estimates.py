@@ -18,8 +18,8 @@ from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.directions import Direction, weakest
-from tuner.uncertainty.error_parts import ErrorParts
 from tuner.uncertainty.parts import Spread, spread_of
+from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Precision, Reason, Verdict, judge
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter

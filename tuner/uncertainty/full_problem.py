@@ -14,7 +14,7 @@ from tuner.objective.normal import Objective
 from tuner.objective.space import Space
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
-from tuner.vehicle.size import Size, sized
+from tuner.vehicle.vehicle import Size, sized
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
-from tuner.uncertainty.global_sensitivity_json import (
+from tuner.uncertainty.records import (
     GlobalSensitivity,
     Method,
     SensitivityIndex,

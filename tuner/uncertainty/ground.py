@@ -13,7 +13,7 @@ from tuner.core.numerics import scaled_inverse, unit_diagonal
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.sources import CONFLICT, Sources
+from tuner.uncertainty.records import CONFLICT, Sources
 from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]

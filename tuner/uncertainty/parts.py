@@ -11,9 +11,8 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 from tuner.core.numerics import Z95, Inverse
 from tuner.objective.alternatives import DRAWS, READINGS, STEP
 from tuner.objective.information import FisherInformation
-from tuner.uncertainty.error_parts import ErrorParts
-from tuner.uncertainty.independent import IndependentErrors
-from tuner.uncertainty.stretches import parts_of
+from tuner.uncertainty.overdispersion import IndependentErrors, parts_of
+from tuner.uncertainty.records import ErrorParts
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from tuner.search.levenberg_marquardt import advance, begin, on_host
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import FullProblem
-from tuner.uncertainty.profiles_json import THRESHOLD, Profile
+from tuner.uncertainty.records import THRESHOLD, Profile
 from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.core.numerics import Z95
 from tuner.core.phrases import listed, percent, quantity
 from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.error_parts import ErrorParts
+from tuner.uncertainty.records import ErrorParts
 from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
 from tuner.vehicle import scale_group
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tuner.core.numerics import Z95
 from tuner.objective.criterion import Criterion, Jacobian
 from tuner.objective.normal import Objective
-from tuner.uncertainty.residual import Residual
+from tuner.uncertainty.records import Residual
 
 Array = NDArray[np.float64]
 

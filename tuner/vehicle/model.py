@@ -21,7 +21,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Aerodynamics, Body, Motor, Rotor, Setup, Vehicle
 from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, initial_values
-from tuner.vehicle.size import size_of
+from tuner.vehicle.vehicle import size_of
 
 RADIUS = 0.13
 """m of the rotors of a vehicle of the registry's size; those of others are in proportion."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field, JsonValue, model_validator
 
 from tuner.core.disk import write_text
@@ -20,7 +22,40 @@ from tuner.core.yaml_section import (
     refuse,
 )
 from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.coefficient import Coefficient
 from tuner.vehicle.motor_orders import MotorOrder
+
+MASS, ARM = 2.079, 0.25
+"""kg, and m from the middle to a rotor, of the vehicle that the registry's numbers are made for."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """Mass and arm of a vehicle over those of the registry's."""
+
+    mass: float = 1.0
+    arm: float = 1.0
+
+
+def size_of(vehicle: VehicleFile) -> Size:
+    """Return how large a vehicle is."""
+    arm = float(np.mean([np.hypot(*rotor.position[:2]) for rotor in vehicle.rotors]))
+    return Size(vehicle.mass / MASS, arm / ARM)
+
+
+def sized(row: Coefficient, size: Size) -> Coefficient:
+    """Return a coefficient's row with bounds, prior and step as they are for a vehicle's size.
+
+    Logarithms need none: their limits are factors.
+    """
+    if row.scale == "log":
+        return row
+    ratio = size.mass**row.mass_exponent * size.arm**row.length_exponent
+    bounds = row.bounds
+    if isinstance(bounds, tuple):
+        bounds = (bounds[0] * ratio, bounds[1] * ratio)
+    return replace(row, bounds=bounds, prior_sd=row.prior_sd * ratio, step=row.step * ratio)
+
 
 #: What the quad-X mixer assumes of each rotor in PX4's order: sign of x, sign of y, spin.
 QUAD_X = ((+1, -1, "ccw"), (-1, +1, "ccw"), (+1, +1, "cw"), (-1, -1, "cw"))

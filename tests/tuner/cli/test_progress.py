@@ -9,8 +9,7 @@ from rich.console import Console
 
 from tuner.cli.progress import DOING, _MovingLine, listening
 from tuner.core.spans import span, watching
-from tuner.search.iteration import Iteration
-from tuner.search.point_estimate import PointEstimate
+from tuner.search.iteration import Iteration, PointEstimate
 
 MESSAGE = "Examining [how well] each coefficient is known, of which there are many." * 4
 

@@ -8,7 +8,7 @@ from tests.tuner.report.conftest import FREE, ROLLING
 from tests.tuner.wording.test_findings import MADE
 from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.core.findings import Finding
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.result import read_run
 from tuner.vehicle import COEFFICIENTS
 

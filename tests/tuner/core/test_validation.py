@@ -53,7 +53,7 @@ def models() -> list[type[BaseModel]]:
                 "tuner.engine.cluster_file",
                 "tuner.recordings.topics",
                 "tuner.service.request",
-                "tuner.evaluate.plan",
+                "tuner.evaluate.simulate",
                 "tuner.config.trajectory_settings",
             )
         ):

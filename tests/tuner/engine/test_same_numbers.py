@@ -14,14 +14,17 @@ from tuner.config import Options, TrajectorySettings, settle
 from tuner.engine import using
 from tuner.evaluate import simulate as simulation
 from tuner.evaluate.simulate import simulate
-from tuner.objective.batch import evaluate
+from tuner.job.sensitivity import unfitted
+from tuner.objective.batch import evaluate, sums_at
 from tuner.objective.criterion import Point
-from tuner.objective.many_points import sums_at
 from tuner.search.job_flights import read_recordings
 from tuner.search.problem import job_of
-from tuner.search.unfitted import unfitted
-from tuner.uncertainty.bootstrap import BOOTSTRAP_FILE, bootstrap
-from tuner.uncertainty.cross_validation import CROSS_VALIDATION_FILE, cross_validate
+from tuner.uncertainty.refits import (
+    BOOTSTRAP_FILE,
+    CROSS_VALIDATION_FILE,
+    bootstrap,
+    cross_validate,
+)
 from tuner.vehicle import ControllerFile
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")

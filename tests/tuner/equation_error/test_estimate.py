@@ -12,9 +12,9 @@ from tuner.config import Options, settle
 from tuner.config.job import Search
 from tuner.equation_error.estimate import GAINS
 from tuner.equation_error.measured import measured
-from tuner.equation_error.turning import predicts_turning, regressors
 from tuner.job.accelerations import with_accelerations
 from tuner.recordings.flight import Series
+from tuner.search.inlet_choice import predicts_turning, regressors
 from tuner.search.job_flights import read_usable
 from tuner.search.problem import job_of
 

@@ -11,9 +11,8 @@ from tuner.cli import main
 from tuner.config import Options
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.compare import compare, table_of
+from tuner.evaluate.compare import compare, table_of, write_table
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.comparison_table import write_table
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile
 

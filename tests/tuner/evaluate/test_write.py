@@ -6,9 +6,8 @@ import pandas as pd
 import pytest
 
 from tuner.core.errors import InputError
-from tuner.evaluate.plan import fly, grid_of
-from tuner.evaluate.simulation_table import roll_pitch_yaw, write_csv
-from tuner.evaluate.write import summary_of, write_flights
+from tuner.evaluate.simulate import fly, grid_of
+from tuner.evaluate.write import roll_pitch_yaw, summary_of, write_csv, write_flights
 from tuner.recordings.loader import load_flight
 
 COLUMNS = [

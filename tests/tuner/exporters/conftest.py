@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.result import CoefficientResult, FlightResult, RunResult, SearchResult, read_run
 from tuner.vehicle import COEFFICIENTS, read_vehicle, values_of, with_values, write_vehicle
 

@@ -8,7 +8,7 @@ import pytest
 from tests.tuner.terms.making import unfitted_with
 from tests.tuner.uncertainty.making import problem, vehicle_file, with_data
 from tuner.config import JobFile
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.exporters.effective import (
     carried_terms,
     effective_fit,
@@ -20,7 +20,7 @@ from tuner.exporters.effective import (
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
 from tuner.result import PoseRmse
-from tuner.terms.extension import extended
+from tuner.terms.candidates import extended
 from tuner.vehicle import values_of
 
 DRAG = 0.04

@@ -26,8 +26,8 @@ from tuner.recordings.notes import Cause
 from tuner.report import render
 from tuner.report.record import SearchRecord
 from tuner.result import read_run
+from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import Recording
-from tuner.search.point_estimate import PointEstimate
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
 from tuner.wording.findings import sentence
 

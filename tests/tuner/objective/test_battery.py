@@ -19,12 +19,15 @@ from tests.tuner.uncertainty.making import (
 from tuner.core.errors import RecordingError
 from tuner.objective.alternatives import DRAWS, STEP, alternatives_of
 from tuner.objective.battery import (
+    IDLE,
+    _resistance,
     log_voltage_of,
+    read_again,
     require_voltage,
+    voltages_of,
     with_reference_voltage,
 )
 from tuner.objective.criterion import Point
-from tuner.objective.voltage import IDLE, _resistance, read_again, voltages_of
 from tuner.objective.windows import Window
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.search.normal_equations import normal_equations

@@ -11,7 +11,8 @@ from tuner.core.shipped import find_config
 from tuner.design.log_proposal import LogProposal
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.forces import Forces
-from tuner.evaluate.rmse import FlightErrors, PredictedErrors, SignalErrors
+from tuner.evaluate.records import PredictedErrors
+from tuner.evaluate.rmse import FlightErrors, SignalErrors
 from tuner.report import write_traces
 from tuner.report.record import SearchRecord, Start
 from tuner.result import (
@@ -27,14 +28,14 @@ from tuner.result import (
 )
 from tuner.search.iteration import Iteration
 from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.residual import Residual
+from tuner.uncertainty.records import Residual
 from tuner.uncertainty.sensitivity_json import (
     CoefficientKnowledge,
     EffectOverTime,
     Knowledge,
     OutputSensitivity,
+    write_files,
 )
-from tuner.uncertainty.tables import write_files
 from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
 from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle

@@ -6,7 +6,7 @@ import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.core.findings import Code, Finding
-from tuner.evaluate.rmse import AxesRmse
+from tuner.evaluate.records import AxesRmse
 from tuner.report.outcome import Standing, counted, next_step, outcome, warnings_of
 from tuner.uncertainty.verdict import Verdict
 

@@ -1,7 +1,7 @@
 from types import SimpleNamespace
 
 from tuner.report.sections.tables import sources
-from tuner.uncertainty.sources import Sources
+from tuner.uncertainty.records import Sources
 
 
 def contents(**by_name):

@@ -11,7 +11,7 @@ from tuner.objective.criterion import Point
 from tuner.objective.initial_conditions import ROWS, freedom_of_spin
 from tuner.objective.segments import OFFSETS
 from tuner.search.continuation import grow
-from tuner.search.free_starts import FAR, are_far, starts_asked_for
+from tuner.search.least_squares import FAR, are_far, starts_asked_for
 from tuner.search.optimiser import Free
 from tuner.search.progress import beginning, criterion_of
 from tuner.search.stages import plan

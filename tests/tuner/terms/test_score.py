@@ -7,8 +7,8 @@ import pytest
 
 from tuner.terms.held_out_score import lost_by_sections
 from tuner.terms.linear import Linear
-from tuner.terms.rows import row_of
 from tuner.terms.score import Score, _Gain, score, surviving
+from tuner.terms.selection_state import row_of
 from tuner.vehicle.selection_table import SelectionCode
 
 MODEL, FIRST, SECOND, COPY = (np.array([i]) for i in range(4))

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tuner.terms.test_score import FLIGHTS, MODEL, STRETCHES, by_flight, linear_fit
-from tuner.terms.score import score
-from tuner.terms.steady import chance_of_gusts
+from tuner.terms.score import chance_of_gusts, score
 
 WINDS, STILL = 3 + np.arange(FLIGHTS), np.zeros(3 + FLIGHTS)
 

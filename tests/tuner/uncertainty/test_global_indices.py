@@ -10,7 +10,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.normal import Objective
 from tuner.uncertainty.global_indices import _outputs, global_sensitivity
-from tuner.uncertainty.global_sensitivity_json import (
+from tuner.uncertainty.records import (
     GlobalSensitivity,
     Method,
 )

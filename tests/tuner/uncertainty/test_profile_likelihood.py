@@ -18,7 +18,7 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
-from tuner.uncertainty.profiles_json import Profile, Profiles
+from tuner.uncertainty.records import Profile, Profiles
 
 FREE = (
     "inertia_xx",

@@ -9,8 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.report.result_texts import refits_in_words
 from tuner.report.sections.tables import refits
-from tuner.uncertainty.cross_validation import Fold, jackknife_errors
-from tuner.uncertainty.refits import _counted
+from tuner.uncertainty.refits import Fold, _counted, jackknife_errors
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 

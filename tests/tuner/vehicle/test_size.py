@@ -18,7 +18,7 @@ from tuner.core.shipped import find_config
 from tuner.objective.space import space_of
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, read_vehicle, with_values
 from tuner.vehicle.model import model_of
-from tuner.vehicle.size import Size, size_of, sized
+from tuner.vehicle.vehicle import Size, size_of, sized
 
 SMALL = Size(mass=0.015, arm=0.2)
 LINEAR = [

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.evaluate.rmse import RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,

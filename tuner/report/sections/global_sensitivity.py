@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.report.chart import PALETTE, Bars, Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section, Table, figures
-from tuner.uncertainty.global_sensitivity_json import MEANING, GlobalSensitivity
+from tuner.uncertainty.records import MEANING, GlobalSensitivity
 
 
 def global_sensitivity(contents: Contents) -> Section | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tuner.report.chart import FITTED, GREY, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section, figures
-from tuner.uncertainty.profiles_json import THRESHOLD, Profile
+from tuner.uncertainty.records import THRESHOLD, Profile
 
 HIGHEST = 12.0
 """Of χ² above the lowest that is drawn."""

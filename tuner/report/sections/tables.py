@@ -11,7 +11,7 @@ from tuner.design.texts import next_log_in_words
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
-from tuner.uncertainty.sources import CONFLICT
+from tuner.uncertainty.records import CONFLICT
 from tuner.vehicle import COEFFICIENTS
 from tuner.wording.findings import remedy, sentence
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pydantic import ValidationError
 
 from tuner.core.files import MAX_BYTES
-from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, FlightResult, RunResult
 from tuner.service import jobs
 from tuner.service.database import Database

@@ -21,7 +21,7 @@ from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
 from tuner.core.validation import config_error
 from tuner.core.yaml_document import read_yaml
-from tuner.evaluate.rmse import RMSE_UNITS
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.outcome import flights_table, outcome, warnings_of
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
