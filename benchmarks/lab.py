@@ -23,6 +23,7 @@ from benchmarks.table import Section, figure
 from sim_jax.schedule import Schedule
 from tuner.config import Options, settle
 from tuner.engine import Report, engine_for
+from tuner.findings.findings import one_line
 from tuner.job.listener import SILENT
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
@@ -36,7 +37,6 @@ from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Estimate, Uncertainty
 from tuner.vehicle import COEFFICIENTS, values_of
-from tuner.wording.findings import one_line
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
 WORKERS = int(os.environ.get("TUNE_LAB_WORKERS", "0")) or None

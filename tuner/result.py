@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 from tuner.core.disk import exists
 from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile
-from tuner.core.findings import Finding
 from tuner.design.log_proposal import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
+from tuner.findings.findings import Finding
 from tuner.uncertainty.records import ErrorParts, Sources
 from tuner.uncertainty.verdict import Reason, Verdict
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle

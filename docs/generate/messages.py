@@ -16,8 +16,7 @@ from pathlib import Path
 
 from docs.generate.text import GENERATED
 from tuner import __file__ as _package
-from tuner.core.findings import Code
-from tuner.wording.findings import TEXTS
+from tuner.findings.findings import Code
 
 PACKAGE = Path(_package).parent
 UNKNOWN = "…"
@@ -111,7 +110,7 @@ def messages_page() -> str:
         parts.append("")
     parts.append(FINDINGS)
     for code in Code:
-        text, remedy = TEXTS[code]
+        text, remedy = code.sentence, code.remedy
         if code in IN_OTHER_WORDS or not isinstance(text, str):
             text, remedy = IN_OTHER_WORDS.get(code, IN_ITS_OWN), ""
         line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, f"{text} {remedy}".strip()))

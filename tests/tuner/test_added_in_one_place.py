@@ -19,6 +19,7 @@ from annotated_types import Interval
 from cyclopts import App
 
 import tuner
+from docs.generate.models import sections_of
 from sim_jax.environment import Environment
 from sim_jax.numeric import safe_sqrt
 from sim_jax.rigid_body import Wrench
@@ -36,6 +37,7 @@ from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.write import write_flights
 from tuner.exporters.draft import Draft, differences
 from tuner.exporters.target import Target, registered
+from tuner.findings.findings import Finding, Worded, brief, one_line
 from tuner.options import FILES, Options
 from tuner.recordings.inspection import inspect_recordings
 from tuner.vehicle import (
@@ -50,6 +52,7 @@ from tuner.vehicle import (
     with_values,
     write_vehicle,
 )
+from tuner.vehicle.controller import Flag, Mixer
 
 NAME = "sail_drag"
 TRUTH = 0.06
@@ -241,3 +244,43 @@ def test_a_coefficient_and_its_term_are_fitted_judged_reported_and_exported(upda
     assert any("is not exported: the motor plugins know no sail" in note for note in sdf.notes)
     with pytest.raises(ExportError, match=f"{NAME} is .* which --format px4 can neither write"):
         tuner.export(run, "px4")
+
+
+class More(Worded):
+    SAIL_TORN = ("sail_torn", "Its {first} tore after {seconds:.0f} s.", "Mend it.")  # seconds
+
+
+def test_a_finding_is_one_entry_with_its_sentence_and_remedy():
+    finding = Finding(More.SAIL_TORN, "warning", "circle", {"seconds": 3.0}, ("main_sail",))
+    assert one_line(finding) == "warning: circle: Its main sail tore after 3 s. Mend it."
+    assert brief(finding, 60).startswith("circle: Its main sail tore")
+    with pytest.raises(TypeError):
+        Worded("SAIL", {"TORN": "torn"})  # no code without its sentence
+
+
+class SwitchedMixer(Mixer):
+    """PX4's quad-X mixer, and one switch more.
+
+    Attributes
+    ----------
+    battery_compensation
+        ``MC_BAT_SCALE_EN``.
+    """
+
+    battery_compensation: Flag = False
+
+
+class SwitchedFile(ControllerFile):
+    """A controller file with that mixer."""
+
+    mixer: SwitchedMixer = SwitchedMixer()
+
+
+def test_a_controller_switch_is_one_field_of_the_file_and_its_page():
+    given = build(SwitchedFile, {"mixer": {"battery_compensation": True}}, "quad.yaml")
+    assert given.mixer.battery_compensation
+    with pytest.raises(ConfigError, match=r"battery_compensation"):
+        build(SwitchedFile, {"mixer": {"battery_compensation": "perhaps"}}, "quad.yaml")
+    assert "`battery_compensation` | true or false | `false` | `MC_BAT_SCALE_EN`." in sections_of(
+        SwitchedFile
+    )

@@ -4,7 +4,7 @@ import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
 from tuner.core.errors import InputError
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.result import read_run
 
 

@@ -96,8 +96,8 @@ def _origins(result: RunResult) -> list[str]:
 
 
 def _warnings(result: RunResult) -> list[Text]:
+    from tuner.findings.findings import brief
     from tuner.report.outcome import by_weight
-    from tuner.wording.findings import brief
 
     found = by_weight(result.findings)
     lines = [Text(f"! {brief(one, WIDTH - 2)}", "yellow") for one in found[:MOST_WARNINGS]]
@@ -218,10 +218,10 @@ def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
 
 def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> None:
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
+    from tuner.findings.findings import one_line
     from tuner.report.contents import read_contents
     from tuner.report.sections import sections_of
     from tuner.uncertainty.verdict_texts import direction_in_words
-    from tuner.wording.findings import one_line
 
     screen = console()
     for section in sections_of(read_contents(result.folder)):

@@ -15,9 +15,9 @@ from tuner.core.shipped import find_config
 from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.evaluate.rmse import FlightErrors, rmse_of
+from tuner.findings.findings import one_line
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import VehicleFile, read_vehicle
-from tuner.wording.findings import one_line
 
 TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
 

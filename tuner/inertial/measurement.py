@@ -17,6 +17,7 @@ import numpy as np
 
 from tuner.core.errors import RecordingError
 from tuner.core.phrases import clause
+from tuner.findings.findings import remedy, sentence
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
@@ -25,7 +26,6 @@ from tuner.objective.motor_order import order_findings
 from tuner.recordings.inertial import InertialFlight
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import model_of
-from tuner.wording.findings import remedy, sentence
 
 NUMBERS = (
     ("time_constant_up",),

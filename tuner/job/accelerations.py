@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.core.errors import ConfigError
-from tuner.core.findings import Code, Finding
 from tuner.equation_error.estimate import GAINS, Estimate, estimate
 from tuner.equation_error.measured import measured
+from tuner.findings.findings import Code, Finding
 from tuner.objective.space import extended
 from tuner.search.problem import Job, job_of
 from tuner.terms.candidates import candidate_groups, start_of

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sim_jax.control.mixer import ROTORS
 from sim_jax.numeric import GRAVITY
-from tuner.core.findings import Code, Finding
 from tuner.core.numerics import symmetric_eigen, unit_diagonal
+from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import Source, squared_speed
 from tuner.objective.inlets import INLETS, bypassed_by
 from tuner.objective.motor_order import order_findings

@@ -12,10 +12,10 @@ from pydantic import JsonValue
 
 from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError
-from tuner.core.findings import Code, Finding
 from tuner.core.numerics import Z95
 from tuner.core.shipped import find_config
 from tuner.core.versions import PROGRAM, versions
+from tuner.findings.findings import Code, Finding
 from tuner.ground.bench_json import bench_record
 from tuner.ground.combine import Combination, combine
 from tuner.ground.experiments import measure, names_of

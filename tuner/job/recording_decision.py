@@ -7,13 +7,12 @@ from pathlib import Path
 
 from tuner.config import Settings
 from tuner.core.errors import InputError
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding, sentence
 from tuner.job.recording_verdict import Verdict
 from tuner.job.without_pose import without_pose
 from tuner.objective.inlets import bypassed_by
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import COEFFICIENTS
-from tuner.wording.findings import sentence
 
 
 def decided(path: Path, settings: Settings) -> Verdict:

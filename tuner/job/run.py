@@ -16,7 +16,6 @@ from pathlib import Path
 from tuner.config import Options, Settings, settle
 from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
-from tuner.core.findings import Finding
 from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.log_job import what_to_log
@@ -34,6 +33,7 @@ from tuner.exporters.effective import Effective, effective_fit
 from tuner.exporters.effective_of_run import kept_effective
 from tuner.exporters.export import exports_of_job
 from tuner.exporters.refly import refly
+from tuner.findings.findings import Finding, remedy, sentence
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
 from tuner.job.examination_files import write_knowledge, write_next_flight
@@ -63,7 +63,6 @@ from tuner.uncertainty.ground import ground_conflicts, sources_of
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
-from tuner.wording.findings import remedy, sentence
 
 
 def run(

@@ -12,7 +12,7 @@ import numpy as np
 from tuner.config import Settings
 from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, InputError, RecordingError
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.ground.combine import Combination, combine
 from tuner.ground.measurement import Measurement
 from tuner.ground.scales import value_of

@@ -14,7 +14,7 @@ from itertools import permutations
 import numpy as np
 from scipy import signal
 
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import (
     Source,
     common_clock,

@@ -27,7 +27,7 @@ from sim_jax.control.position import (
 )
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.vehicle import ControllerFile

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from tuner.core.findings import Code, Finding
 from tuner.core.phrases import listed
 from tuner.evaluate.records import AxesRmse
+from tuner.findings.findings import Code, Finding, remedy, sentence
 from tuner.ground.bench_json import BenchRecord
 from tuner.ground.texts import bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks
@@ -21,7 +21,6 @@ from tuner.result import FlightResult, RunResult
 from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
-from tuner.wording.findings import remedy, sentence
 
 AT_NOISE = 1.5
 """Times the noise up to which what remains of a flight is called noise."""

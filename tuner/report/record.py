@@ -12,7 +12,7 @@ from pydantic import JsonValue
 
 from tuner.core.disk import file_name, whole_file
 from tuner.core.files import FiniteOrNone, Part, ResultFile, read_arrays
-from tuner.core.findings import Finding
+from tuner.findings.findings import Finding
 from tuner.search.iteration import Iteration
 
 if TYPE_CHECKING:  # a page is drawn without jax

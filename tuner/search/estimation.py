@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tuner.core.disk import whole_file
 from tuner.core.errors import InputError
 from tuner.core.files import read_arrays
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.inlets import INLETS
 from tuner.objective.normal import Objective

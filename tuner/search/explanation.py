@@ -7,9 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from tuner.core.errors import EngineError, OutputError
-from tuner.core.findings import Code, Finding
 from tuner.core.spans import span
-from tuner.wording.findings import one_line
+from tuner.findings.findings import Code, Finding, one_line
 
 logger = logging.getLogger(__name__)
 

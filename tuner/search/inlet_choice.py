@@ -10,9 +10,9 @@ import numpy as np
 
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
-from tuner.core.findings import Code, Finding
 from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.regression import convolved
+from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import Explained, Source, explained, levers
 from tuner.objective.inlets import INLETS
 from tuner.objective.motor_order import motor_order

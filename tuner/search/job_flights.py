@@ -14,8 +14,8 @@ from tuner.config import Settings, TrajectorySettings
 from tuner.config.job import InletName
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError, did_you_mean
-from tuner.core.findings import Code, Finding
 from tuner.core.yaml_section import build
+from tuner.findings.findings import Code, Finding
 from tuner.objective.allocation import with_commands
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.motor_order import flight_in_rotor_order

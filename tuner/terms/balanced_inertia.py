@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sim_jax.markers import markers_of
-from tuner.core.findings import Code, Finding, Level
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
+from tuner.findings.findings import Code, Finding, Level
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.balance import Balance, balance_of
 from tuner.objective.batch import sums_at

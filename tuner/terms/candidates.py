@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from tuner.config import JobFile
-from tuner.core.findings import Finding
+from tuner.findings.findings import Finding
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective, with_conditions
 from tuner.objective.space import Space, extended

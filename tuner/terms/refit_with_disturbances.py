@@ -9,12 +9,12 @@ from functools import partial
 
 import numpy as np
 
-from tuner.core.findings import Code, Finding
 from tuner.core.phrases import listed
 from tuner.disturbances.information import hidden
 from tuner.disturbances.predictor import Predictor
 from tuner.disturbances.recorded import FLIGHT_CONTROLLER
 from tuner.disturbances.refit import STEPS, with_least_innovations
+from tuner.findings.findings import Code, Finding
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Point
 from tuner.search.estimation import free_offsets

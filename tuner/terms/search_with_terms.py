@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tuner.core.findings import Finding
 from tuner.core.spans import span
 from tuner.evaluate.held_out import point_estimates
+from tuner.findings.findings import Finding
 from tuner.objective.battery import require_voltage
 from tuner.objective.inlets import INLETS
 from tuner.objective.space import extended

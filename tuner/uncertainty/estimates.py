@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.findings import Code, Finding
 from tuner.core.numerics import Z95, scaled_inverse
+from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import Point
 from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space

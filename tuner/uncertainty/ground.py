@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.findings import Code, Finding
 from tuner.core.numerics import scaled_inverse, unit_diagonal
+from tuner.findings.findings import Code, Finding
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty

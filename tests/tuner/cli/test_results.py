@@ -3,12 +3,12 @@
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
+from tests.tuner.findings.test_findings import MADE
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
-from tests.tuner.wording.test_findings import MADE
 from tuner.cli.results import LINES, WIDTH, print_run
-from tuner.core.findings import Finding
 from tuner.evaluate.records import AxesRmse
+from tuner.findings.findings import Finding
 from tuner.result import read_run
 from tuner.vehicle import COEFFICIENTS
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from tuner.core.findings import Code
 from tuner.evaluate.predict import input_lag, with_inputs_on_time
+from tuner.findings.findings import Code
 from tuner.objective.motor_order import order_findings
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.states import initial_state

@@ -9,8 +9,8 @@ import pytest
 from tests.tuner.recordings.micro_sd import log_of
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
-from tuner.core.findings import Code
 from tuner.evaluate.simulate import simulate
+from tuner.findings.findings import Code, one_line
 from tuner.inertial.ahead import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed
@@ -21,7 +21,6 @@ from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_usable
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, with_values
-from tuner.wording.findings import one_line
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 LATENCY = 0.004

@@ -8,7 +8,7 @@ import pytest
 from tests.tuner.job.test_windows import stage_for
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
-from tuner.core.findings import Code
+from tuner.findings.findings import Code, one_line
 from tuner.objective.inlets import TURNING
 from tuner.objective.motor_order import MotorOrder
 from tuner.recordings.flight import Series
@@ -18,7 +18,6 @@ from tuner.search.inlet_choice import choose_inlet
 from tuner.search.job_flights import read_usable, recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle import ControllerFile, values_of, with_values
-from tuner.wording.findings import one_line
 
 EXPONENT = 0.8
 FULL = 16.6

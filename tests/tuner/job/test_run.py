@@ -17,8 +17,8 @@ from tuner.cli import main
 from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.config import Options
 from tuner.core.errors import InputError
-from tuner.core.findings import Code
 from tuner.evaluate.comparison import Comparison
+from tuner.findings.findings import Code, sentence
 from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.recordings.loader import load_flight
@@ -29,7 +29,6 @@ from tuner.result import read_run
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_controller, read_vehicle, values_of
-from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 MECHANICAL = (

@@ -9,7 +9,7 @@ import pytest
 
 from tuner.config import Options
 from tuner.core.errors import InputError
-from tuner.core.findings import Code
+from tuner.findings.findings import Code
 from tuner.job.run import run
 from tuner.result import read_run
 

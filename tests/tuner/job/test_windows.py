@@ -8,8 +8,8 @@ import pytest
 from tuner.config import JobFile, Options, settle
 from tuner.config.job import FlightSettings, Search
 from tuner.core.errors import ConfigError
-from tuner.core.findings import Code
 from tuner.evaluate.comparison import Comparison
+from tuner.findings.findings import Code
 from tuner.job.check import check
 from tuner.search.estimation import search
 from tuner.search.job_flights import recordings_of

@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from tuner.config import Options
-from tuner.core.findings import Code
+from tuner.findings.findings import Code
 from tuner.job.ground import bench
 from tuner.job.run import run
 

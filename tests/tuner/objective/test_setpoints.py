@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tuner.core.findings import Code
+from tuner.findings.findings import Code, one_line
 from tuner.objective.setpoints import match_setpoints, setpoint_findings
 from tuner.recordings.flight import Series
 from tuner.search.inlet_choice import choose_inlet
 from tuner.vehicle import ControllerFile
-from tuner.wording.findings import one_line
 
 OURS = ControllerFile()
 

@@ -16,14 +16,13 @@ from tests.tuner.recordings import making
 from tuner.cli import main
 from tuner.config import Options, settle
 from tuner.core.errors import RecordingError
-from tuner.core.findings import Code
+from tuner.findings.findings import Code, one_line
 from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import contradiction, noted_contradiction
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
 from tuner.search.job_flights import load_flights, read_usable
-from tuner.wording.findings import one_line
 
 SHARED = Path(__file__).parents[4] / "shared"
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", SHARED / "flights"))

@@ -9,7 +9,7 @@ import pytest
 
 from tests.tuner.recordings import making
 from tuner.config import Options, settle
-from tuner.core.findings import Code
+from tuner.findings.findings import Code
 from tuner.recordings import inspect_recordings
 from tuner.recordings.flight import Series
 from tuner.recordings.missions import FITTED, PIECE, Mission, manoeuvres

@@ -9,7 +9,7 @@ import pytest
 
 from tests.tuner.recordings import making
 from tuner.config import Options, settle
-from tuner.core.findings import Code
+from tuner.findings.findings import Code, one_line
 from tuner.job.recording_verdict import Verdict, in_words, verdict_of
 from tuner.recordings import inspect_recordings, load_flight
 from tuner.recordings.notes import NoteCode
@@ -17,7 +17,6 @@ from tuner.recordings.px4 import advice_of, settings_in_words
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.motor_orders import motor_order_of
-from tuner.wording.findings import one_line
 
 PARAMETERS = {
     "MC_ROLLRATE_P": 0.15,

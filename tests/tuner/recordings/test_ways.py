@@ -15,6 +15,7 @@ from scipy.io import savemat
 from tests.tuner.recordings import ways
 from tuner.config import Options, settle
 from tuner.core.errors import ConfigError, RecordingError
+from tuner.findings.findings import one_line
 from tuner.objective.explained import levers
 from tuner.objective.motor_order import order_findings
 from tuner.recordings import Flight, load_flight
@@ -26,7 +27,6 @@ from tuner.recordings.notes import NoteCode
 from tuner.recordings.suggestion import suggested_map
 from tuner.search.job_flights import read_recordings
 from tuner.vehicle import read_vehicle, with_values
-from tuner.wording.findings import one_line
 
 COLUMNS = {
     "position": ("x", "y", "z"),

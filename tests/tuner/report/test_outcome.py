@@ -5,8 +5,8 @@ import math
 import pytest
 
 from tests.tuner.exporters.conftest import make_run  # noqa: F401 (a fixture)
-from tuner.core.findings import Code, Finding
 from tuner.evaluate.records import AxesRmse
+from tuner.findings.findings import Code, Finding
 from tuner.report.outcome import Standing, counted, next_step, outcome, warnings_of
 from tuner.uncertainty.verdict import Verdict
 

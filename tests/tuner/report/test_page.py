@@ -11,7 +11,7 @@ import pytest
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.core.errors import InputError
-from tuner.core.findings import Code, Finding
+from tuner.findings.findings import Code, Finding
 from tuner.report import render
 from tuner.report.contents import read_contents
 from tuner.report.record import SearchRecord

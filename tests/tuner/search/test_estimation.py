@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty.making import fitted_of, problem, truth
 from tuner.config import JobFile
 from tuner.config.job import Search
-from tuner.core.findings import Code
+from tuner.findings.findings import Code, sentence
 from tuner.objective.space import space_of
 from tuner.search import estimation as module
 from tuner.search.estimation import starting_vectors
@@ -19,7 +19,6 @@ from tuner.search.loop import USUAL
 from tuner.search.stages import left, plan
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.vehicle import ControllerFile
-from tuner.wording.findings import sentence
 
 FREE = ("inertia_xx", "motor_constant", "estimate_latency")
 

@@ -9,14 +9,13 @@ import pytest
 
 from tuner.config import Options
 from tuner.core.errors import OutputError
-from tuner.core.findings import LARGEST, Code, Finding
+from tuner.findings.findings import LARGEST, Code, Finding, one_line
 from tuner.job.listener import Listener
 from tuner.job.run import run
 from tuner.result import read_run
 from tuner.search.explanation import Explanation
 from tuner.terms import refit_with_disturbances as disturbances
 from tuner.uncertainty.verdict import Verdict
-from tuner.wording.findings import one_line
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 JOB = """

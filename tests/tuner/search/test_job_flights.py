@@ -7,6 +7,7 @@ import pytest
 
 from tuner.config import JobFile, Options, settle
 from tuner.core.errors import InputError, RecordingError
+from tuner.findings.findings import sentence
 from tuner.search.job_flights import (
     Recording,
     read_recordings,
@@ -14,7 +15,6 @@ from tuner.search.job_flights import (
     recordings_of,
     with_offsets,
 )
-from tuner.wording.findings import sentence
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
 SPIN, CIRCLE = "yaw_spin_3rps", "circle_4mps"

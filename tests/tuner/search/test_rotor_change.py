@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tuner.config import Options, settle
-from tuner.core.findings import Code
+from tuner.findings.findings import Code
 from tuner.job.run import _prepared
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings

@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from tests.tuner.job.test_windows import fitted_through, job_through
-from tuner.core.findings import Code
+from tuner.findings.findings import Code
 from tuner.objective.balance import balance_of
 from tuner.objective.criterion import Point
 from tuner.recordings.flight import Series

@@ -9,8 +9,8 @@ import pytest
 
 from tuner.config import JobFile, Options, settle
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.findings import Code
 from tuner.core.shipped import configs_folder, find_config
+from tuner.findings.findings import Code
 from tuner.ground.bench_json import BenchRecord, joint_prior
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.space import space_of

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
+from tuner.findings.composed import PREDICTED
 from tuner.recordings.flight import Array
 from tuner.report.chart import (
     FITTED,
@@ -26,7 +27,6 @@ from tuner.report.outcome import flights_table, outcome
 from tuner.report.result_texts import starts_in_words
 from tuner.report.section import Cell, Section, Table, short
 from tuner.result import FlightResult, RunResult
-from tuner.wording.composed import PREDICTED
 
 #: What is flown -> suffix of its arrays and its look; drawn in this order.
 CURVES = {

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 
 from tuner.core.phrases import percent
 from tuner.design.texts import next_log_in_words
+from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words
 from tuner.report.section import Cell, Section, Table, figures, short
 from tuner.uncertainty.records import CONFLICT
 from tuner.vehicle import COEFFICIENTS
-from tuner.wording.findings import remedy, sentence
 
 #: Settings that other sections show.
 SHOWN = ("command", "origin", "starts")

@@ -1,17 +1,19 @@
 """Sentences of findings that take more than a text with the finding's numbers in it.
 
-Each is named after its code in `tuner.core.findings.Code`.
+Each is named after its code in `tuner.findings.findings.Code`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tuner.core.findings import Code, Finding
 from tuner.core.phrases import as_sentence, listed
 from tuner.recordings.note_texts import damage_sentence, note_in_words
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
+
+if TYPE_CHECKING:
+    from tuner.findings.findings import Finding
 
 WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
 """Words with which an error begins that says something of the file which it names."""
@@ -124,7 +126,7 @@ def inertia_balanced(finding: Finding) -> str:
         ]
     )
     error = finding.numbers["error"]
-    if finding.code is Code.INERTIA_BALANCED:
+    if finding.code == "inertia_balanced":
         return (
             "Errors in the measured rotor speeds would pass for inertia, so that it is the one at "
             f"which recorded motion and rotor speeds balance: {values}. All else is fitted to what "

@@ -2,8 +2,7 @@
 
 import pytest
 
-from tuner.core.findings import Code, Finding
-from tuner.wording.findings import one_line, remedy, sentence
+from tuner.findings.findings import Code, Finding, one_line, remedy, sentence
 
 #: What each code's maker gives beside it.
 MADE = {

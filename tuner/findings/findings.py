@@ -1,0 +1,561 @@
+"""What a user should know before believing a number: each finding with its sentence and remedy."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any, Literal, Self
+
+from tuner.core.phrases import as_sentence, listed, percent, shorten
+from tuner.findings import composed
+from tuner.vehicle.motor_orders import order_in_words
+
+LARGEST = 1e300
+"""What stands for a number that is not finite, which JSON does not have."""
+
+Level = Literal["failure", "warning", "info"]
+Text = str | Callable[[Any], str]
+"""With the finding's numbers in braces, ``names``, ``first`` and ``last`` for its names in words,
+``coefficients`` and ``given`` for them as they stand, ``subject`` for its subject; or what makes a
+sentence of a finding."""
+
+GIVE_VEHICLE = (
+    "Give the vehicle with --vehicle and what it weighs with --mass; tune new-vehicle writes a "
+    "starting file from its mass, size and propellers."
+)
+
+CLAUSE = re.compile(r"[;.] | \(|, (?=and|as|at|or|if)|: (?!false|true)(?=[a-z0-9]+ )")
+"""Where the first clause of a sentence ends; not before the value of a setting."""
+
+
+class Worded(StrEnum):
+    """Codes, each with what was noticed as a sentence, and what to do about it."""
+
+    sentence: Text
+    remedy: Text
+
+    def __new__(cls, value: str, sentence: Text, remedy: Text) -> Self:
+        """Keep the sentences beside the code."""
+        code = str.__new__(cls, value)
+        code._value_ = value
+        code.sentence, code.remedy = sentence, remedy
+        return code
+
+
+class Code(Worded):
+    """What was noticed; the comment after each names its numbers and its names."""
+
+    RECORDING = (
+        "recording",  # count and numbers, names: code, topic and names of the `Note`
+        composed.recording,
+        "",
+    )
+    SALVAGED = (
+        "salvaged",  # those of `tuner.recordings.notes.Damage`; names: its cause and subject
+        composed.salvaged,
+        "Record the flight again if what was lost matters.",
+    )
+    LEFT_OUT = (
+        "left_out",  # names: what the flight lacks, what to do
+        composed.left_out,
+        lambda finding: as_sentence(finding.names[1]),
+    )
+    FLIGHT_WORSE = (
+        "flight_worse",  # before, after; names: position or attitude, its unit
+        (
+            "Its {first} is met worse than before the fit: RMSE {after:.3g} {unit}, before "
+            "{before:.3g} {unit}."
+        ),
+        "Look at its figures and at inspect: it may have been flown, or recorded, otherwise.",
+    )
+    FLIGHT_CRASHES = (
+        "flight_crashes",  # seconds
+        (
+            "The simulated flight crashes after {seconds:.1f} s: with the initial coefficients it "
+            "does not."
+        ),
+        "Do not use this fit: free other coefficients, and look at inspect.",
+    )
+    PART_FAILED = (
+        "part_failed",  # names: the type of the error, its text
+        (
+            "This part failed and is left out: {given}, {text}. The rest of the result does not "
+            "depend on it."
+        ),
+        "Please report it, with the job's log.",
+    )
+    MISSING_SIGNALS = (
+        "missing_signals",  # names: the signals
+        "It holds no {names}: the flight says less about the motors, and about inertia.",
+        "Log that too, if you can.",
+    )
+    POSE_GAP = (
+        "pose_gap",  # seconds
+        "No pose was recorded for {seconds:.2f} s during the mission.",
+        "Check the cameras' view and the network.",
+    )
+    WRONG_VEHICLE = (
+        "wrong_vehicle",  # lift, weight (N), mass (kg)
+        (
+            "This is not the vehicle that flew: turning as recorded, its rotors would lift "
+            "{lift:.3g} N on average, and {mass:g} kg weigh {weight:.3g} N."
+        ),
+        GIVE_VEHICLE,
+    )
+    CANNOT_HOVER = (
+        "cannot_hover",  # idle, full, weight (N), mass (kg)
+        (
+            "This is not the vehicle that flew: {mass:g} kg weigh {weight:.3g} N, and its rotors "
+            "lift {idle:.3g} N idling, {full:.3g} N at full command."
+        ),
+        GIVE_VEHICLE,
+    )
+    SPARSE_INPUT = (
+        "sparse_input",  # recorded, needed (Hz); names: the signal
+        (
+            "The {first} comes at {recorded:.0f} of {needed:.0f} Hz: what happened in between is "
+            "lost, and moments of inertia may be wrong by tens of percent, more than their "
+            "intervals show."
+        ),
+        "Log it at the full rate, or choose an inlet further upstream.",
+    )
+    INLET_CHOSEN = (
+        "inlet_chosen",  # correlation, recorded, gyro (Hz); names: inlet, signal, order?
+        composed.inlet_chosen,
+        composed.inlet_remedy,
+    )
+    MANOEUVRES_CHOSEN = (
+        "manoeuvres_chosen",  # fitted, flights; names: recording, numbers
+        (
+            "It is long: {fitted:.0f} of its {flights:.0f} manoeuvres are fitted, those that show "
+            "most (missions {others})."
+        ),
+        "Name others under 'missions' in its side-car, {first}.yaml.",
+    )
+    PX4_LOOPS = (
+        "px4_loops",  # names: the inlet
+        (
+            "PX4's own position and attitude control flew it, other loops than the geometric ones "
+            "that are simulated: it enters below them, through the inlet {first}."
+        ),
+        "",
+    )
+    LOGGED_GAINS = (
+        "logged_gains",  # names: what the log has otherwise, each as a clause
+        "The rate loop is simulated with the log's own parameters: {coefficients}.",
+        "",
+    )
+    LOGS_DIFFER = (
+        "logs_differ",  # names: the parameters
+        "The logs differ: in {coefficients}; those of the first are simulated.",
+        "Fit them one by one.",
+    )
+    ATTITUDE_FOLLOWED = (
+        "attitude_followed",  # names: the inlet that it could have entered through
+        (
+            "The recorded attitude of all fitted flights is followed, so that nothing is fitted of "
+            "how the vehicle turns: that of this flight is followed, too."
+        ),
+        "",
+    )
+    MOTOR_ORDER = (
+        "motor_order",  # names: the recorded columns, from 1, in the vehicle's order
+        (
+            "Motors are in another order: how they turn the vehicle makes them {names} of the "
+            "columns that the topic map lists."
+        ),
+        "Write motor_order: {order} into the topic map.",
+    )
+    SPINS_REVERSED = (
+        "spins_reversed",
+        "Motors yaw it against the spins of the vehicle file.",
+        "Check the spins, the motors' order, and the sign of the gyro's z.",
+    )
+    SETPOINTS_SCALED = (
+        "setpoints_scaled",  # gain, correlation; names: the axis, the law guessed
+        composed.setpoints_scaled,
+        composed.setpoints_remedy,
+    )
+    SETPOINTS_LATE = (
+        "setpoints_late",  # seconds
+        (
+            "The recorded rate set-points are those of the controller file to a state that is "
+            "{milliseconds:.0f} ms old: a slow estimator, a filter or late stamps lie between."
+        ),
+        "Check the stamps of pose and set-points; the fit takes it for estimate_latency.",
+    )
+    SETPOINTS_BIASED = (
+        "setpoints_biased",  # bias (rad/s); names: the axis
+        "The recorded {first} rate set-points are {bias:+.3f} rad/s off the controller file's.",
+        "",
+    )
+    SETPOINTS_FOREIGN = (
+        "setpoints_foreign",  # axis -> correlation
+        composed.setpoints_foreign,
+        "Give the controller that flew (--controller), or enter below it (inlet: body_rate).",
+    )
+    HEADING_FLOWN = (
+        "heading_flown",  # correlation
+        (
+            "The heading was commanded otherwise, as by hand: recorded yaw rate set-points do not "
+            "follow from the controller file (correlation {correlation:.2f}), so that the "
+            "reference says nothing of it."
+        ),
+        "Feed in its rate set-points (inlet: body_rate) if yaw matters.",
+    )
+    STILL_AXES = (
+        "still_axes",  # names: the axes
+        "No flight moves in {names}: inertia and rotor drag there are not excited.",
+        "Fly a circle or a lemniscate.",
+    )
+    NO_YAW = (
+        "no_yaw",  # rate (rad/s)
+        (
+            "No flight yaws faster than {rate:.2f} rad/s: inertia_zz and moment_constant are not "
+            "excited."
+        ),
+        "Fly a yaw spin.",
+    )
+    IMPLAUSIBLE_BOUNDS = (
+        "implausible_bounds",  # lower, upper, plausible_lower, plausible_upper
+        (
+            "The bounds {lower:g} to {upper:g} exclude every plausible value "
+            "({plausible_lower:g} to {plausible_upper:g})."
+        ),
+        "Widen them.",
+    )
+    START_ON_BOUND = (
+        "start_on_bound",  # bound, start
+        "The initial value {bound:g} lies on a bound; the search starts at {start:.3g}.",
+        "",
+    )
+    NOT_FINITE = (
+        "not_finite",
+        "The simulation with the initial coefficients does not stay finite.",
+        "Check the vehicle and controller files.",
+    )
+    NOTHING_HAS_EFFECT = (
+        "nothing_has_effect",
+        "No free coefficient has an effect on any recorded signal.",
+        "Use flights that move, or other channels.",
+    )
+    NO_EFFECT = (
+        "no_effect",
+        "The coefficient has no effect on any recorded signal.",
+        "Fix it with --fix {subject}, or record a signal that it acts on.",
+    )
+    SINGULAR_DIRECTION = (
+        "singular_direction",  # names: the coefficients
+        (
+            "The flights do not tell them apart: a common change of {coefficients} leaves every "
+            "recorded signal as it is."
+        ),
+        "Fix one of them to its measured value (--fix {given}).",
+    )
+    SATURATION_FEEDBACK = (
+        "saturation_feedback",  # feedback: 1 if the integrator stops, else 0
+        (
+            "The mixer was another: the recordings agree with one that {mixer} at the rotors' "
+            "lower limit, other than the controller file has it. It was simulated so."
+        ),
+        "Set mixer.saturation_feedback: {flag} (in the controller file).",
+    )
+    SEES_MARKERS = (
+        "sees_markers",  # seen: 1 if position and attitude control see them, else 0
+        (
+            "The controllers see another frame: the recordings agree with ones that see {frame}, "
+            "other than the controller file has it. It was simulated so."
+        ),
+        "Set sensing.sees_markers: {seen_flag} (in the controller file).",
+    )
+    CLOCK_OFFSET = (
+        "clock_offset",  # seconds; names: the clock
+        "The {first} clock is {milliseconds:+.2f} ms late, which the fit takes into account.",
+        "",
+    )
+    TURNING_UNEXPLAINED = (
+        "turning_unexplained",  # explained (share)
+        (
+            "Inputs explain {explained_percent} of the turning: that share of the change of body "
+            "rate over half a second. Noise in them, and the loop's answer to disturbances, make "
+            "their torque look weaker than it is: inertia and lags are those that predict best, "
+            "and inertia may be several times too large, whatever its interval says."
+        ),
+        "Log inputs at the rate loop's rate, or measure the inertia on the ground (tune bench).",
+    )
+    TURNING_REGRESSED = (
+        "turning_regressed",  # explained_AXIS (shares), gain_AXIS, seconds
+        (
+            "Not all turning is recorded: rotor speeds and forces of the air explain "
+            "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
+            "acceleration about forward, left and up. The rest is not recorded, and the loop's "
+            "rotors answer it. Moments of inertia and other physical coefficients are those of a "
+            "regression of accelerations that the answer does not bend. Torque gains, damping and "
+            "steady torque are not physical, but what predicts up to {seconds:g} s ahead best."
+        ),
+        "Fly faster and less evenly, or measure the inertia on the ground (tune bench).",
+    )
+    TURNING_NOT_PREDICTED = (
+        "turning_not_predicted",  # likewise, no seconds
+        (
+            "Most turning is not recorded: rotor speeds and forces of the air explain "
+            "{explained_x_percent}, {explained_y_percent} and {explained_z_percent} of the angular "
+            "acceleration about forward, left and up, too little to predict roll and pitch 0.1 s "
+            "ahead better than that they stay. Physical coefficients are those of a regression of "
+            "accelerations."
+        ),
+        "Feed the attitude in (inlet: attitude), or log what the loop is told to do.",
+    )
+    HOLDING_BETTER = (
+        "holding_better",  # seconds, QUANTITY, QUANTITY_held; names: QUANTITYs
+        composed.holding_better,
+        "Predict less far ahead, or with more recorded.",
+    )
+    INERTIA_BALANCED = (
+        "inertia_balanced",  # error, NAME_fitted, NAME_balanced; names: NAMEs
+        composed.inertia_balanced,
+        "",
+    )
+    INERTIA_NOT_BALANCED = (
+        "inertia_not_balanced",  # likewise
+        composed.inertia_balanced,
+        "Take these inertias for effective ones, and measure them on the ground (tune bench).",
+    )
+    DISTURBANCES_FOLLOWED = (
+        "disturbances_followed",  # gust, thrust (shares), both _seconds
+        composed.disturbances_followed,
+        "",
+    )
+    ROTOR_CHANGED = (
+        "rotor_changed",  # seconds, rotor (from 1), loss (share); names: its place
+        composed.rotor_changed,
+        "Look at its propeller, motor and mount before you fly again.",
+    )
+    INPUT_LATE = (
+        "input_late",  # seconds
+        (
+            "What is fed into the simulation is stamped {milliseconds:+.2f} ms late against the "
+            "recorded state, which the fit takes into account."
+        ),
+        "",
+    )
+    GYRO_OFFSET = (
+        "gyro_offset",  # rate (rad/s); names: the axis
+        "The {first} reads {rate:+.4f} rad/s at rest, which the fit takes into account.",
+        "",
+    )
+    FLIGHT_UNMATCHED = (
+        "flight_unmatched",  # channel -> multiple of the noise
+        composed.flight_unmatched,
+        "Look at its figures: the controller, the clock, wind, damage or the vehicle may differ.",
+    )
+    MODEL_UNMATCHED = (
+        "model_unmatched",  # unmatched, flights, noise_multiple
+        (
+            "It lacks an effect that flights share: the residuals of {unmatched:.0f} of "
+            "{flights:.0f} flights are about {noise_multiple:.0f} times the measurement noise."
+        ),
+        "Judge the fit by held-out flights, not by its intervals.",
+    )
+    FINER_THAN_STEPS = (
+        "finer_than_steps",  # seconds
+        (
+            "Simulators differ by {milliseconds:g} ms: their physics steps do, which the 95 % "
+            "intervals of these lags leave out."
+        ),
+        "Take these values as known to {twice:g} ms.",
+    )
+    REFERENCE_VOLTAGE = (
+        "reference_voltage",  # volts
+        (
+            "They are those at {volts:.2f} V, the highest voltage of these flights without load: "
+            "the vehicle file names no other."
+        ),
+        "Give battery.reference_voltage in the vehicle file for those at another voltage.",
+    )
+    POORLY_MET = (
+        "poorly_met",  # noise_multiple; names: the channel
+        (
+            "Its {first} is {noise_multiple:.0f} times the noise off: intervals are widened "
+            "accordingly."
+        ),
+        "Fit first, then examine the fitted vehicle.",
+    )
+    STARTS_DISAGREE = (
+        "starts_disagree",  # starts, changed: 1 if CMA-ES ended lower, else 0
+        "No two of {starts:.0f} starts ended in the same minimum; {second_search}.",
+        "",
+    )
+    FLIGHTS_FAR_OFF = (
+        "flights_far_off",  # far_off, flights, changed
+        (
+            "The simulation of {far_off:.0f} of {flights:.0f} flights stayed far from the "
+            "recording; {second_search}."
+        ),
+        "",
+    )
+    GROUND_CONFLICT = (
+        "ground_conflict",  # deviation (standard errors), ground, flights; names: unit
+        (
+            "Ground and flights disagree: {ground:.5g} {unit} and {flights:.5g} {unit}, "
+            "{deviation:+.1f} standard errors apart, model error included."
+        ),
+        "Find out which is wrong, the rig or the model.",
+    )
+    SCALES_WITH_MASS = (
+        "scales_with_mass",  # mass (kg); names: the coefficients
+        (
+            "Without a pose the flights show {coefficients} over the mass alone; they hold for "
+            "{mass:g} kg, and go with it."
+        ),
+        "Weigh the vehicle (--mass): that, or one measured inertia, closes the scale.",
+    )
+    NO_TACHOMETER = (
+        "no_tachometer",
+        (
+            "No rotor speed was recorded: the curve from command to rotor speed stays as it is, "
+            "and motor_constant goes with the inverse square of input_scaling."
+        ),
+        "One tachometer reading at a known command closes that; thrust and torque do not need it.",
+    )
+    YAW_OPEN = (
+        "yaw_open",
+        "The flights show moment_constant over inertia_zz, and not each of them.",
+        "Measure one of the two: a bifilar pendulum gives inertia_zz (tune bench).",
+    )
+    RATE_WORSE = (
+        "rate_worse",  # before, after, hold (rad/s), seconds
+        (
+            "Its body rate is predicted worse than before: {seconds:g} s ahead, from its commands "
+            "alone, to {after:.3g} rad/s instead of {before:.3g} rad/s."
+        ),
+        "Fit it by itself: another build, battery or propeller turns the vehicle otherwise.",
+    )
+    RATE_FORETOLD = (
+        "rate_foretold",  # before, after, hold (rad/s), seconds
+        (
+            "From its commands alone the fitted coefficients predict the body rate of this flight, "
+            "which was held out, {seconds:g} s ahead to {after:.3g} rad/s; the initial ones do to "
+            "{before:.3g} rad/s, and that it stays as it is would be right to {hold:.3g} rad/s."
+        ),
+        "",
+    )
+    RATE_NOT_FORETOLD = (
+        "rate_not_foretold",  # before, after, hold (rad/s), seconds
+        (
+            "From its commands alone the fitted coefficients predict the body rate of this flight "
+            "{seconds:g} s ahead to {after:.3g} rad/s ({before:.3g} rad/s with the initial ones), "
+            "and that it stays as it is would be right to {hold:.3g} rad/s: commands answer "
+            "disturbances that are not recorded, and an open loop adds them up."
+        ),
+        "Predict less far ahead, or simulate the loop that flew.",
+    )
+    VEHICLE_NOT_GIVEN = (
+        "vehicle_not_given",
+        (
+            "No vehicle was given: these flights were taken for its own, and without a pose mass "
+            "and arms come from the vehicle file."
+        ),
+        "Give the vehicle with --vehicle, and what it weighs with --mass.",
+    )
+    BENCH_CONFLICT = (
+        "bench_conflict",  # deviation (standard errors); names: the coefficients
+        (
+            "It contradicts the other experiments: what it says of {coefficients} lies "
+            "{deviation:+.1f} standard errors from theirs."
+        ),
+        "Check its geometry (levers, arms, wires), its units and its calibration.",
+    )
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that a user should know before believing a number.
+
+    Attributes
+    ----------
+    code
+        What was noticed.
+    level
+        ``failure`` stops a run unless forced, ``warning`` does not, ``info`` explains.
+    subject
+        The flight, coefficient or part concerned.
+    numbers, names
+        What `Code` lists beside the code.
+    """
+
+    code: Code
+    level: Level
+    subject: str
+    numbers: Mapping[str, int | float] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Replace what JSON has no number for."""
+        if not all(math.isfinite(number) for number in self.numbers.values()):
+            finite = {n: v if math.isfinite(v) else LARGEST for n, v in self.numbers.items()}
+            object.__setattr__(self, "numbers", finite)
+
+
+def sentence(finding: Finding) -> str:
+    """Return what was noticed, as a sentence."""
+    return _worded(finding.code.sentence, finding)
+
+
+def remedy(finding: Finding) -> str:
+    """Return what to do about it, as a sentence; empty if there is nothing to do."""
+    return _worded(finding.code.remedy, finding)
+
+
+def one_line(finding: Finding) -> str:
+    """Return a finding as one line of a terminal."""
+    return f"{finding.level}: {finding.subject}: {sentence(finding)} {remedy(finding)}".rstrip()
+
+
+def brief(finding: Finding, width: int) -> str:
+    """Return a finding in so many characters: its subject, what was noticed, what to do.
+
+    What does not fit is cut from the middle, what to do last.
+    """
+    first, *others = finding.subject.split(", ")
+    subject = shorten(f"{first} and {len(others)} more" if others else first, 30)
+    what, to_do = CLAUSE.split(sentence(finding))[0].removesuffix("."), remedy(finding)
+    if len(f"{subject}: {what}. {to_do}") > width and to_do:
+        to_do = f"{CLAUSE.split(to_do)[0].removesuffix('.')}."
+    left = width - len(f"{subject}: . {to_do}")
+    return shorten(f"{subject}: {shorten(what, max(left, 12))}. {to_do}".rstrip(), width)
+
+
+def _worded(text: Text, finding: Finding) -> str:
+    return text.format(**_values(finding)) if isinstance(text, str) else text(finding)
+
+
+def _values(finding: Finding) -> dict[str, object]:
+    names, numbers = [name.replace("_", " ") for name in finding.names], finding.numbers
+    values: dict[str, object] = {"subject": finding.subject, **numbers}
+    if names:
+        values["others"] = listed(names[1:] or names)
+        values |= {"names": listed(names), "first": names[0], "last": names[-1]}
+        values |= {"coefficients": listed(finding.names), "given": finding.names[0]}
+        values["text"] = finding.names[-1]
+        values["unit"] = finding.names[-1]
+        if all(name.isdecimal() for name in names):
+            values["order"] = order_in_words([int(name) for name in names])
+    seconds, feedback = numbers.get("seconds", 0.0), bool(numbers.get("feedback"))
+    for share in ("explained", *(f"explained_{axis}" for axis in "xyz")):
+        values[f"{share}_percent"] = percent(max(numbers.get(share, 0.0), 0.0))
+    values |= {"milliseconds": 1e3 * seconds, "twice": 2e3 * seconds}
+    mixer = (
+        "desaturates and a rate integrator that stops"
+        if feedback
+        else "clips each rotor by itself and a rate integrator that does not stop"
+    )
+    values |= {"mixer": mixer, "flag": str(feedback).lower()}
+    seen = bool(numbers.get("seen"))
+    frame = "that frame" if seen else "the centre of mass and the body's axes"
+    values |= {"frame": frame, "seen_flag": str(seen).lower()}
+    lower = "ended lower, and its result was kept" if numbers.get("changed") else "ended no lower"
+    return values | {"second_search": f"CMA-ES then searched more widely and {lower}"}

@@ -1,1 +1,0 @@
-"""The sentences of pages and terminals, made of typed results when they are rendered."""
