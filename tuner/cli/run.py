@@ -17,7 +17,7 @@ from tuner.cli.options import TYPED
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
 
 DONE = 0
-OUR_FAULT = 1
+INTERNAL_ERROR = 1
 WRONG_INPUT = 2
 INTERRUPTED = 130
 FULL = (errno.ENOSPC, errno.EDQUOT)
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         status = answer if isinstance(answer, int) else DONE  # of a command that answers by it
     except ServerFaultError as error:
-        return _say(str(error), OUR_FAULT)
+        return _say(str(error), INTERNAL_ERROR)
     except InputError as error:
         return _say(str(error), WRONG_INPUT)
     except CycloptsError as error:
@@ -66,7 +66,8 @@ def _unforeseen(error: Exception) -> int:
     if isinstance(error, OSError) and error.errno in FULL:
         return _say("the disk is full; free some space and try again", WRONG_INPUT)
     traceback.print_exception(error)
-    return _say(f"this is a fault of ours: {type(error).__name__}: {error}", OUR_FAULT)
+    what = f"internal error ({type(error).__name__}: {error})"
+    return _say(f"{what}; please report it", INTERNAL_ERROR)
 
 
 def _know_the_command(arguments: Sequence[str]) -> None:

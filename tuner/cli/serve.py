@@ -86,8 +86,8 @@ def _serve(
         Let a job take so many GiB of memory.
     """
     with _extra():
-        from tuner.service.serve import LOOPBACK, is_loopback
-        from tuner.service.serve import serve as run
+        from tuner.service.server import LOOPBACK, is_loopback
+        from tuner.service.server import serve as run
     from tuner.core.errors import InputError
     from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
 

@@ -23,13 +23,13 @@ import cloudpickle
 from distributed import Client, Event, KilledWorker
 from distributed.comm import CommClosedError
 
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError
 from tuner.core.runtime import configure
 from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import Engine, Report, Task
-from tuner.engine.store import Store
 from tuner.engine.worker import SetUp, Shared, run_task, stop_name
 
 T = TypeVar("T")
@@ -49,7 +49,7 @@ class OnDask(Engine):
         Through which shared values travel.
     """
 
-    def __init__(self, client: Client, at_once: int, store: Store) -> None:
+    def __init__(self, client: Client, at_once: int, store: ContentStore) -> None:
         self.at_once = self.ahead = at_once
         self.executor: Executor = client.get_executor(pure=False)
         self._client, self._store = client, store
@@ -143,7 +143,7 @@ def on_dask(file: ClusterFile) -> Iterator[Engine]:
     """
     configure()
     base = file.store or str(cache_folder() / "shared")
-    store = Store(f"{base.rstrip('/')}/{uuid.uuid4().hex}")  # what this engine shares, and no other
+    store = ContentStore(f"{base.rstrip('/')}/{uuid.uuid4().hex}")  # of this engine alone
     with contextlib.ExitStack() as stack:
         stack.callback(store.clear)
         local = file.address is None and file.jobs is None and file.kubernetes is None

@@ -14,10 +14,10 @@ from typing import Any
 
 from distributed import Event, Status, Worker, WorkerPlugin, get_worker
 
+from tuner.core.content_store import ContentStore
 from tuner.core.errors import EngineError
 from tuner.core.runtime import configure
 from tuner.engine.engine import HERE, using
-from tuner.engine.store import Store
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Of linear algebra beside XLA: one, for every worker has its cores for itself."""
@@ -150,4 +150,4 @@ class Shared:
 
 @lru_cache(maxsize=2)
 def _arrived(store: str, sha256: str) -> Any:
-    return pickle.loads(Store(store).read(sha256))
+    return pickle.loads(ContentStore(store).read(sha256))

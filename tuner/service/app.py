@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from http import HTTPStatus
 
+from anyio import CapacityLimiter
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -18,7 +19,7 @@ from tuner.core.errors import InputError
 from tuner.core.validation import first_complaint
 from tuner.core.versions import installed
 from tuner.service.errors import ServiceError
-from tuner.service.http import Doors, api, watching
+from tuner.service.http import api, watching
 from tuner.service.metrics import Metrics
 from tuner.service.safety import Guard
 from tuner.service.service import Service
@@ -52,7 +53,8 @@ def create_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.metrics = Metrics(service)
-    app.state.doors = Doors(service.settings.limits.uploads_at_once, INSPECTIONS_AT_ONCE)
+    app.state.uploads = CapacityLimiter(service.settings.limits.uploads_at_once)
+    app.state.inspections = CapacityLimiter(INSPECTIONS_AT_ONCE)
     app.include_router(api)
     app.include_router(watching)
     app.include_router(web)
@@ -108,8 +110,8 @@ async def _http(request: Request, error: Exception) -> Response:
 
 async def _fault(request: Request, error: Exception) -> Response:
     logger.error("%s %s", request.method, request.url.path, exc_info=error)
-    remedy = "see its log, and report what was asked of it"
-    return _problem(request, 500, "the server", "met a fault of ours", remedy)
+    what = f"internal error ({type(error).__name__})"
+    return _problem(request, 500, "the server", what, "please report it, with its log")
 
 
 def _is_for_people(request: Request) -> bool:

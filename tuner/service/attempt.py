@@ -17,12 +17,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import digest_of, inside
 from tuner.result import RunResult
+from tuner.service.errors import full_disk
 from tuner.service.queue import Claim, Outcome
 from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits
-from tuner.service.store import Store, full_disk
 from tuner.service.tables import State
 from tuner.service.worker import RESULT, Assignment
 
@@ -46,7 +47,7 @@ class UnwantedError(Exception):
     """The attempt holds its job no more, or its server is ending."""
 
 
-def prepare(folder: Path, claim: Claim, store: Store) -> CheckedRequest:
+def prepare(folder: Path, claim: Claim, store: ContentStore) -> CheckedRequest:
     """Lay out the folder of a job, as far as an earlier attempt has not.
 
     Raises
@@ -219,7 +220,7 @@ def _cause(status: int) -> str:
     return f"it was ended by {name}{hint}"
 
 
-def outcome_of(last: Mapping[str, Any], folder: Path, store: Store) -> Outcome:
+def outcome_of(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
     """Return what an attempt came to, the files of a result put into the store.
 
     Raises
@@ -230,7 +231,7 @@ def outcome_of(last: Mapping[str, Any], folder: Path, store: Store) -> Outcome:
     if last["kind"] == "refused":
         return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
     if last["kind"] == "fault":
-        error = f"this is a fault of ours: {last['error']}"
+        error = f"internal error ({last['error']}); please report it"
         return Outcome(State.FAILED, error=error, exit_status=1)
     result = RunResult.read(folder / RESULT)
     return Outcome(
@@ -253,7 +254,7 @@ def outcome_of(last: Mapping[str, Any], folder: Path, store: Store) -> Outcome:
     )
 
 
-def _stored(result: Path, store: Store) -> list[dict[str, Any]]:
+def _stored(result: Path, store: ContentStore) -> list[dict[str, Any]]:
     """Put copies of a result's files into the store, and return their rows."""
     rows = []
     for file in sorted(result.rglob("*")):
@@ -264,7 +265,7 @@ def _stored(result: Path, store: Store) -> list[dict[str, Any]]:
     return rows
 
 
-def put(file: Path, store: Store) -> str:
+def put(file: Path, store: ContentStore) -> str:
     """Put a copy of a file into a store, and return its digest.
 
     Raises

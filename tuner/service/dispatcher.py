@@ -14,15 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from tuner.core.content_store import ContentStore
 from tuner.core.errors import InputError
 from tuner.core.runtime import cores
 from tuner.engine.engine import Engine
 from tuner.service.attempt import DiedError, Events, UnwantedError, attempt, outcome_of, prepare
-from tuner.service.elsewhere import Errand, sent
 from tuner.service.errors import NoSpaceError, UnavailableError
 from tuner.service.queue import Claim, Outcome, Queue
+from tuner.service.remote import RemoteTask, run_remotely
 from tuner.service.settings import ServiceSettings
-from tuner.service.store import Store
 from tuner.service.tables import State
 
 logger = logging.getLogger(__name__)
@@ -47,7 +47,11 @@ class Dispatcher:
     """
 
     def __init__(
-        self, settings: ServiceSettings, jobs: Queue, store: Store, engine: Engine | None = None
+        self,
+        settings: ServiceSettings,
+        jobs: Queue,
+        store: ContentStore,
+        engine: Engine | None = None,
     ) -> None:
         self._engine = engine
         self._settings = settings
@@ -118,8 +122,8 @@ class Dispatcher:
             self._attempt(claim, slot)
         except Exception as error:
             logger.exception("job %s", claim.id)
-            ours = f"this is a fault of ours: {type(error).__name__}"
-            self._commit(claim, Outcome(State.FAILED, ours, exit_status=1))
+            what = f"internal error ({type(error).__name__}); please report it"
+            self._commit(claim, Outcome(State.FAILED, what, exit_status=1))
         finally:
             del self._held[claim.word]
             self._slots.put(slot)
@@ -135,7 +139,7 @@ class Dispatcher:
                 self._put_back(claim, "The server was stopped; the job waits for it.")
             return
         except DiedError as death:
-            self._mourn(claim, death)
+            self._on_worker_death(claim, death)
             return
         except NoSpaceError as error:
             outcome = Outcome(State.FAILED, f"{error}; then retry the job", exit_status=2)
@@ -145,13 +149,13 @@ class Dispatcher:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _worked_on(self, claim: Claim, slot: int, folder: Path) -> Outcome:
-        """Return what an attempt comes to, here or elsewhere."""
+        """Return what an attempt comes to, on this machine or another."""
         limits, lease = self._settings.limits, self._settings.lease_seconds
-        report = Reporting(self._jobs, claim, lease)
+        report = Reporter(self._jobs, claim, lease)
         is_unwanted = self._stopping.is_set
         if self._engine is not None:
-            errand = Errand(claim, self._settings.store_url, limits)
-            return sent(errand, self._engine, report, is_unwanted)
+            task = RemoteTask(claim, self._settings.store_url, limits)
+            return run_remotely(task, self._engine, report, is_unwanted)
         asked = prepare(folder, claim, self._store)
         last = attempt(
             folder,
@@ -164,7 +168,7 @@ class Dispatcher:
         )
         return outcome_of(last, folder, self._store)
 
-    def _mourn(self, claim: Claim, death: DiedError) -> None:
+    def _on_worker_death(self, claim: Claim, death: DiedError) -> None:
         """Put the job of a worker that died back, or give it up after too many deaths."""
         self.deaths += 1
         deaths = claim.deaths + 1
@@ -201,7 +205,7 @@ class Dispatcher:
         return sorted(os.sched_getaffinity(0))[slot :: self._settings.workers]
 
 
-class Reporting:
+class Reporter:
     """Passes on what a worker says, and renews the lease now and then when it says nothing.
 
     What cannot be entered because the database does not answer is kept for the next time. What

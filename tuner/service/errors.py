@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import ClassVar
 
 from tuner.core.errors import InputError
+from tuner.service.names import shown
 
 
 class ServiceError(InputError):
@@ -66,7 +70,20 @@ def unknown_job(name: str) -> NotKnownError:
     return NotKnownError(f"job {shown(name)}", "is not known here", "list the jobs with tune jobs")
 
 
-def shown(name: str) -> str:
-    """Return a user's word for a message: short, in one line."""
-    plain = "".join(c if c.isprintable() else "?" for c in name)
-    return plain if len(plain) <= 60 else plain[:57] + "..."
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Turn a full disk into a sentence for the user.
+
+    Raises
+    ------
+    NoSpaceError
+        The disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        raise NoSpaceError(
+            "the server", "has no space left", "free some space and try again"
+        ) from None

@@ -6,8 +6,8 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import selectinload
 
 from tuner.service.database import Database
-from tuner.service.errors import NotKnownError, shown
-from tuner.service.naming import stems
+from tuner.service.errors import NotKnownError
+from tuner.service.names import shown, stems
 from tuner.service.shapes import CoefficientHistory, History, Point, iso
 from tuner.service.tables import JobRow, PointRow, State
 from tuner.vehicle.registry import at_mass

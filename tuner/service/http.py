@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import anyio
@@ -11,18 +11,15 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.requests import ClientDisconnect
 
-from tuner.core.disk import file_name
 from tuner.core.errors import InputError
 from tuner.core.versions import installed
 from tuner.service import jobs, recordings
-from tuner.service.archive import zipped
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.events import follow
 from tuner.service.history import history
-from tuner.service.incoming import FIELD, Upload, receive
 from tuner.service.metrics import Metrics
 from tuner.service.request import JobRequest
-from tuner.service.safety import REPORT_POLICY
+from tuner.service.result_files import file_response, zipped
 from tuner.service.service import Service
 from tuner.service.shapes import (
     API,
@@ -38,9 +35,9 @@ from tuner.service.shapes import (
     full_job,
     recording_answer,
 )
-from tuner.service.tables import FileRow, RecordingRow, State
+from tuner.service.tables import RecordingRow, State
+from tuner.service.upload import FIELD, Upload, receive
 
-BLOCK = 2**18
 #: What any call may answer beside what it is for.
 PROBLEMS: Mapping[int | str, dict[str, Any]] = {
     status: {"model": Problem, "description": what}
@@ -102,14 +99,6 @@ Served = Annotated[Service, Depends(service_of)]
 Counted = Annotated[Metrics, Depends(metrics_of)]
 
 
-class Doors:
-    """How many uploads are received, and how many inspected, at the same time."""
-
-    def __init__(self, uploads: int, inspections: int) -> None:
-        self.left = uploads
-        self.inspections = anyio.CapacityLimiter(inspections)
-
-
 async def upload(request: Request) -> tuple[RecordingRow, bool]:
     """Take in the recording of a request, and return its row and whether it is new.
 
@@ -119,21 +108,22 @@ async def upload(request: Request) -> tuple[RecordingRow, bool]:
         It cannot be taken; one line says why.
     """
     service, metrics = service_of(request), metrics_of(request)
-    doors: Doors = request.app.state.doors
-    if doors.left < 1:
+    uploads: anyio.CapacityLimiter = request.app.state.uploads
+    try:
+        uploads.acquire_nowait()
+    except anyio.WouldBlock:
         raise TooManyError(
             "the server", "is receiving too many recordings", "try again in a minute"
-        )
-    doors.left -= 1
+        ) from None
     try:
         parts = (service.database, service.store, service.settings)
         await anyio.to_thread.run_sync(recordings.check_space, *parts)
         whole = await _received(request)
         metrics.uploaded.inc(whole.size)
-        async with doors.inspections:
+        async with request.app.state.inspections:
             return await anyio.to_thread.run_sync(recordings.take, *parts, whole)
     finally:
-        doors.left += 1
+        uploads.release()
 
 
 async def _received(request: Request) -> Upload:
@@ -253,35 +243,7 @@ def _after(service: Service, job: str) -> FullJobAnswer:
 )
 def get_file(service: Served, job: str, name: str) -> StreamingResponse:
     """Return a file of a job's result."""
-    return file_response(service, jobs.file(service.database, job, name))
-
-
-_KINDS = {".json": "application/json", ".csv": "text/csv", ".svg": "image/svg+xml"}
-
-
-def file_response(service: Service, row: FileRow) -> StreamingResponse:
-    """Return a stored file; a report as a page that reaches nothing, the rest to be saved."""
-    suffix, base = row.name[row.name.rfind(".") :], row.name.rpartition("/")[2]
-    headers = {
-        "content-length": str(row.size),
-        "content-security-policy": REPORT_POLICY,
-        "etag": f'"{row.sha256}"',
-    }
-    if suffix == ".html":
-        kind = "text/html; charset=utf-8"
-    else:
-        kind = _KINDS.get(suffix, "application/octet-stream")
-        headers["content-disposition"] = f'attachment; filename="{file_name(base)}"'
-    if not service.store.has(row.sha256):
-        raise NotKnownError(row.name, "is gone from the store", "submit the job again")
-
-    async def blocks() -> AsyncIterator[bytes]:
-        with service.store.reading(row.sha256) as file:
-            read: Callable[[int], bytes] = file.read
-            while block := await anyio.to_thread.run_sync(read, BLOCK):
-                yield block
-
-    return StreamingResponse(blocks(), media_type=kind, headers=headers)
+    return file_response(service.store, jobs.file(service.database, job, name))
 
 
 @api.get(

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session, selectinload, undefer
 
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
-from tuner.service.naming import recording_name
+from tuner.service.names import recording_name
 from tuner.service.queue import add_event
 from tuner.service.request import JobRequest, checked
 from tuner.service.settings import Limits

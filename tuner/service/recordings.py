@@ -13,19 +13,19 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.exc import IntegrityError
 
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
 from tuner.core.errors import InputError
 from tuner.service.database import Database
-from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, shown
-from tuner.service.incoming import Upload
-from tuner.service.inspecting import inspect
-from tuner.service.naming import recording_name, stems
+from tuner.service.errors import NoSpaceError, NotKnownError, TooManyError, full_disk
+from tuner.service.inspection import inspect
+from tuner.service.names import recording_name, shown, stems
 from tuner.service.settings import ServiceSettings
-from tuner.service.store import Store
 from tuner.service.tables import RecordingRow
+from tuner.service.upload import Upload
 
 
-def check_space(database: Database, store: Store, settings: ServiceSettings) -> None:
+def check_space(database: Database, store: ContentStore, settings: ServiceSettings) -> None:
     """Refuse an upload before it begins, where there is no room for one.
 
     Raises
@@ -44,7 +44,7 @@ def check_space(database: Database, store: Store, settings: ServiceSettings) -> 
 
 
 def take(
-    database: Database, store: Store, settings: ServiceSettings, upload: Upload
+    database: Database, store: ContentStore, settings: ServiceSettings, upload: Upload
 ) -> tuple[RecordingRow, bool]:
     """Inspect an upload, store and enter it, and return its row and whether it is new.
 
@@ -59,7 +59,8 @@ def take(
         if known is not None and store.has(upload.sha256):
             return _enter(database, upload, known.inspection), False
         inspection = _inspected(upload, settings)
-        store.take(upload.path, upload.sha256)
+        with full_disk():
+            store.take(upload.path, upload.sha256)
         return _enter(database, upload, inspection), known is None
     finally:
         upload.path.unlink(missing_ok=True)

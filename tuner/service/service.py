@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import make_folder, write_text
 from tuner.core.errors import InputError
 from tuner.engine.engine import Engine
@@ -16,7 +17,6 @@ from tuner.service.database import Database
 from tuner.service.dispatcher import Dispatcher
 from tuner.service.queue import Queue
 from tuner.service.settings import ServiceSettings
-from tuner.service.store import Store
 
 
 @dataclass
@@ -33,7 +33,7 @@ class Service:
 
     settings: ServiceSettings
     database: Database
-    store: Store
+    store: ContentStore
     dispatcher: Dispatcher
     stopping: threading.Event = field(default_factory=threading.Event)
     _lock: IO[str] | None = None
@@ -58,7 +58,7 @@ class Service:
         lock = _only_server(settings.data)
         shutil.rmtree(settings.incoming, ignore_errors=True)
         make_folder(settings.incoming)
-        store = Store(settings.store_url)
+        store = ContentStore(settings.store_url)
         database = Database(settings.database_url)
         database.migrate()
         jobs = Queue(database, _identity(settings.data), settings.lease_seconds)

@@ -22,9 +22,8 @@ from pydantic import BaseModel
 
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
-from tuner.service.limiting import limit_process
 from tuner.service.request import CheckedRequest
-from tuner.service.settings import Limits, size_in_words
+from tuner.service.settings import Limits, limit_process, size_in_words
 
 RESULT = Path("result")
 LOCK = ".lock"

@@ -71,7 +71,7 @@ def test_a_fault_of_ours_is_status_1_with_its_trace(failing, capsys):
     assert main(["simulate"]) == 1
     err = capsys.readouterr().err
     assert "Traceback" in err
-    assert err.endswith("tune: this is a fault of ours: RuntimeError: oops\n")
+    assert err.endswith("tune: internal error (RuntimeError: oops); please report it\n")
 
 
 def test_ctrl_c_is_one_line_and_status_130(failing, capsys):

@@ -70,7 +70,7 @@ def test_a_job_is_submitted_listed_watched_fetched_and_cancelled(client, table, 
     ("wish", "status", "error"),
     [
         ("refuse", 2, "tune: flights: nothing moves; fly a circle\n"),
-        ("fault", 1, "this is a fault of ours: ZeroDivisionError: division by zero\n"),
+        ("fault", 1, "internal error (ZeroDivisionError: division by zero); please report it\n"),
     ],
 )
 def test_a_job_that_fails_ends_the_command_as_it_would_here(table, capsys, wish, status, error):

@@ -16,9 +16,9 @@ import pytest
 from tests.tuner.service.conftest import ended, submit, upload
 from tuner.report.outcome import outcome
 from tuner.result import RunResult
-from tuner.service import archive, attempt, jobs, queue
+from tuner.service import attempt, jobs, queue, result_files
 from tuner.service.attempt import put
-from tuner.service.dispatcher import Reporting
+from tuner.service.dispatcher import Reporter
 from tuner.service.tables import FileRow, JobRow, State
 
 KEYS = {
@@ -129,7 +129,7 @@ def test_three_deaths_are_the_end_with_the_reason(client, recording):
     ("wish", "status", "error"),
     [
         ("refuse", 2, "flights: nothing moves; fly a circle"),
-        ("fault", 1, "this is a fault of ours: ZeroDivisionError: division by zero"),
+        ("fault", 1, "internal error (ZeroDivisionError: division by zero); please report it"),
     ],
 )
 def test_what_a_worker_refuses_is_the_error_of_the_job(client, recording, wish, status, error):
@@ -266,7 +266,7 @@ def test_what_happens_again_after_the_preamble_is_said_again(idle):
     jobs_queue = queue.Queue(idle.database, "here", 60.0)
     for _ in range(3):
         claim = jobs_queue.claim()
-        Reporting(jobs_queue, claim, 60.0)([said, said, iteration, worse, said], {})
+        Reporter(jobs_queue, claim, 60.0)([said, said, iteration, worse, said], {})
         jobs_queue.give_back(claim, message="gone")
     texts = [e.content["text"] for e in jobs.events(idle.database, row, kind="message")]
     again = ["a flight got worse", "the flights", "gone"]
@@ -306,13 +306,13 @@ def test_all_files_come_as_one_archive_under_plain_names(client, recording):
 
 
 def test_an_archive_unpacks_nowhere_else_and_is_made_block_by_block(idle, tmp_path, monkeypatch):
-    monkeypatch.setattr(archive, "BLOCK", 1000)
+    monkeypatch.setattr(result_files, "BLOCK", 1000)
     content = random.Random(1).randbytes(50_000)
     (tmp_path / "x").write_bytes(content)
     digest = put(tmp_path / "x", idle.store)
     names = ("../../x", "/etc/x", "a/../x", "C:\\x", "plots/\0.svg")
     rows = [FileRow(name=name, sha256=digest, size=50_000) for name in names]
-    blocks = list(archive.zipped(idle.store, rows, "job"))
+    blocks = list(result_files.zipped(idle.store, rows, "job"))
     assert max(map(len, blocks)) < 40_000  # compression's window; a file at once has more
     with zipfile.ZipFile(io.BytesIO(b"".join(blocks))) as opened:
         made = opened.namelist()

@@ -12,8 +12,8 @@ from dataclasses import replace
 import pytest
 
 from tests.tuner.service.conftest import ended, listening, submit, upload
+from tuner.core.content_store import ContentStore
 from tuner.service.service import Service
-from tuner.service.store import Store
 
 pytest.importorskip("s3fs", reason="needs s3fs")
 moto = pytest.importorskip("moto.server", reason="needs moto[server]")
@@ -43,7 +43,7 @@ def test_a_server_keeps_everything_in_a_bucket(bucket, settings, table):
         found = client.get(job["links"]["files"]["result.json"])
         assert found.json()["coefficients"]["motor_constant"]["best"] == sum(range(5)) * 1e-8
     service.close()
-    store = Store(bucket)
+    store = ContentStore(bucket)
     assert not store.is_folder
     with store.reading(recording) as file:
         assert file.read() == table.read_bytes()

@@ -15,7 +15,8 @@ import pytest
 from tests.tuner.service.conftest import FLIGHTS, LIMITS, listening, submit, upload
 from tuner.config import Options
 from tuner.core.errors import RecordingError
-from tuner.service import incoming, inspecting, recordings
+from tuner.service import errors, inspection, recordings
+from tuner.service import upload as upload_module
 from tuner.service.service import Service
 from tuner.service.settings import MIB
 from tuner.service.web.words import FIELDS, on_the_web
@@ -109,11 +110,11 @@ def test_a_recording_that_takes_too_long_is_stopped(tmp_path):
     os.mkfifo(fifo)
     limits = replace(LIMITS, inspection_seconds=2.0)
     with pytest.raises(RecordingError, match=r"endless\.bag: takes more than 2 s to read; split"):
-        inspecting.inspect(fifo, limits)
+        inspection.inspect(fifo, limits)
 
 
 def test_a_recording_that_needs_too_much_memory_is_stopped(tmp_path, monkeypatch):
-    hungry = "import sys; from tuner.service.limiting import limit_process as l; "
+    hungry = "import sys; from tuner.service.settings import limit_process as l; "
     hungry += f"l(memory_bytes={300 * MIB}, file_bytes=1)\ntry: b'x' * {2**31}\n"
     hungry += "except MemoryError: sys.exit(3)"
     script = tmp_path / "python"
@@ -122,7 +123,7 @@ def test_a_recording_that_needs_too_much_memory_is_stopped(tmp_path, monkeypatch
     monkeypatch.setenv("HUNGRY", hungry)
     monkeypatch.setattr(sys, "executable", str(script))
     with pytest.raises(RecordingError, match="needs more than 2 GiB of memory to read"):
-        inspecting.inspect(tmp_path / "x.bag", LIMITS)
+        inspection.inspect(tmp_path / "x.bag", LIMITS)
 
 
 def test_a_file_beyond_the_limit_is_refused_before_it_is_all_there(settings, table):
@@ -197,10 +198,10 @@ def test_a_full_disk_refuses_the_upload_and_keeps_the_rest(client, service, tabl
     upload(client, table.read_bytes())
 
     def refuse(*_: object) -> None:
-        with incoming.full_disk():
+        with errors.full_disk():
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(incoming._Receiver, "flush", refuse)
+    monkeypatch.setattr(upload_module._Receiver, "flush", refuse)
     answer = send(client, b"time,x\n0,0\n" * 1000)
     assert answer.status_code == 507
     assert answer.json()["detail"] == "the server: has no space left; free some space and try again"

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 from pydantic import ValidationError
 
+from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.result import CoefficientResult, ExportRecord, ExportRecords, FlightResult, RunResult
 from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError
-from tuner.service.store import Store
 from tuner.service.tables import JobRow
 from tuner.vehicle.registry import at_mass
 
@@ -51,7 +51,7 @@ class FlightPair:
     rmse: tuple[tuple[float | None, float | None], ...]
 
 
-def result_of(database: Database, store: Store, job: str) -> RunResult:
+def result_of(database: Database, store: ContentStore, job: str) -> RunResult:
     """Return the result of a job that is done.
 
     Raises
@@ -71,7 +71,7 @@ def result_of(database: Database, store: Store, job: str) -> RunResult:
         ) from None
 
 
-def exports_of(store: Store, row: JobRow) -> tuple[ExportRecord, ...]:
+def exports_of(store: ContentStore, row: JobRow) -> tuple[ExportRecord, ...]:
     """Return what a job exported, with the conditions that were checked."""
     content = _content(row, store, ExportRecords.FILE)
     try:
@@ -81,7 +81,7 @@ def exports_of(store: Store, row: JobRow) -> tuple[ExportRecord, ...]:
     return tuple(records.exports.values())
 
 
-def _content(row: JobRow, store: Store, name: str) -> bytes | None:
+def _content(row: JobRow, store: ContentStore, name: str) -> bytes | None:
     """Return a file of a job; None if it has none of that name."""
     file = next((file for file in row.files if file.name == name), None)
     if file is None:

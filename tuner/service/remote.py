@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import inside
 from tuner.core.errors import EngineError
 from tuner.engine.engine import Engine
@@ -32,20 +33,19 @@ from tuner.service.attempt import (
 )
 from tuner.service.queue import Claim, Outcome
 from tuner.service.settings import Limits
-from tuner.service.store import Store
 from tuner.service.worker import RESULT
 
 
 @dataclass(frozen=True)
-class Errand:
-    """What a machine elsewhere is to do: the claim on a job, and the store's URL."""
+class RemoteTask:
+    """What a machine of the cluster is to do: the claim on a job, and the store's URL."""
 
     claim: Claim
     store: str
     limits: Limits
 
 
-def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
+def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
     """Work on a job, on the machine that an engine has chosen for it.
 
     Raises
@@ -53,7 +53,7 @@ def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
     DiedError
         Its process died.
     """
-    store, claim = Store(errand.store), errand.claim
+    store, claim = ContentStore(task.store), task.claim
     kept = dict(claim.checkpoint)
     with tempfile.TemporaryDirectory(prefix="tune-job-") as name:
         folder = Path(name)
@@ -72,7 +72,7 @@ def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
             folder,
             claim,
             asked,
-            limits=errand.limits,
+            limits=task.limits,
             cores=(),
             report=relay,
             is_unwanted=lambda: False,
@@ -80,10 +80,10 @@ def fit_elsewhere(errand: Errand, report: Channel) -> Outcome:
         return outcome_of(last, folder, store)
 
 
-def sent(
-    errand: Errand, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
+def run_remotely(
+    task: RemoteTask, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
 ) -> Outcome:
-    """Have a job worked on elsewhere, and return what came of it.
+    """Have a job worked on by a machine of a cluster, and return what came of it.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def sent(
         The process of the job died, or the machine did.
     """
     heard: SimpleQueue[dict[str, Any]] = SimpleQueue()
-    future = engine.submit(fit_elsewhere, errand, heard.put)
+    future = engine.submit(fit_remotely, task, heard.put)
     try:
         while True:
             has_ended = wait([future], timeout=BEAT).done

@@ -1,18 +1,24 @@
-"""A job's files as one archive, made while it is sent: no more than a block of it is held."""
+"""Files of a result as they are sent, one by one or as an archive made meanwhile, in blocks."""
 
 from __future__ import annotations
 
 import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import PurePosixPath
 
+import anyio.to_thread
+from fastapi.responses import StreamingResponse
+
+from tuner.core.content_store import ContentStore
 from tuner.core.disk import file_name
-from tuner.service.store import Store
+from tuner.service.errors import NotKnownError
+from tuner.service.safety import REPORT_POLICY
 from tuner.service.tables import FileRow
 
 BLOCK = 1 << 20
 """bytes that are read at a time"""
+_KINDS = {".json": "application/json", ".csv": "text/csv", ".svg": "image/svg+xml"}
 
 
 class _Passing(io.RawIOBase):
@@ -40,7 +46,7 @@ class _Passing(io.RawIOBase):
         return raw
 
 
-def zipped(store: Store, files: Sequence[FileRow], folder: str) -> Iterator[bytes]:
+def zipped(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterator[bytes]:
     """Yield an archive of stored files, in a folder of a name, under plain names.
 
     Parameters
@@ -67,3 +73,28 @@ def zipped(store: Store, files: Sequence[FileRow], folder: str) -> Iterator[byte
                     target.write(block)
                     yield passing.taken()
     yield passing.taken()
+
+
+def file_response(store: ContentStore, row: FileRow) -> StreamingResponse:
+    """Return a stored file; a report as a page that reaches nothing, the rest to be saved."""
+    suffix, base = row.name[row.name.rfind(".") :], row.name.rpartition("/")[2]
+    headers = {
+        "content-length": str(row.size),
+        "content-security-policy": REPORT_POLICY,
+        "etag": f'"{row.sha256}"',
+    }
+    if suffix == ".html":
+        kind = "text/html; charset=utf-8"
+    else:
+        kind = _KINDS.get(suffix, "application/octet-stream")
+        headers["content-disposition"] = f'attachment; filename="{file_name(base)}"'
+    if not store.has(row.sha256):
+        raise NotKnownError(row.name, "is gone from the store", "submit the job again")
+
+    async def blocks() -> AsyncIterator[bytes]:
+        with store.reading(row.sha256) as file:
+            read: Callable[[int], bytes] = file.read
+            while block := await anyio.to_thread.run_sync(read, BLOCK):
+                yield block
+
+    return StreamingResponse(blocks(), media_type=kind, headers=headers)

@@ -14,10 +14,9 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from tuner.core.errors import InputError
-from tuner.service.errors import TooLargeError
-from tuner.service.naming import last_part
+from tuner.service.errors import TooLargeError, full_disk
+from tuner.service.names import shown_name
 from tuner.service.settings import Limits, size_in_words
-from tuner.service.store import full_disk
 
 BUFFER = 2**20
 """bytes that are gathered before they are hashed and written"""
@@ -175,9 +174,3 @@ async def receive(
     except BaseException:
         path.unlink(missing_ok=True)
         raise
-
-
-def shown_name(name: str) -> str:
-    """Return what a sender calls a file, as it may be shown: one short line without folders."""
-    plain = "".join(c if c.isprintable() else "_" for c in last_part(name)).strip()
-    return plain[:200] or "recording"

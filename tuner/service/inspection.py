@@ -1,6 +1,6 @@
 """A recording inspected in a process of its own, with limits on memory, time and what it writes.
 
-``python -m tuner.service.inspecting FILE MEMORY BYTES SECONDS`` prints what `tune inspect --json`
+``python -m tuner.service.inspection FILE MEMORY BYTES SECONDS`` prints what `tune inspect --json`
 prints.
 """
 
@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tuner.core.errors import RecordingError
-from tuner.service.limiting import limit_process
-from tuner.service.settings import Limits, size_in_words
+from tuner.service.settings import Limits, limit_process, size_in_words
 
 SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
 MOST_JSON = 20_000_000
@@ -35,7 +34,7 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
         limits.file_bytes,
         int(limits.inspection_seconds) + 1,
     )
-    command = [sys.executable, "-m", "tuner.service.inspecting", str(file), *map(str, numbers)]
+    command = [sys.executable, "-m", "tuner.service.inspection", str(file), *map(str, numbers)]
     single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
         done = subprocess.run(

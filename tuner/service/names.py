@@ -1,4 +1,4 @@
-"""What users call their recordings, made fit to be a file's name here: never a path."""
+"""What users call things, made fit to be a file's name here, never a path, or to be shown."""
 
 from __future__ import annotations
 
@@ -31,3 +31,15 @@ def recording_name(name: str) -> str:
 def stems(names: Iterable[str]) -> list[str]:
     """Return the flights' names."""
     return [PurePosixPath(name).stem for name in names]
+
+
+def shown_name(name: str) -> str:
+    """Return what a sender calls a file, as it may be shown: one short line without folders."""
+    plain = "".join(c if c.isprintable() else "_" for c in last_part(name)).strip()
+    return plain[:200] or "recording"
+
+
+def shown(name: str) -> str:
+    """Return a user's word for a message: short, in one line."""
+    plain = "".join(c if c.isprintable() else "?" for c in name)
+    return plain if len(plain) <= 60 else plain[:57] + "..."
