@@ -21,10 +21,10 @@ from tuner.findings.findings import Code
 PACKAGE = Path(_package).parent
 UNKNOWN = "…"
 
-#: Where a message comes from -> heading; the first that matches.
+#: Where a message comes from -> stage in which a user meets it; the first that matches.
 TOPICS: Mapping[str, str] = {
-    "recording": "Recordings",
-    "job_flights": "Recordings",
+    "recording": "Reading recordings",
+    "job_flights": "Reading recordings",
     "ground/": "Ground measurements",
     "exporters/": "Export",
     "vehicle/": "Vehicle, controller and job files",
@@ -32,15 +32,45 @@ TOPICS: Mapping[str, str] = {
     "core/yaml": "Vehicle, controller and job files",
     "core/shipped": "Vehicle, controller and job files",
     "core/validation": "Vehicle, controller and job files",
-    "evaluate/": "Simulated flights",
-    "objective/trajectory": "Simulated flights",
+    "evaluate/": "Simulating and comparing",
+    "objective/trajectory": "Simulating and comparing",
     "service/": "The tuning service",
     "client/": "The tuning service",
     "engine/": "Workers and clusters",
-    "cli/": "Options of the command line",
+    "cli/": "The command line",
     "core/": "Files and folders",
-    "": "Jobs and results",
+    "": "Searching, and its result",
 }
+ORDER = (
+    "The command line",
+    "Vehicle, controller and job files",
+    "Reading recordings",
+    "Ground measurements",
+    "Searching, and its result",
+    "Simulating and comparing",
+    "Export",
+    "Files and folders",
+    "Workers and clusters",
+    "The tuning service",
+)
+
+#: Stage of a run -> beginnings of the codes of what is found there; the first that matches.
+STAGES: Mapping[str, tuple[str, ...]] = {
+    "While recordings are read": (
+        *("recording", "salvaged", "left_out", "missing_signals", "pose_gap", "sparse_input"),
+        *("manoeuvres", "px4_loops", "logged_gains", "logs_differ", "inlet_chosen", "motor_order"),
+        *("attitude_followed", "spins_reversed", "rotor_changed"),
+    ),
+    "Before the search": (
+        *("wrong_vehicle", "cannot_hover", "still_axes", "no_yaw", "implausible", "start_on_bound"),
+        *("not_finite", "nothing_has", "no_effect", "singular", "setpoints", "heading_flown"),
+        *("input_late", "turning_regressed", "turning_not"),
+    ),
+    "Without a pose": ("scales_with", "no_tacho", "yaw_open", "rate_", "vehicle_not_given"),
+    "Of ground measurements": ("ground_conflict", "bench_conflict"),
+    "After the search": ("",),
+}
+NOTHING_TO_DO = "Nothing to do."
 
 INTRO = """# Messages
 
@@ -68,12 +98,27 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",
+    Code.INLET_CHOSEN: "What was logged does not explain how the vehicle turned, so that its "
+    "recorded attitude is followed, or it is simulated from its rotor speeds. Log commands as "
+    "often as the rate loop runs.",
+    Code.SETPOINTS_SCALED: "The recorded rate set-points are a multiple of the controller file's. "
+    "Check its gains and its attitude.law.",
+    Code.SETPOINTS_FOREIGN: "Another controller flew, or another reference: the recorded rate "
+    "set-points do not follow from reference, state and controller file. Give the controller that "
+    "flew (--controller), or enter below it (inlet: body_rate).",
+    Code.HOLDING_BETTER: "That the state stays as it is predicts this flight better than the "
+    "fitted coefficients do. Predict less far ahead, or with more recorded.",
+    Code.INERTIA_BALANCED: "Errors in rotor speeds would pass for inertia: it is the one at which "
+    "recorded motion and rotor speeds balance. Nothing to do.",
+    Code.INERTIA_NOT_BALANCED: "Errors in rotor speeds pass for inertia: what predicts the "
+    "flights is kept. Take these inertias for effective ones, and measure them on the ground "
+    "(tune bench).",
+    Code.DISTURBANCES_FOLLOWED: "The residuals hold more than noise, as gusts leave it, and a "
+    "Kalman filter follows what pushed the flights. Nothing to do.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
     "vehicle may differ.",
 }
-
-IN_ITS_OWN = "The line says what was noticed and what to do."
 
 FINDINGS = """## Findings of a run
 
@@ -101,7 +146,7 @@ def messages_page() -> str:
     parts = [f"{GENERATED}{INTRO}"]
     messages = known_messages()
     seen: set[str] = set()
-    for topic in dict.fromkeys(TOPICS.values()):
+    for topic in ORDER:
         parts.append(f"## {topic}\n")
         for message in sorted((m for m in messages if m.topic == topic), key=lambda m: m.anchor):
             anchor = "" if message.anchor in seen else f'<a id="{message.anchor}"></a>'
@@ -109,13 +154,21 @@ def messages_page() -> str:
             parts.append(f"- {anchor}**{_shown(message.what)}**; {_shown(message.remedy)}")
         parts.append("")
     parts.append(FINDINGS)
-    for code in Code:
-        text, remedy = code.sentence, code.remedy
-        if code in IN_OTHER_WORDS or not isinstance(text, str):
-            text, remedy = IN_OTHER_WORDS.get(code, IN_ITS_OWN), ""
-        line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, f"{text} {remedy}".strip()))
-        parts.append(f'- <a id="{code}"></a>`{code}`: {line}')
+    stage_of = {code: _stage(code) for code in Code}
+    for stage in STAGES:
+        parts.append(f"\n### {stage}\n")
+        parts += [_finding(code) for code in Code if stage_of[code] == stage]
     return "\n".join(parts) + "\n"
+
+
+def _stage(code: Code) -> str:
+    return next(s for s, begins in STAGES.items() if code.value.startswith(begins))
+
+
+def _finding(code: Code) -> str:
+    line = IN_OTHER_WORDS.get(code) or f"{code.sentence} {code.remedy or NOTHING_TO_DO}"
+    line = _shown(re.sub(r"\{[^}]*\}", UNKNOWN, line))
+    return f'- <a id="{code}"></a>`{code}`: {line}'
 
 
 def _shown(text: str) -> str:

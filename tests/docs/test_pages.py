@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.__main__ import BY_NAME, PARTS
 from docs.generate.house import house_page, rooms
-from docs.generate.messages import known_messages, sites
+from docs.generate.messages import IN_OTHER_WORDS, ORDER, STAGES, TOPICS, known_messages, sites
 from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
 from tests.docs.pages import PAGES, ROOT, anchors, blocks, commands, links, name_of
@@ -120,6 +120,20 @@ def test_every_error_line_has_one_anchor():
     assert set(counts.values()) == {1}
     assert {message.anchor for message in known_messages()} <= set(counts)
     assert set(Code) <= set(counts)
+
+
+def test_messages_are_grouped_by_stage_and_have_an_answer():
+    page = (REFERENCE / "messages.md").read_text(encoding="utf-8")
+    assert set(ORDER) == set(TOPICS.values())
+    places = [page.index(f"## {stage}\n") for stage in (*ORDER, "Findings of a run")]
+    assert places == sorted(places)
+    groups = page.partition("## Findings of a run")[2].split("\n### ")[1:]
+    assert [group.partition("\n")[0] for group in groups] == list(STAGES)
+    assert all(group.count("<a id=") > 1 for group in groups)
+    assert set(IN_OTHER_WORDS) >= {c for c in Code if not isinstance(c.sentence, str)}
+    refusals = re.findall(r"^- (?:<a id=.*?</a>)?\*\*.*\*\*; (.*)$", page, flags=re.MULTILINE)
+    assert len(refusals) > 300
+    assert all(refusals)
 
 
 def test_the_words_of_nearly_every_error_are_known():

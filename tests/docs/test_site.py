@@ -54,3 +54,21 @@ def test_a_browser_shows_it_whole(site: Path, width: int):
                 assert asked <= {"file", "data", "blob"}, name
                 broken = "[...document.images].filter(i => i.complete && !i.naturalWidth).length"
                 assert page.evaluate(broken) == 0, name
+
+
+def test_search_works_in_pages_that_are_opened_as_files(site: Path):
+    browser = pytest.importorskip("tests.tuner.report.browser", reason="needs Playwright")
+    if browser.CHROMIUM is None:
+        pytest.skip("needs Chromium or Chrome on the path")
+    with (
+        browser.chromium() as started,
+        browser.reading(started, site / "tutorials/first-fit.html") as opened,
+    ):
+        page = opened.page
+        page.locator(".md-search__input").fill("finer_than_steps")
+        links = page.locator(".md-search-result__link")
+        links.first.wait_for(timeout=browser.PATIENCE)
+        assert any("messages.html" in (link.get_attribute("href") or "") for link in links.all())
+        asked = {address.partition(":")[0] for address in opened.requests}
+        assert asked <= {"file", "data", "blob"}
+        assert opened.complaints == []

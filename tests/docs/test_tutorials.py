@@ -13,6 +13,7 @@ import pytest
 
 import tuner
 from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands, figures
+from tests.docs.px4_logs import write_logs
 from tuner.cli import main
 from tuner.cli.results import print_run
 from tuner.evaluate.write import write_flights
@@ -66,6 +67,8 @@ def words_of(command: str) -> list[str]:
 def test_its_commands_run_and_print_what_it_shows(
     page: Path, place: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    if page.stem == "px4-without-mocap":
+        write_logs(place / "logs")
     for line in commands(page):
         if line == SHARED:
             shutil.copytree(request.getfixturevalue("demo")[0], place / "runs" / "first")

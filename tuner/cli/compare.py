@@ -54,7 +54,7 @@ def compare(
             write_figure(comparison_figure(flown), plot)
 
     options = Options(**vars(recordings))
-    with listening(quiet=quiet) as listener:
+    with listening(quiet=quiet, verbose=True) as listener:
         table, settings = compare_vehicles(
             options, vehicle, out or (), on_flown=draw, on_message=listener.on_message
         )

@@ -136,10 +136,9 @@ class _StageLines:
         self._last: Iteration | None = None
 
     def stage(self, name: str) -> None:
-        if not name or name in self._named:
-            return
-        self._named.add(name)
-        self.line(DOING.get(name, as_sentence(name)))
+        if name in DOING and name not in self._named:
+            self._named.add(name)
+            self.line(DOING[name])
 
     def show(self, iteration: Iteration) -> None:
         self._last = iteration

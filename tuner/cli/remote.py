@@ -190,7 +190,7 @@ def watch(
     from tuner.client.client import ended_well
 
     with client_of(server, token) as client:
-        with listening(quiet=quiet) as listener:
+        with listening(quiet=quiet, verbose=True) as listener:
             show(client.follow(job), listener)
         ended_well(client.job(job))
     if not quiet:

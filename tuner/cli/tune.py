@@ -39,7 +39,7 @@ def tune(
     with profiling(profile, quiet=quiet) as profile_into:
         with span("import"):
             from tuner.cli.progress import listening
-            from tuner.cli.results import print_bench, print_run
+            from tuner.cli.results import print_run
             from tuner.core.runtime import configure
 
             configure()
@@ -61,7 +61,12 @@ def tune(
                 )
             profile_into(measured.folder)
             if not quiet:
-                print_bench(measured, verbose=verbose)
+                print_run(
+                    measured.folder,
+                    measured.result,
+                    seconds=time.perf_counter() - began,
+                    verbose=verbose,
+                )
             return
         engine = engine_for(options.workers, options.cluster)
         with engine, listening(quiet=quiet, verbose=verbose) as listener:

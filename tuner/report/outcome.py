@@ -269,7 +269,7 @@ def _standing(result: RunResult, checks: Sequence[Met], met: Sequence[Met]) -> S
         "unchanged" in words,
         bool(met) and not any(one.held_out for one in met),
         not result.search.converged,
-        bool(fitted) and all(row.identifiable is False for row in fitted),
+        bool(fitted) and (any if not met else all)(row.identifiable is False for row in fitted),
         any(f.level == "warning" and f.code in DOUBTS for f in result.findings),
     )
     return Standing.WITH_CARE if any(unsure) else Standing.USABLE

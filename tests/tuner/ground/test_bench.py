@@ -181,7 +181,7 @@ def test_a_conflict_is_named_in_the_result(tmp_path, capsys):
         shutil.copy(recording, tmp_path)
     wrong = THRUST | {"lever_ratio": 1.0}
     assert run(tmp_path, {"experiments": [wrong, HOVER]}, "--out", str(tmp_path / "out")) == 0
-    assert "standard errors from what all other experiments say" in capsys.readouterr().out
+    assert "It contradicts the other experiments" in capsys.readouterr().out
     written = json.loads((tmp_path / "out" / "result.json").read_text())
     assert {f["subject"] for f in written["findings"]} == {"thrust_stand", "hover_weights"}
 

@@ -111,4 +111,4 @@ def test_the_command_asks_for_what_was_typed_and_prints_a_line_for_each_coeffici
     shown = capsys.readouterr().out
     assert "rolling_moment_coefficient (fixed)" in shown
     assert "The worst determined combination of coefficients: " in shown
-    assert f"written to {examined.folder}/" in shown
+    assert f"Written to {examined.folder}:" in shown

@@ -46,7 +46,7 @@ def test_another_law_is_said_before_the_search(flight):
     findings = setpoint_findings(flight, lee)
     assert {finding.code for finding in findings} == {Code.SETPOINTS_SCALED}
     line = one_line(findings[0])
-    assert "roll rate set-points are 0.5 times the controller file's" in line
+    assert "Roll rate set-points are 0.5 times the controller file's" in line
     assert "as those of the quaternion law would be" in line
 
 

@@ -80,8 +80,8 @@ def test_recordings_of_which_no_flight_can_be_made_are_left_out_by_name(tmp_path
     recordings, left_out = read_usable(settings)
     assert [recording.flight.name for recording in recordings] == [CIRCLE]
     assert [finding.subject for finding in left_out] == ["too_short", "empty"]
-    assert sentence(left_out[1]).startswith("The flight is left out: it is empty")
-    assert sentence(left_out[0]).startswith("The flight is left out: nothing flies in it")
+    assert sentence(left_out[1]).startswith("It is empty; the flight is left out")
+    assert sentence(left_out[0]).startswith("Nothing flies in it: no mission was found")
     with pytest.raises(RecordingError, match="nothing flies in it"):
         read_usable(replace(settings, flights=(too_short, empty)))
     with pytest.raises(RecordingError, match="no such file"):

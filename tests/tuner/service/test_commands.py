@@ -31,12 +31,9 @@ def test_submitting_and_waiting_shows_and_ends_as_the_local_command(table, tmp_p
     out = tmp_path / "run"
     assert main(["submit", "--flights", str(table), "--wait", "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert "begins at 0" in shown
     assert "whole length: iteration 5, horizon 1 s, position RMSE 20.00 mm" in shown
-    ended, estimates = shown.index("whole length: "), shown.index("The search ended here.")
-    assert ended < estimates < shown.index("how well it is known")
-    assert "RMSE with the initial → with the best coefficients" in shown
-    assert f"written to {out}/" in shown
+    assert shown.index("whole length: ") < shown.index("± 95 %")
+    assert f"Written to {out}" in shown
     assert (out / "plots" / "one.svg").exists()
     assert json.loads((out / "result.json").read_text())["status"] == "converged"
 

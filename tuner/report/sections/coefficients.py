@@ -130,7 +130,7 @@ def _fixed(
 def _examined(knowledge: Mapping[str, CoefficientKnowledge]) -> Table:
     rows = [
         (
-            _name(name),
+            Cell(known.label(name), small=COEFFICIENTS[name].meaning),
             figures(known.value),
             short(known.std_error),
             _from_to(known.ci95),
