@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 import tuner
-from tuner.recordings.note_texts import note_in_words
+from tuner.recordings.notes import note_in_words
 
 LAB = Path(__file__).resolve().parents[1] / "reference_flights"
 OUT = Path(sys.argv[1] if len(sys.argv) > 1 else "runs/example")

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 from tuner.core.disk import exists
 from tuner.core.errors import InputError
 from tuner.core.files import FiniteOrNone, Part, ResultFile
-from tuner.design.log_proposal import LogProposal
+from tuner.design.proposals import LogProposal
 from tuner.evaluate.records import AxesRmse, PredictedErrors
 from tuner.findings.findings import Finding
 from tuner.uncertainty.records import ErrorParts, Sources

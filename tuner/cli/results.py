@@ -205,8 +205,7 @@ def _cell(of: Cell | str) -> Text:
 
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
     """Print what each experiment and all together say, and where everything lies."""
-    from tuner.ground.bench_json import bench_record
-    from tuner.ground.texts import agreement_in_words, numbers_in_words
+    from tuner.ground.bench_json import agreement_in_words, bench_record, numbers_in_words
 
     screen = console()
     record = bench_record(bench.combination, bench.measurements)

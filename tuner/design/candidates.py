@@ -1,14 +1,26 @@
-"""Flights that could be flown next inside an arena: the simulator's reference and a name."""
+"""Flights that could be flown next inside an arena, simulated and measured as the recorded ones."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_jax.control.position import ReferencePoint
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.state import Start, hover
 from sim_jax.trajectory import Shape, shapes
+from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
-from tuner.objective.trajectory import at_speed
+from tuner.objective.criterion import Criterion, Point
+from tuner.objective.normal import Objective
+from tuner.objective.segments import Measured, Segments
+from tuner.objective.trajectory import Published, at_speed, published
 
 CLEARANCE = 0.5
 """Distance that a reference keeps from the walls, from which a vehicle may stray, m."""
@@ -22,6 +34,8 @@ SMALLEST = 0.5
 """Radius of a shape below which it is not worth flying, m."""
 HARDEST = 9.0
 """Acceleration of the reference beyond which it is not proposed, some 45° of tilt; m/s²."""
+SAMPLE_RATE = 100.0
+"""Highest rate at which candidates are compared, Hz; their weights stand for more samples."""
 
 
 @dataclass(frozen=True)
@@ -90,3 +104,159 @@ def _spins(shape: type[Shape]) -> Iterator[Candidate]:
 
 def _noun(shape: type[Shape]) -> str:
     return f"a {shape.name.replace('_', ' ')}"
+
+
+Array = NDArray[np.float64]
+
+
+def candidate_problem(
+    objective: Objective,
+    flights: Sequence[Candidate],
+    *,
+    seconds: float,
+    spin_channels: Sequence[str],
+) -> Objective:
+    """Return the problem with candidates in the place of recordings, whose values are zero.
+
+    Parameters
+    ----------
+    objective
+        The problem of the recorded flights, which are whole.
+    flights
+        The candidates.
+    seconds
+        How long each lasts.
+    spin_channels
+        Channels that a yaw spin is compared by.
+    """
+    recorded, schedule = objective.segments, objective.schedule
+    references = [
+        published(
+            flight.trajectory,
+            duration=seconds,
+            control_rate=schedule.position_control_rate,
+        )
+        for flight in flights
+    ]
+    starts: Vec3 = jax.tree.map(lambda *places: jnp.stack(places), *(r.start for r in references))
+    spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
+    count = len(flights)
+    segments = Segments(
+        inlet=_laid(references, recorded),
+        start=_hovering(objective, starts, count),
+        measured={
+            name: _sampled(
+                measured,
+                silent=spins & (name not in spin_channels),
+                seconds=seconds,
+                recorded=_seconds(objective),
+            )
+            for name, measured in recorded.measured.items()
+        },
+        flight=jnp.arange(count),
+        resting=None if recorded.resting is None else jnp.ones(count, bool),
+        log_voltage=_filled(recorded.log_voltage, count, np.nan),
+        wander=_filled(recorded.wander, count, 0.0),
+    )
+    return replace(
+        objective,
+        segments=segments,
+        samples=round(seconds * schedule.log_rate),
+        multiplicity=None,
+    )
+
+
+def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
+    """Return the references side by side, the last points held."""
+    assert isinstance(recorded.inlet, ReferenceInlet)
+    inlets = [reference.inlet for reference in references]
+    length = max(len(reference.lap) - 1 for reference in references)  # none acts at the end
+
+    def beside(*rows: jax.Array) -> jax.Array:
+        edges = [
+            np.pad(np.asarray(row)[:length], (0, max(length - len(row), 0)), mode="edge")
+            for row in rows
+        ]
+        return jnp.asarray(np.stack(edges, axis=-1))
+
+    points: ReferencePoint = jax.tree.map(beside, *(inlet.points for inlet in inlets))
+    held = recorded.inlet.level_held
+    return ReferenceInlet(
+        points,
+        spins=jnp.stack([inlet.spins for inlet in inlets]),
+        yaw_rate=jnp.stack([inlet.yaw_rate for inlet in inlets]),
+        level_held=None if held is None else jnp.zeros(len(inlets), bool),
+    )
+
+
+def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
+    start = hover(objective.model.vehicle, places)
+    wide: Start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (count,)), start
+    )
+    return wide
+
+
+def _filled(recorded: jax.Array | None, count: int, value: float) -> jax.Array | None:
+    """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
+    return None if recorded is None else jnp.full((*recorded.shape[:-1], count), value)
+
+
+def _seconds(objective: Objective) -> Array:
+    """Return (F,) s that each segment was recorded for."""
+    ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
+    return np.asarray(np.maximum(np.max(ends, axis=0), 1e-9))
+
+
+def _sampled(
+    measured: Measured,
+    *,
+    silent: NDArray[np.bool_],
+    seconds: float,
+    recorded: Array,
+) -> Measured:
+    """Return one channel of every candidate, as often and as precisely recorded as in the best.
+
+    Parameters
+    ----------
+    measured
+        The channel of the recorded segments.
+    silent
+        (C,) for which candidates it is not compared.
+    seconds, recorded
+        How long a candidate lasts, and (F,) how long each segment was recorded, in s.
+    """
+    weight = np.asarray(measured.weight)
+    rows = int(seconds * SAMPLE_RATE) - 1
+    recorded_rate = (weight > 0).sum(axis=0) / recorded
+    equivalent = np.where(
+        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / SAMPLE_RATE), 0.0
+    )
+    segments = len(silent)
+    time = np.repeat(np.arange(1, rows + 1)[:, None] / SAMPLE_RATE, segments, axis=1)
+    values = np.zeros((rows, np.asarray(measured.values).shape[1], segments))
+    if values.shape[1] > weight.shape[1]:
+        values[:, 0] = 1.0  # an attitude
+    constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
+    weights = np.broadcast_to(constant, (rows, *constant.shape))
+    return Measured(time=jnp.asarray(time), values=jnp.asarray(values), weight=jnp.asarray(weights))
+
+
+def candidate_point(
+    point: Point, criterion: Criterion, objective: Objective, *, seconds: float
+) -> tuple[Point, Criterion]:
+    """Return point and criterion of candidates of so many s, weighed as most recorded flights."""
+    count = objective.flights
+    offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
+    reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
+    scale = {
+        name: jnp.full(count, float(np.median(np.asarray(of_segment))))
+        for name, of_segment in criterion.scale.items()
+    }
+    return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
+        horizon=jnp.asarray(round(seconds * objective.schedule.log_rate)),
+        scale=scale,
+        reference_offset=jnp.asarray(reference_offset),
+        huber=jnp.asarray(np.inf),
+        prior=criterion.prior,
+    )

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import log_determinant, scaled_inverse, unit_diagonal
-from tuner.design.candidate_problem import candidate_point, candidate_problem
-from tuner.design.candidates import Arena, Candidate, candidates
-from tuner.design.next_flight_json import Proposal, Proposals
+from tuner.design.candidates import Arena, Candidate, candidate_point, candidate_problem, candidates
+from tuner.design.proposals import Proposal, Proposals
 from tuner.objective.criterion import Criterion
 from tuner.objective.information import information_from_jacobian
 from tuner.objective.normal import Objective

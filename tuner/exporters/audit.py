@@ -20,8 +20,7 @@ from tuner.exporters.px4_parameters import outside_range, read_parameters
 from tuner.exporters.sdf.composite import Array, Inertial, together
 from tuner.exporters.sdf.includes import assembled
 from tuner.exporters.sdf.model import Model, inertials, read_model
-from tuner.exporters.sdf.spans import Element, number
-from tuner.exporters.sdf.template import rendered
+from tuner.exporters.sdf.spans import Element, number, rendered
 from tuner.result import Run
 from tuner.vehicle import values_of
 
@@ -243,14 +242,24 @@ def _speeds(
     return None if math.isinf(limit) else (0.0, limit)
 
 
+def _motor_constant(rotors: list[Rotor]) -> float:
+    """Return N s²/rad² of all rotors together."""
+    return sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
+
+
+def _hover_throttle(whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float]) -> float:
+    """Return the share of the way from no to full command at which rotors carry the weight."""
+    low, high = speeds
+    return (math.sqrt(whole.mass * GRAVITY / _motor_constant(rotors)) - low) / (high - low)
+
+
 def _of_hover(
     whole: Inertial, rotors: list[Rotor], speeds: tuple[float, float] | None
 ) -> Iterator[str]:
     """Yield what is wrong with thrust to weight and with the hover."""
     if speeds is None or any("motorConstant" not in rotor.numbers for rotor in rotors):
         return
-    constant = sum(rotor.numbers["motorConstant"] for rotor in rotors)
-    low, high = speeds
+    constant, (low, high) = _motor_constant(rotors), speeds
     if constant <= 0 or high <= low:
         yield f"motorConstant and speeds of {low:g} to {high:g} rad/s give no thrust"
         return
@@ -263,7 +272,7 @@ def _of_hover(
             "are off"
         )
         return
-    hover = (math.sqrt(weight / constant) - low) / (high - low)
+    hover = _hover_throttle(whole, rotors, speeds)
     if not HOVER[0] <= hover <= HOVER[1]:
         yield (
             f"it hovers at a throttle of {hover:.2f}, with rotors of {low:g} to {high:g} rad/s; "
@@ -295,10 +304,9 @@ def _of_parameters(
     if mass is not None and not math.isclose(mass, whole.mass, rel_tol=SAME_SHARE):
         yield f"SIH_MASS is {mass:g} kg, the model weighs {whole.mass:.4g} kg"
     hover = given.get("MPC_THR_HOVER")
-    constant = sum(rotor.numbers.get("motorConstant", 0.0) for rotor in rotors)
-    if hover is not None and speeds is not None and constant > 0 and "SIH_T_MAX" not in given:
-        low, high = speeds
-        there = (math.sqrt(whole.mass * GRAVITY / constant) - low) / (high - low)
+    of_model = speeds is not None and _motor_constant(rotors) > 0 and "SIH_T_MAX" not in given
+    if hover is not None and speeds is not None and of_model:
+        there = _hover_throttle(whole, rotors, speeds)
         if abs(hover - there) > SAME_SHARE:
             yield f"MPC_THR_HOVER is {hover:g}, the model hovers at a throttle of {there:.2f}"
 

@@ -20,7 +20,7 @@ from tuner.evaluate.comparison import Comparison
 from tuner.evaluate.held_out import comparison_of, controller_flown
 from tuner.evaluate.records import AxesRmse
 from tuner.evaluate.rmse import FlightErrors
-from tuner.exporters.target import target_of
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.objective.criterion import Point
 from tuner.objective.segments import OFFSETS
 from tuner.objective.space import Space
@@ -32,8 +32,6 @@ from tuner.search.polish import polished
 from tuner.search.problem import Job
 from tuner.vehicle import (
     COEFFICIENTS,
-    REGISTRY,
-    NotCarried,
     VehicleFile,
     Written,
     initial_values,
@@ -43,8 +41,6 @@ from tuner.vehicle import (
 from tuner.vehicle.coefficient import Parameter
 from tuner.vehicle.model import model_of
 
-FORMAT = "sdf"
-"""The export format that says what Gazebo has a place for."""
 STAGES = 3
 """Of the search: whole flights, then the polish in the weights that what is missing leaves."""
 
@@ -87,7 +83,7 @@ def effective_fit(
         "flies most like the vehicle."
     )
     names = [name for group in lost.values() for name in group]
-    bare = without(vehicle, names)
+    bare = GAZEBO_CLASSIC.lacking(vehicle, names)
     end, effective = refitted(job, fitted, bare, names, on_progress)
     spinning = [flight.name for flight in job.flights if flight.spins_freely]
     comparisons: dict[frozenset[str], Comparison] = {}
@@ -111,7 +107,7 @@ def effective_fit(
             LostTerm(
                 group=group,
                 names=members,
-                rmse_without=over_flights(flown(without(vehicle, members), members)),
+                rmse_without=over_flights(flown(GAZEBO_CLASSIC.lacking(vehicle, members), members)),
             )
             for group, members in lost.items()
         ),
@@ -132,36 +128,17 @@ def lost_terms(vehicle: VehicleFile, fitted: Fitted) -> dict[str, tuple[str, ...
         name: float(np.abs(row).max())
         for name, row in zip(fitted.objective.conditions, rows, strict=True)
     }
-    entry, groups = target_of(FORMAT).entry, dict[str, tuple[str, ...]]()
-    for name, value in (values_of(vehicle) | around).items():
-        held = entry(REGISTRY[name])
-        if isinstance(held, NotCarried) and held.built_in not in (None, value):
-            group = REGISTRY[name].group or name
-            groups[group] = (*groups.get(group, ()), name)
-    return groups
+    return GAZEBO_CLASSIC.lost(values_of(vehicle) | around)
 
 
 def carried_terms(vehicle: VehicleFile) -> tuple[str, ...]:
     """Return the terms beyond the motor model that act and that Gazebo has a place for."""
-    entry = target_of(FORMAT).entry
+    entry = GAZEBO_CLASSIC.entry
     return tuple(
         name
         for name, value in vehicle.effects.items()
         if isinstance(entry(COEFFICIENTS[name]), Written) and value != COEFFICIENTS[name].neutral
     )
-
-
-def without(vehicle: VehicleFile, names: Collection[str]) -> VehicleFile:
-    """Return the vehicle with some coefficients as Gazebo has them built in."""
-    kept = {name: value for name, value in vehicle.effects.items() if name not in names}
-    entry, built_in = target_of(FORMAT).entry, {}
-    for name in names:
-        if name in COEFFICIENTS and not COEFFICIENTS[name].is_effect:
-            held = entry(COEFFICIENTS[name])
-            assert isinstance(held, NotCarried), "Gazebo has no place for it"
-            assert held.built_in is not None, "Gazebo flies it"
-            built_in[name] = held.built_in
-    return with_values(vehicle.replace(effects=kept), built_in)
 
 
 def refitted(

@@ -36,7 +36,6 @@ from tuner.search.problem import job_of
 from tuner.search.progress import beginning
 from tuner.vehicle import (
     COEFFICIENTS,
-    REGISTRY,
     NotCarried,
     VehicleFile,
     read_vehicle,
@@ -127,14 +126,13 @@ def effective_in(run: Run, simulator: Simulator) -> tuple[VehicleFile, Effective
     start = bare if simulator.start is None else simulator.flown(simulator.start(run.vehicle))
     vehicle, converged = refitted(run, simulator, start, settings, still)
     flights = flown(vehicle)
-    terms = [
-        LostTerm(
-            group=group,
-            names=members,
-            rmse_without=over_flights(flown(_lacking(run.vehicle, simulator, members))),
+    terms = []
+    for group, members in lost.items():
+        lacking = (
+            simulator.lacking(run.vehicle, members) if members else simulator.laws(run.vehicle)
         )
-        for group, members in lost.items()
-    ]
+        missed = over_flights(flown(lacking))
+        terms.append(LostTerm(group=group, names=members, rmse_without=missed))
     result = EffectiveResult(
         target=simulator.name,
         coefficients=values_of(vehicle),
@@ -169,30 +167,10 @@ def lost_terms(
         for recording in recordings
         for name in recording.conditions
     }
-    groups: dict[str, tuple[str, ...]] = {}
-    for name, value in (values_of(vehicle) | around).items():
-        held = simulator.entry(REGISTRY[name])
-        if isinstance(held, NotCarried) and held.built_in not in (None, value):
-            group = REGISTRY[name].group or name
-            groups[group] = (*groups.get(group, ()), name)
+    groups = simulator.lost(values_of(vehicle) | around)
     if not same_flight(simulator.laws(vehicle), vehicle):
         groups[LAWS] = ()
     return groups
-
-
-def _lacking(vehicle: VehicleFile, simulator: Simulator, names: tuple[str, ...]) -> VehicleFile:
-    """Return a vehicle with some coefficients as a simulator has them; without any, by its laws."""
-    if not names:
-        return simulator.laws(vehicle)
-    effects = {n: value for n, value in vehicle.effects.items() if n not in names}
-    built_in = {}
-    for name in names:
-        if name in COEFFICIENTS and not COEFFICIENTS[name].is_effect:
-            held = simulator.entry(COEFFICIENTS[name])
-            assert isinstance(held, NotCarried)
-            assert held.built_in is not None
-            built_in[name] = held.built_in
-    return with_values(vehicle.replace(effects=effects), built_in)
 
 
 def _without(recording: Recording, names: set[str]) -> Recording:

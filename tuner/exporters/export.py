@@ -102,8 +102,6 @@ def export(
         The file cannot be written.
     """
     target = target_of(kind)
-    if into is not None and not target.patches:
-        raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own), folder_is_made=True)
@@ -178,11 +176,8 @@ def export_vehicle(
     ExportError, OutputError
         As of `export`.
     """
-    vehicle, target = read_vehicle(file), target_of(kind)
-    if into is not None and not target.patches:
-        raise ExportError("--into", f"does not go with --format {kind}", "leave it out")
-    choices = Choices(into, simulator)
-    target = target.chosen(choices)
+    vehicle, choices = read_vehicle(file), Choices(into, simulator)
+    target = target_of(kind).chosen(choices)
     check_every_coefficient(vehicle, target)
     line, sources = provenance_of_file(vehicle, file, today, accept)
     draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
@@ -190,11 +185,7 @@ def export_vehicle(
     if beside.name == file.name:
         beside = file.with_name(f"{file.stem}_exported{target.suffix}")
     places = _places(draft, out or into or beside, into)
-    gates = (
-        *draft.gates,
-        check_hover(target.flown(vehicle), draft.vehicle),
-        *not_flown(),
-    )
+    gates = (*draft.gates, check_hover(target.flown(vehicle), draft.vehicle), *not_flown())
     refuse(file, gates, accept, "correct the vehicle file or the model")
     write(draft, *places)
     computed = () if target.simulator is None else target.simulator.deviations

@@ -7,7 +7,7 @@ vehicle that it flies, which the project's own simulation flies for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
@@ -21,6 +21,7 @@ from tuner.exporters.hover import (
 )
 from tuner.vehicle import (
     COEFFICIENTS,
+    REGISTRY,
     Coefficient,
     NotCarried,
     VehicleFile,
@@ -78,45 +79,35 @@ class Simulator:
     def flown(self, vehicle: VehicleFile) -> VehicleFile:
         """Return the vehicle as the simulator flies it, in a file that this project flies."""
         vehicle = self.laws(vehicle)
-        effects, built_in = dict(vehicle.effects), {}
-        for name in values_of(vehicle):
-            row = COEFFICIENTS[name]
-            entry = self.entry(row)
-            if isinstance(entry, NotCarried) and entry.built_in is not None:
-                if row.is_effect:
-                    del effects[name]
-                else:
-                    built_in[name] = entry.built_in
-        flown = with_values(vehicle.replace(effects=effects), built_in)
+        flown = self.lacking(
+            vehicle, [n for n in values_of(vehicle) if self.built_in(n) is not None]
+        )
         return flown.replace(aerodynamics=flown.aerodynamics.replace(reaction_torque="body"))
 
+    def built_in(self, name: str) -> float | None:
+        """Return the value that it flies in the place of a coefficient's; None where it has it."""
+        entry = self.entry(REGISTRY[name])
+        return entry.built_in if isinstance(entry, NotCarried) else None
 
-def entries(
-    held: Mapping[str, str], lacks: Mapping[str, NotCarried], *, title: str
-) -> Callable[[Coefficient], Entry]:
-    """Return `Simulator.entry` of what a simulator holds, and of what it lacks for a reason.
+    def lost(self, acting: Mapping[str, float]) -> dict[str, tuple[str, ...]]:
+        """Return group -> its coefficients, of name -> value, that it flies at another value."""
+        groups: dict[str, tuple[str, ...]] = {}
+        for name, value in acting.items():
+            if self.built_in(name) not in (None, value):
+                group = REGISTRY[name].group or name
+                groups[group] = (*groups.get(group, ()), name)
+        return groups
 
-    Parameters
-    ----------
-    held
-        Coefficient -> the key of its file.
-    lacks
-        Coefficient -> why, for those of Gazebo's motor model, and those of which there is more to
-        say than that there is no such term.
-    title
-        Of the simulator.
-    """
-
-    def entry(row: Coefficient) -> Entry:
-        if row.name in held:
-            return Written(held[row.name])
-        if row.name in lacks:
-            return lacks[row.name]
-        if row.scope != "vehicle":
-            return _OF_SETUP
-        return NotCarried(f"{title} has no such term", row.neutral)
-
-    return entry
+    def lacking(self, vehicle: VehicleFile, names: Collection[str]) -> VehicleFile:
+        """Return a vehicle with some coefficients as the simulator has them built in."""
+        effects = {name: value for name, value in vehicle.effects.items() if name not in names}
+        built_in = {
+            name: value
+            for name in names
+            if name in COEFFICIENTS and not COEFFICIENTS[name].is_effect
+            if (value := self.built_in(name)) is not None
+        }
+        return with_values(vehicle.replace(effects=effects), built_in)
 
 
 # laws
@@ -335,18 +326,38 @@ SIH = Simulator(
 
 _CENTRE = {f"center_of_mass_{axis}": "rotor positions" for axis in "xyz"}
 _MOTORS = ("input_scaling", "zero_position_armed", "input_offset", "quadratic")
-_NO_ROLLING = {"rolling_moment_coefficient": NotCarried("it has no such term", 0.0)}
-_NO_AIRSPEED = {
-    "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS)
+_LACKED = {
+    "rolling_moment_coefficient": NotCarried("it has no such term", 0.0),
+    "max_relative_airspeed": NotCarried("its thrust does not depend on the airspeed", NO_LOSS),
 }
+"""What of Gazebo's motor model the others lack, and why."""
 _BODY = ("mass", "inertia_xx", "inertia_yy", "inertia_zz")
 _LINEAR = ("linear_drag_x", "linear_drag_y", "linear_drag_z")
 _ANGULAR = ("angular_drag_x", "angular_drag_y", "angular_drag_z")
 
 
-def _held(*groups: tuple[str, ...], **keys: str) -> dict[str, str]:
-    """Return coefficient -> key, of groups under their own names and of others under theirs."""
-    return {name: name for group in groups for name in group} | keys
+def _entries(title: str, *groups: tuple[str, ...], **keys: str) -> Callable[..., Entry]:
+    """Return `Simulator.entry` of what a simulator holds.
+
+    Parameters
+    ----------
+    title
+        Of the simulator.
+    groups, keys
+        Coefficients under their own names, beside body and motors, and coefficient -> key.
+    """
+    held = {name: name for group in (_BODY, _MOTORS, *groups) for name in group} | keys
+
+    def entry(row: Coefficient) -> Entry:
+        if row.name in held:
+            return Written(held[row.name])
+        if row.name in _LACKED:
+            return _LACKED[row.name]
+        if row.scope != "vehicle":
+            return _OF_SETUP
+        return NotCarried(f"{title} has no such term", row.neutral)
+
+    return entry
 
 
 def _about_centre(vehicle: VehicleFile) -> VehicleFile:
@@ -399,23 +410,18 @@ MUJOCO = Simulator(
         "each rotor's thrust is an actuator's, which lags the control in N by one time constant",
         "drag is linear in the velocity of the rotors' centre, at the hover's rotor speed",
     ),
-    entry=entries(
-        _held(
-            _BODY,
-            _LINEAR,
-            _ANGULAR,
-            _MOTORS,
-            time_constant_up="dynprm",
-            time_constant_down="dynprm",
-            motor_constant="gainprm, ctrlrange",
-            moment_constant="gear",
-            rotor_drag_coefficient="biasprm",
-            thrust_inflow_coefficient="biasprm",
-            rotor_drag_ratio_y="biasprm",
-            **_CENTRE,
-        ),
-        _NO_ROLLING | _NO_AIRSPEED,
-        title="MuJoCo",
+    entry=_entries(
+        "MuJoCo",
+        _LINEAR,
+        _ANGULAR,
+        time_constant_up="dynprm",
+        time_constant_down="dynprm",
+        motor_constant="gainprm, ctrlrange",
+        moment_constant="gear",
+        rotor_drag_coefficient="biasprm",
+        thrust_inflow_coefficient="biasprm",
+        rotor_drag_ratio_y="biasprm",
+        **_CENTRE,
     ),
     laws=_mujoco_laws,
     fixed=(*_MOTORS, "time_constant_up", "time_constant_down"),
@@ -426,22 +432,17 @@ ROTORPY = Simulator(
     version="RotorPy 3.0.0",
     source="rotorpy/vehicles/multirotor.py",
     deviations=("one time constant, up and down",),
-    entry=entries(
-        _held(
-            _BODY,
-            _MOTORS,
-            time_constant_up="tau_m",
-            time_constant_down="tau_m",
-            motor_constant="k_eta",
-            moment_constant="k_m",
-            rotor_drag_coefficient="k_d",
-            thrust_inflow_coefficient="k_z",
-            fuselage_drag="c_Dx, c_Dy, c_Dz",
-            flapping_moment_coefficient="k_flap",
-            **_CENTRE,
-        ),
-        _NO_ROLLING | _NO_AIRSPEED,
-        title="RotorPy",
+    entry=_entries(
+        "RotorPy",
+        time_constant_up="tau_m",
+        time_constant_down="tau_m",
+        motor_constant="k_eta",
+        moment_constant="k_m",
+        rotor_drag_coefficient="k_d",
+        thrust_inflow_coefficient="k_z",
+        fuselage_drag="c_Dx, c_Dy, c_Dz",
+        flapping_moment_coefficient="k_flap",
+        **_CENTRE,
     ),
     laws=_rotorpy_laws,
     ties=(("time_constant_up", "time_constant_down"),),
@@ -456,20 +457,15 @@ DRONE_MODELS = Simulator(
         "rotors sit in a square at the height of the centre of mass",
         "the gyroscopic moment about forward has the other sign",
     ),
-    entry=entries(
-        _held(
-            _BODY,
-            _LINEAR,
-            _MOTORS,
-            time_constant_up="rotor_dyn_coef",
-            time_constant_down="rotor_dyn_coef",
-            motor_constant="rpm2thrust",
-            moment_constant="rpm2torque",
-            rotor_drag_coefficient="drag_matrix",
-            rotor_inertia="prop_inertia",
-        ),
-        _NO_ROLLING | _NO_AIRSPEED,
-        title="drone-models",
+    entry=_entries(
+        "drone-models",
+        _LINEAR,
+        time_constant_up="rotor_dyn_coef",
+        time_constant_down="rotor_dyn_coef",
+        motor_constant="rpm2thrust",
+        moment_constant="rpm2torque",
+        rotor_drag_coefficient="drag_matrix",
+        rotor_inertia="prop_inertia",
     ),
     laws=lambda vehicle: _square_x(_dragging_at_hover(vehicle)),
     free=("linear_drag_x", "linear_drag_y"),
@@ -483,21 +479,16 @@ ISAAC_LAB = Simulator(
         "one drag in all directions, linear in the velocity and at the centre of mass",
         "one damping of rotation about all axes",
     ),
-    entry=entries(
-        _held(
-            _BODY,
-            _LINEAR,
-            _ANGULAR,
-            _MOTORS,
-            time_constant_up="tau_inc_range",
-            time_constant_down="tau_dec_range",
-            motor_constant="thrust_const_range",
-            moment_constant="torque_to_thrust_ratio",
-            rotor_drag_coefficient="linear_damping",
-            **_CENTRE,
-        ),
-        _NO_ROLLING | _NO_AIRSPEED,
-        title="Isaac Lab",
+    entry=_entries(
+        "Isaac Lab",
+        _LINEAR,
+        _ANGULAR,
+        time_constant_up="tau_inc_range",
+        time_constant_down="tau_dec_range",
+        motor_constant="thrust_const_range",
+        moment_constant="torque_to_thrust_ratio",
+        rotor_drag_coefficient="linear_damping",
+        **_CENTRE,
     ),
     laws=_isaac_laws,
     free=_LINEAR,

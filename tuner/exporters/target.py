@@ -77,8 +77,10 @@ class Target:
         Raises
         ------
         ExportError
-            It has nothing for that simulator, or the model is for another one.
+            It patches no model, has nothing for that simulator, or the model is for another one.
         """
+        if choices.into is not None and not self.patches:
+            raise ExportError("--into", f"does not go with --format {self.name}", "leave it out")
         known = {s.name: s for s in (self.simulator, *self.others) if s is not None}
         is_for = ""
         if choices.into is not None and self.detected is not None:

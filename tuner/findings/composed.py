@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from tuner.core.phrases import as_sentence, listed
-from tuner.recordings.note_texts import damage_sentence, note_in_words
-from tuner.recordings.notes import Cause, Damage, Note, NoteCode
+from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
     from tuner.findings.findings import Finding

@@ -93,12 +93,9 @@ def bifilar(
     drift = abs(solution.x[5]) * time[-1]
     if drift > 0.2 * amplitude:
         remarks.append(Remark("drift", {"drift": drift}))
-    used = np.ones(len(time), bool)
     dense = np.linspace(0.0, time[-1], 2000)
-    curve = Curve(
-        f"Swing about {axis}", "time, s", "angle, rad", time, angle, used, dense,
-        _swing(solution.x, dense),
-    )  # fmt: skip
+    titles = (f"Swing about {axis}", "time, s", "angle, rad")
+    curve = Curve.of(titles, (time, angle), (dense, _swing(solution.x, dense)))
     return Measurement(
         name,
         ({f"inertia_{axis}{axis}": 1.0},),

@@ -13,8 +13,6 @@ import numpy as np
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.numerics import GRAVITY
 from tuner.ground.bifilar import bifilar
-from tuner.ground.columns import open_table, read_columns
-from tuner.ground.flown import angle_of_attitude, attitude_of, is_table, steady_flight
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import Array, Measurement
 from tuner.ground.plan import (
@@ -31,6 +29,14 @@ from tuner.ground.plan import (
     YawSpin,
 )
 from tuner.ground.propeller import propeller, read_static_table
+from tuner.ground.rig_recordings import (
+    angle_of_attitude,
+    attitude_of,
+    is_table,
+    open_table,
+    read_columns,
+    steady_flight,
+)
 from tuner.ground.rpm_curve import rpm_curve
 from tuner.ground.stands import thrust_stand, torque_stand
 from tuner.ground.step_response import step_response

@@ -46,10 +46,9 @@ def hover_weights(
         birge = float(weight @ (values - mean) ** 2) / freedom
         error2 *= max(1.0, birge)
     weights = np.linspace(0.95 * mass.min(), 1.05 * mass.max(), 50)
-    curve = Curve(
-        "Hover", "mass, kg", "rotor speed, rad/s", mass, speed, np.ones(len(points), bool), weights,
-        np.sqrt(weights * GRAVITY / (rotors * math.exp(mean))),
-    )  # fmt: skip
+    speeds = np.sqrt(weights * GRAVITY / (rotors * math.exp(mean)))
+    titles = ("Hover", "mass, kg", "rotor speed, rad/s")
+    curve = Curve.of(titles, (mass, speed), (weights, speeds))
     return Measurement(
         name, ({"motor_constant": 1.0},), np.array([mean]), np.array([[error2]]),
         (Remark("points", {"points": len(points)}),), (curve,),
@@ -123,10 +122,8 @@ def yaw_spin(
         for v, r in zip(values, rows, strict=True)
     ])  # fmt: skip
     mean = float(np.exp(np.log(ratios).mean()))
-    curve = Curve(
-        "Steady spin", "yaw rate, rad/s", "rotor drag over torque constant, rad s/m²", rates,
-        ratios, np.ones(len(points), bool), rates, np.full(len(points), mean),
-    )  # fmt: skip
+    titles = ("Steady spin", "yaw rate, rad/s", "rotor drag over torque constant, rad s/m²")
+    curve = Curve.of(titles, (rates, ratios), (rates, np.full(len(points), mean)))
     return Measurement(
         name, tuple(rows), np.array(values), np.diag(variances),
         (Remark("points", {"points": len(points)}),), (curve,),

@@ -1,14 +1,25 @@
-"""What an experiment yields: a few numbers that depend on coefficients, with their covariance."""
+"""What an experiment yields: a few numbers that depend on coefficients, with their covariance.
+
+The numbers are linear in scaled coordinates: the logarithm of a coefficient where the registry has
+it so, else the value.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.vehicle import COEFFICIENTS
+
 Array = NDArray[np.float64]
+
+
+MOST_DRAWN = 800
+"""Samples of a curve that are kept."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +31,11 @@ class Curve:
     title, x_label, y_label
         For the axes, units included.
     x, measured
-        (n,) samples.
+        n samples, of those that are known no more than `MOST_DRAWN`.
     used
-        (n,) which of them the estimate rests on.
+        n: which of them the estimate rests on.
     fit_x, fit
-        (m,) the fitted law.
+        m: the fitted law.
     law
         Whether they are a law, from which there are residuals; else they are levels, as points.
     """
@@ -32,12 +43,50 @@ class Curve:
     title: str
     x_label: str
     y_label: str
-    x: Array
-    measured: Array
-    used: NDArray[np.bool_]
-    fit_x: Array
-    fit: Array
+    x: list[float]
+    measured: list[float]
+    used: list[bool]
+    fit_x: list[float]
+    fit: list[float]
     law: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        titles: tuple[str, str, str],
+        samples: tuple[Array, Array],
+        fit: tuple[Array, Array],
+        *,
+        used: NDArray[np.bool_] | None = None,
+        law: bool = True,
+    ) -> Curve:
+        """Return the panel of all samples, thinned.
+
+        Parameters
+        ----------
+        titles
+            Of the panel, of x and of y.
+        samples, fit
+            x and y: (n,) samples, NaN where unknown, and (m,) of the fitted law.
+        used
+            (n,) as of the attribute; None for all.
+        law
+            As of the attribute.
+        """
+        x, measured = samples
+        known = np.flatnonzero(np.isfinite(x) & np.isfinite(measured))
+        known = known[:: max(1, -(-len(known) // MOST_DRAWN))]
+        thinned = slice(None, None, max(1, -(-len(fit[0]) // MOST_DRAWN)))
+        used = np.ones(len(x), bool) if used is None else used
+        return cls(
+            *titles,
+            x=x[known].tolist(),
+            measured=measured[known].tolist(),
+            used=used[known].tolist(),
+            fit_x=fit[0][thinned].tolist(),
+            fit=fit[1][thinned].tolist(),
+            law=law,
+        )
 
 
 @dataclass(frozen=True)
@@ -83,3 +132,19 @@ class Measurement:
     def names(self) -> tuple[str, ...]:
         """The coefficients that the experiment speaks of, in the order of first mention."""
         return tuple(dict.fromkeys(name for row in self.rows for name in row))
+
+
+def scaled_of(name: str, value: float) -> float:
+    """Return the scaled coordinate of a coefficient's value."""
+    return math.log(value) if COEFFICIENTS[name].scale == "log" else value
+
+
+def value_of(name: str, scaled: float) -> float:
+    """Return a coefficient's value, in its unit."""
+    return math.exp(scaled) if COEFFICIENTS[name].scale == "log" else scaled
+
+
+def error_of(name: str, scaled: float, deviation: float) -> float:
+    """Return the standard error of a value, in its unit, from that of its scaled coordinate."""
+    log = COEFFICIENTS[name].scale == "log"
+    return deviation * math.exp(scaled) if log else deviation

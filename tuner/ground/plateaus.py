@@ -16,6 +16,8 @@ OUTLIER = 3.0
 """Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
 MIDDLE = (0.3, 0.95)
 """Share of a step, from and to, that is its middle: transients over, the next not begun."""
+TRUSTED = 4
+"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
 FEWEST = 8
 """Samples without which a step has no mean."""
 
@@ -103,6 +105,23 @@ def mean_and_error(values: Array) -> tuple[float, float]:
         return float(values.mean()), plain
     means = np.array([block.mean() for block in np.array_split(values, blocks)])
     return float(values.mean()), max(plain, float(means.std(ddof=1)) / np.sqrt(blocks))
+
+
+def widened(covariance: Array, chi_square: float, freedom: int) -> Array:
+    """Return a covariance with the scatter of the residuals: Birge's ratio and Student's t.
+
+    A few residuals that happen to be small do not narrow it.
+
+    Parameters
+    ----------
+    covariance
+        Of weighted least squares.
+    chi_square, freedom
+        Sum of the squared weighted residuals, and the degrees of freedom that they have.
+    """
+    ratio = chi_square / max(freedom, 1)
+    ratio = max(ratio, 1.0) if freedom < TRUSTED else ratio
+    return np.asarray(covariance * ratio * student(freedom) ** 2)
 
 
 def student(freedom: int) -> float:

@@ -71,10 +71,8 @@ def propeller(
         propeller_motor_constant(thrust, diameter=diameter, density=air_density),
         propeller_moment_constant(thrust, power, diameter=diameter),
     ])  # fmt: skip
-    curve = Curve(
-        "Propeller table", "RPM", "thrust coefficient", table[:, 0], table[:, 1],
-        np.ones(len(table), bool), table[:, 0], np.full(len(table), thrust),
-    )  # fmt: skip
+    titles, speeds = ("Propeller table", "RPM", "thrust coefficient"), table[:, 0]
+    curve = Curve.of(titles, (speeds, table[:, 1]), (speeds, np.full(len(table), thrust)))
     return Measurement(
         name,
         ({"motor_constant": 1.0}, {"moment_constant": 1.0}),

@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
-from tuner.ground.plateaus import levels_of, mean_and_error, student, without_outliers
+from tuner.ground.plateaus import levels_of, mean_and_error, widened, without_outliers
 
 SHORTEST = 0.8
 STEP = 0.015
@@ -20,8 +20,6 @@ VOLTAGE_RANGE = 1.015
 """Ratio of the highest to the lowest voltage without which its exponent is not asked for."""
 BENT = 3.0
 """Standard errors from which a quadratic term is believed."""
-TRUSTED = 4
-"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
 
 
 def rpm_curve(
@@ -89,13 +87,23 @@ def rpm_curve(
     values[:2] = np.log(values[:2])
     dense = np.linspace(u.min(), u.max(), 200)
     curves = (
-        Curve("Steps used", "time, s", "rotor speed, rad/s", time, speed, used,
-              np.zeros(0), np.zeros(0), law=False),
-        Curve("Rotor speed against command", "command",
-              "rotor speed at the reference voltage, rad/s", u, omega / ratio ** solution[3],
-              np.ones(len(u), bool), dense,
-              solution[0] * dense + solution[2] * dense**2 + solution[1]),
-    )  # fmt: skip
+        Curve.of(
+            ("Steps used", "time, s", "rotor speed, rad/s"),
+            (time, speed),
+            (np.zeros(0), np.zeros(0)),
+            used=used,
+            law=False,
+        ),
+        Curve.of(
+            (
+                "Rotor speed against command",
+                "command",
+                "rotor speed at the reference voltage, rad/s",
+            ),
+            (u, omega / ratio ** solution[3]),
+            (dense, solution[0] * dense + solution[2] * dense**2 + solution[1]),
+        ),
+    )
     return Measurement(
         name,
         tuple({names[index]: 1.0} for index in kept_names),
@@ -121,10 +129,8 @@ def _fit(
     start = np.array([line[0], line[1], 0.0, 0.5])[places]
     solution = least_squares(residuals, start, x_scale=np.array([500.0, 100.0, 100.0, 0.5])[places])
     freedom = max(len(u) - len(places), 1)
-    scale = 2 * solution.cost / freedom
-    if freedom < TRUSTED:
-        scale = max(scale, 1.0)
-    small = np.linalg.pinv(solution.jac.T @ solution.jac) * scale * student(freedom) ** 2
+    inverse = np.linalg.pinv(solution.jac.T @ solution.jac)
+    small = widened(inverse, 2 * solution.cost, freedom)
     values, covariance = np.zeros(4), np.zeros((4, 4))
     values[places] = solution.x
     covariance[np.ix_(places, places)] = small

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import scaled_inverse
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
-from tuner.ground.plateaus import levels_of, mean_and_error, student, without_outliers
+from tuner.ground.plateaus import levels_of, mean_and_error, widened, without_outliers
 
 SHORTEST = 1.0
 """s below which a level of the rotor speed is a transient."""
@@ -22,8 +22,6 @@ FEWEST = 4
 """Levels without which slope, offset and drift cannot be told apart."""
 SPREAD = 1.3
 """Ratio of the fastest to the slowest level without which an offset looks like another slope."""
-TRUSTED = 4
-"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
 
 
 @dataclass(frozen=True)
@@ -124,11 +122,19 @@ def _slope(
     squares = design[:, 0]
     order = np.argsort(squares)
     curves = (
-        Curve("Rotor speed", "time, s", "rotor speed, rad/s", time, speed, used,
-              np.array([v.time for v in levels]), np.array([v.speed for v in levels]), law=False),
-        Curve(title, "rotor speed squared, rad²/s²", "force, N", squares, measured,
-              np.ones(len(levels), bool), squares[order], fit[order]),
-    )  # fmt: skip
+        Curve.of(
+            ("Rotor speed", "time, s", "rotor speed, rad/s"),
+            (time, speed),
+            (np.array([v.time for v in levels]), np.array([v.speed for v in levels])),
+            used=used,
+            law=False,
+        ),
+        Curve.of(
+            (title, "rotor speed squared, rad²/s²", "force, N"),
+            (squares, measured),
+            (squares[order], fit[order]),
+        ),
+    )
     return slope, math.sqrt(covariance[0, 0]), tuple(remarks), curves
 
 
@@ -152,8 +158,8 @@ def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDAr
 def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Array, Array]:
     """Return the weighted least squares solution and covariance, Student's t for few levels.
 
-    A speed's error counts as a force's through the slope; the residuals' scatter about the
-    law scales them (Birge's ratio), but a few residuals that happen to be small do not.
+    A speed's error counts as a force's through the slope; the residuals' scatter about the law
+    scales them.
     """
     slope = float(np.linalg.lstsq(design, measured, rcond=None)[0][0])
     variance = np.array(
@@ -164,12 +170,9 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     normal = design.T @ (design * weight[:, None])
     inverse = scaled_inverse(normal)
     solution = inverse @ (design.T @ (weight * measured))
-    freedom = len(levels) - design.shape[1]
     residual = measured - design @ solution
-    scale = float(residual @ (weight * residual)) / max(freedom, 1)
-    if freedom < TRUSTED:
-        scale = max(scale, 1.0)
-    return solution, inverse * scale * student(freedom) ** 2
+    chi_square = float(residual @ (weight * residual))
+    return solution, widened(inverse, chi_square, len(levels) - design.shape[1])
 
 
 def _curvature(design: Array, measured: Array, levels: list[_Level]) -> tuple[float, float]:

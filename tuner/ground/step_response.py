@@ -107,13 +107,14 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     if explained > NOT_FIRST_ORDER:
         lag = float(np.exp(richer[3]))
         remarks.append(Remark("not_first_order", {"explained": explained, "lag": lag}))
+    titles = ("Step response", "time, s", "rotor speed, rad/s")
     return Measurement(
         name,
         ({"time_constant_up": 1.0}, {"time_constant_down": 1.0}, {"actuator_latency": 1.0}),
         np.array([lags[0], lags[1], max(latency, 0.0)]),
         covariance,
         tuple(remarks),
-        (Curve("Step response", "time, s", "rotor speed, rad/s", time, speed, kept, time, plain),),
+        (Curve.of(titles, (time, speed), (time, plain), used=kept),),
     )
 
 

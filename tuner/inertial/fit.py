@@ -24,8 +24,7 @@ from scipy import optimize
 
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Inverse
-from tuner.inertial.response import Lags, rotor_speeds
-from tuner.inertial.signals import Stretch, blocks_of, derivative, smoothed
+from tuner.inertial.signals import Lags, Stretch, blocks_of, derivative, rotor_speeds, smoothed
 from tuner.recordings.flight import Array
 
 OUTPUTS = ("roll", "pitch", "yaw", "thrust")

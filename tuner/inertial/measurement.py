@@ -139,17 +139,8 @@ def _measurement(
 
 def _curve(response: Response, output: str) -> Curve:
     measured, modelled = response.curves[output]
-    everything = np.ones(len(measured), dtype=np.bool_)
-    return Curve(
-        TITLES[output],
-        "time, s",
-        TITLES[output].split(", ")[0],
-        response.time,
-        measured,
-        everything,
-        response.time,
-        modelled,
-    )
+    titles = (TITLES[output], "time, s", TITLES[output].split(", ")[0])
+    return Curve.of(titles, (response.time, measured), (response.time, modelled))
 
 
 def agreeing(

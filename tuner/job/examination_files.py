@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_jax.inlet import ReferenceInlet
 from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
-from tuner.design.next_flight_json import Proposals
+from tuner.design.proposals import Proposals
 from tuner.design.ranking import rank_next_flights
 from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted

@@ -17,11 +17,10 @@ from tuner.core.shipped import find_config
 from tuner.core.versions import PROGRAM, versions
 from tuner.findings.findings import Code, Finding
 from tuner.ground.bench_json import bench_record
-from tuner.ground.combine import Combination, combine
+from tuner.ground.combination import Combination, combine
 from tuner.ground.experiments import measure, names_of
-from tuner.ground.measurement import Measurement
+from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
-from tuner.ground.scales import error_of, scaled_of, value_of
 from tuner.job.folder import folder_for
 from tuner.report import render
 from tuner.result import (

@@ -15,7 +15,7 @@ from tuner.core.files import csv_text
 from tuner.core.numerics import Z95
 from tuner.core.versions import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
-from tuner.design.log_proposal import LogProposal
+from tuner.design.proposals import LogProposal
 from tuner.evaluate.held_out import (
     Validation,
     best_values,

@@ -18,8 +18,8 @@ from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
-from tuner.design.log_job import what_to_log
-from tuner.design.log_proposal import LogProposal
+from tuner.design.next_log import what_to_log
+from tuner.design.proposals import LogProposal
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.held_out import (
     Validation,

@@ -13,11 +13,10 @@ from tuner.config import Settings
 from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, Finding
-from tuner.ground.combine import Combination, combine
-from tuner.ground.measurement import Measurement
-from tuner.ground.scales import value_of
-from tuner.inertial.ahead import AHEAD, rate_errors
+from tuner.ground.combination import Combination, combine
+from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import agreeing, measure_inertial
+from tuner.inertial.prediction import AHEAD, rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.folder import folder_for
 from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written

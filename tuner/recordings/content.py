@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,14 @@ from tuner.recordings.sources import (
     unread,
     with_guesses,
 )
-from tuner.recordings.topics import Sidecar, TopicMap, load_topic_map, shipped_maps, sidecar_path
+from tuner.recordings.topics import (
+    Sidecar,
+    TopicMap,
+    load_topic_map,
+    read_sidecar,
+    shipped_maps,
+    sidecar_path,
+)
 from tuner.recordings.unit_detection import (
     NAMES,
     Stamped,
@@ -40,6 +47,8 @@ from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_word
 
 PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
 """Messages that ask PX4's own position control for something."""
+DRIVES = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
+"""Signals of which one has to be there beside a pose, for anything to drive a simulation."""
 PER_MOTOR = ("command", "rotor_speed")
 """Signals with a column a motor."""
 UNHURRIED = {"lap", "battery_voltage"}
@@ -47,23 +56,58 @@ UNHURRIED = {"lap", "battery_voltage"}
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How a recording is to be read.
+class ReadOptions:
+    """How a recording is to be read: as its user and its side-car say.
 
     Attributes
     ----------
-    topics
-        Topic map, its file, or the name of a shipped one; None takes the shipped map that finds
-        most signals.
+    path
+        The recording.
+    given
+        The topic map that the user or, failing that, the side-car names; None takes the shipped map
+        that finds most signals.
+    sidecar
+        What the file beside it states.
     namespace
         Prefix of the recorded topics that the map does not have, as ``uav1``.
     rate
         Hz of the uniform clock.
     """
 
-    topics: str | Path | TopicMap | None = None
+    path: Path
+    given: TopicMap | None = None
+    sidecar: Sidecar = field(default_factory=Sidecar)
     namespace: str = ""
     rate: float = 100.0
+
+    @classmethod
+    def of(
+        cls,
+        path: Path,
+        topics: str | Path | TopicMap | None = None,
+        namespace: str = "",
+        rate: float = 100.0,
+    ) -> ReadOptions:
+        """Return the options of a recording.
+
+        Parameters
+        ----------
+        path, namespace, rate
+            As of the attributes.
+        topics
+            Topic map, its file, or the name of a shipped one; None takes the side-car's, if any.
+
+        Raises
+        ------
+        ConfigError
+            The topic map or the side-car is wrong.
+        """
+        sidecar = read_sidecar(path)
+        if topics is None and sidecar.topics is not None:
+            topics = load_topic_map(sidecar.topics, base=sidecar_path(path).parent)
+        elif isinstance(topics, str | Path):
+            topics = load_topic_map(topics)
+        return cls(path, topics, sidecar, namespace or sidecar.namespace, rate)
 
 
 @dataclass(frozen=True)
@@ -107,20 +151,13 @@ class Content(Signals):
     missions: tuple[Mission, ...]
 
 
-def read_signals(
-    path: Path,
-    settings: Settings,
-    sidecar: Sidecar,
-    given: TopicMap | None,
-    *,
-    with_pose: bool,
-) -> Signals:
+def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
     """Read and clean all signals that a topic map finds in a recording.
 
     Parameters
     ----------
-    path, settings, sidecar, given
-        As of `read_content`.
+    options
+        Which recording, and how it is to be read.
     with_pose
         Whether a recording without a pose is an error.
 
@@ -128,13 +165,11 @@ def read_signals(
     ------
     RecordingError
         The file cannot be read, or holds no pose though one is asked for.
-    ConfigError
-        The topic map is wrong.
     """
+    path, given, sidecar = options.path, options.given, options.sidecar
     recording = open_recording(path, given.messages if given is not None else ())
-    namespace = settings.namespace or sidecar.namespace
     candidates = [given] if given is not None else list(shipped_maps())
-    candidates = [candidate.under(namespace) for candidate in candidates]
+    candidates = [candidate.under(options.namespace) for candidate in candidates]
     if all(candidate.format != recording.format for candidate in candidates):
         raise RecordingError(
             path,
@@ -158,9 +193,7 @@ def read_signals(
         *taken,
         *passed_over,
         *unread(recording, chosen, places),
-        *_open_unit(places),
-        *_alone(places),
-        *_of_px4(places),
+        *_notes_of_places(places),
         *contents.notes,
         *noticed,
     ]
@@ -180,27 +213,16 @@ def read_signals(
     )
 
 
-def _alone(places: Mapping[str, Place]) -> list[Note]:
-    """Note that a pose is all that was recorded."""
-    drives = ("command", "rotor_speed", "thrust_setpoint", "commanded_thrust", "reference_position")
-    alone = {"position", "attitude"} <= set(places) and not set(drives) & set(places)
-    return [Note(NoteCode.POSE_ALONE)] if alone else []
-
-
-def _of_px4(places: Mapping[str, Place]) -> list[Note]:
-    """Note that PX4's own position control flew the reference."""
-    place = places.get("reference_position")
-    if place is None or not place.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
-        return []
-    return [Note(NoteCode.PX4_REFERENCE, "info", place.topic)]
-
-
-def _open_unit(places: Mapping[str, Place]) -> list[Note]:
-    """Note that no map says in which unit rotor speeds are, and what they were taken for."""
-    place = places.get("rotor_speed")
-    if place is None or place.source.unit is not None:
-        return []
-    return [Note(NoteCode.SPEED_UNIT_OPEN, "info", place.topic, names=(place.unit,))]
+def _notes_of_places(places: Mapping[str, Place]) -> list[Note]:
+    """Return what the places of signals alone tell."""
+    notes, speed, reference = [], places.get("rotor_speed"), places.get("reference_position")
+    if speed is not None and speed.source.unit is None:  # what they were taken for
+        notes.append(Note(NoteCode.SPEED_UNIT_OPEN, "info", speed.topic, names=(speed.unit,)))
+    if {"position", "attitude"} <= set(places) and not set(DRIVES) & set(places):
+        notes.append(Note(NoteCode.POSE_ALONE))
+    if reference and reference.topic.rpartition("/")[2].startswith(PX4_REFERENCES):
+        notes.append(Note(NoteCode.PX4_REFERENCE, "info", reference.topic))
+    return notes
 
 
 def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
@@ -212,28 +234,20 @@ def _late(raw: Mapping[str, Raw], contents: Contents, epoch: int) -> float:
     return (float(np.median(raw[first].time)) - float(np.median(arrival)) - epoch) * 1e-9
 
 
-def read_content(
-    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
-) -> Content:
+def read_content(options: ReadOptions) -> Content:
     """Read a recording up to its missions.
 
     Parameters
     ----------
-    path
-        The recording.
-    settings, sidecar
-        How to read it.
-    given
-        The topic map that the user or the side-car names; None tries the shipped ones.
+    options
+        Which recording, and how it is to be read.
 
     Raises
     ------
     RecordingError
         The file cannot be read or holds no pose.
-    ConfigError
-        The topic map is wrong.
     """
-    signals = read_signals(path, settings, sidecar, given, with_pose=True)
+    sidecar, signals = options.sidecar, read_signals(options, with_pose=True)
     topics = signals.topics
     series, shifted = align_pose(signals.series, topics)
     series, turned = correct_frames(series, topics)
@@ -251,21 +265,6 @@ def read_content(
     return Content(**read, missions=missions)
 
 
-def given_map(path: Path, settings: Settings, sidecar: Sidecar) -> TopicMap | None:
-    """Return the topic map that the user or, failing that, the side-car names.
-
-    Raises
-    ------
-    ConfigError
-        It is wrong.
-    """
-    if settings.topics is None and sidecar.topics is not None:
-        return load_topic_map(sidecar.topics, base=sidecar_path(path).parent)
-    if isinstance(settings.topics, str | Path):
-        return load_topic_map(settings.topics)
-    return settings.topics
-
-
 def _in_order(raw: dict[str, Raw], columns: list[int]) -> dict[str, Raw]:
     """Return signals with a column a motor in PX4's order."""
     ordered = {
@@ -278,14 +277,10 @@ def _in_order(raw: dict[str, Raw], columns: list[int]) -> dict[str, Raw]:
 
 def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:
     """Return signals with times a thousandth as long, where gravity says that they are."""
-    if not is_too_slow({name: _stamped(data, 0) for name, data in raw.items()}):
+    if not is_too_slow({name: data.stamped(0) for name, data in raw.items()}):
         return raw, []
     quick = {name: replace(data, time=data.time // 1000) for name, data in raw.items()}
     return quick, [Note(NoteCode.TIME_READ, count=len(next(iter(raw.values())).time))]
-
-
-def _stamped(data: Raw, epoch: int) -> Stamped:
-    return Stamped(np.asarray((data.time - epoch) * 1e-9, dtype=np.float64), data.values)
 
 
 def _clean(
@@ -295,7 +290,7 @@ def _clean(
     epoch = min((int(data.time.min()) for data in first), default=0)
     series, units = {}, list[Note]()
     notes: dict[tuple[object, ...], Note] = {}
-    recorded = {signal: _stamped(data, epoch) for signal, data in raw.items()}
+    recorded = {signal: data.stamped(epoch) for signal, data in raw.items()}
     scales = scales_of(recorded)
     for signal, data in raw.items():
         seconds, measured = recorded[signal].time, recorded[signal].values
@@ -364,6 +359,10 @@ class Raw:
     time: Nanoseconds
     values: Array
 
+    def stamped(self, epoch: int) -> Stamped:
+        """Return the samples with their times in s since some ns."""
+        return Stamped(np.asarray((self.time - epoch) * 1e-9, dtype=np.float64), self.values)
+
 
 def extract(
     recording: Recording, places: Mapping[str, Place], clocks: tuple[Clock, ...] = ()
@@ -427,12 +426,9 @@ def _unit(
     if signal not in ATTITUDES or place.source.quaternion != "rpy":
         return unit_by_range(signal, recorded.values, place.unit)
     epoch = int(recorded.time[0])
-
-    def stamped(raw: Raw) -> Stamped:
-        return Stamped(np.asarray((raw.time - epoch) * 1e-9, dtype=np.float64), raw.values)
-
-    where = None if position is None else stamped(position)
-    return unit_of_angles(recording.path, stamped(recorded), where, must=signal == "attitude")
+    where = None if position is None else position.stamped(epoch)
+    must = signal == "attitude"
+    return unit_of_angles(recording.path, recorded.stamped(epoch), where, must=must)
 
 
 def _values(samples: Samples, signal: str, place: Place, values: Array) -> Array:

@@ -26,6 +26,7 @@ from tuner.recordings.interpolation import (
     rotate,
     smooth,
     stretch,
+    upward,
 )
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
@@ -119,7 +120,7 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
     def agreement(reading: Callable[[Array], Array]) -> tuple[float, float]:
         """Return how well a reading fits the motion, and how upright it flies."""
         turned = reading(q)
-        up = rotate(turned, np.tile([0.0, 0.0, 1.0], (len(turned), 1)))
+        up = upward(turned)
         scores = []
         if rms(push[:, :2]) > ENOUGH_PUSH:
             scores.append(alike(smooth(up[:, :2], 0.2), push[:, :2]))
@@ -152,20 +153,31 @@ def _worth(fit: float, upright: float) -> float:
     return fit + min(upright, 1.0)
 
 
+def _turning(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
+    """Return the attitude's change and the gyro, (n, 3) rad/s each, which should be alike."""
+    turning = body_rate_of(on_clock(series, "attitude", clock))
+    return smooth(turning), smooth(on_clock(series, "body_rate", clock))
+
+
+def _moving(series: Mapping[str, Series], clock: Array) -> tuple[Array, Array]:
+    """Return the position's change and the velocity, (n, 3) m/s each, which should be alike."""
+    moving = derivative(on_clock(series, "position", clock))
+    return smooth(moving, 0.1), smooth(on_clock(series, "velocity", clock), 0.1)
+
+
+def _left(motion: Array, recorded: Array) -> float:
+    """Return the share of a motion (n, 3) that is left when a recorded one is taken off."""
+    known = np.isfinite(motion).all(axis=1) & np.isfinite(recorded).all(axis=1)
+    return rms((motion - recorded)[known]) / rms(motion[known])
+
+
 def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
-    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)))
-    gyro = smooth(on_clock(series, "body_rate", clock))
+    turning, gyro = _turning(series, clock)
     if min(rms(turning), rms(gyro)) < ENOUGH_TURNING:
         return None, None
-
-    def mismatch(rates: Array) -> float:
-        """Return the part of the turning that is left when a reading of the gyro is taken off."""
-        known = np.isfinite(turning).all(axis=1) & np.isfinite(rates).all(axis=1)
-        return rms((turning - rates)[known]) / rms(turning[known])
-
-    here = mismatch(gyro)
-    best = min(_RATES, key=lambda r: mismatch(r.read(gyro)))
-    there = mismatch(best.read(gyro))
+    here = _left(turning, gyro)
+    best = min(_RATES, key=lambda r: _left(turning, r.read(gyro)))
+    there = _left(turning, best.read(gyro))
     of_another_unit = there < here / 20 and alike(turning, best.read(gyro)) > GOOD
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
@@ -179,19 +191,13 @@ def _judge_setpoint(series: Mapping[str, Series], clock: Array) -> Reading | Non
     wanted = smooth(on_clock(series, "rate_setpoint", clock))
     if min(rms(rate), rms(wanted)) < ENOUGH_TURNING:
         return None
-
-    def mismatch(setpoints: Array) -> float:
-        known = np.isfinite(rate).all(axis=1) & np.isfinite(setpoints).all(axis=1)
-        return rms((setpoints - rate)[known]) / rms(rate[known])
-
-    best = min(_RATES, key=lambda r: mismatch(r.read(wanted)))
-    there, here = mismatch(best.read(wanted)), mismatch(wanted)
+    best = min(_RATES, key=lambda r: _left(rate, r.read(wanted)))
+    there, here = _left(rate, best.read(wanted)), _left(rate, wanted)
     return best if there < GOOD and there < here / 3 else None
 
 
 def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
-    moving = smooth(derivative(on_clock(series, "position", clock)), 0.1)
-    velocity = smooth(on_clock(series, "velocity", clock), 0.1)
+    moving, velocity = _moving(series, clock)
     if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
         return None, None
     fit = alike(moving, velocity)
@@ -240,22 +246,10 @@ def noted_contradiction(notes: Sequence[Note]) -> Note | None:
     return next((note for note in notes if note.code is NoteCode.CONTRADICTED), None)
 
 
-def _turning(series: Mapping[str, Series]) -> float | None:
-    """Return how alike gyro and change of attitude are, if they are opposites."""
-    clock = stretch(series)
-    turning = smooth(body_rate_of(on_clock(series, "attitude", clock)))
-    gyro = smooth(on_clock(series, "body_rate", clock))
-    agreement = alike(turning, gyro)
-    return agreement if agreement < AGAINST and min(rms(turning), rms(gyro)) > TURNING else None
-
-
-def _moving(series: Mapping[str, Series]) -> float | None:
-    """Return how alike velocity and change of position are, if they are opposites."""
-    clock = stretch(series)
-    moving = smooth(derivative(on_clock(series, "position", clock)), 0.1)
-    velocity = smooth(on_clock(series, "velocity", clock), 0.1)
-    agreement = alike(moving, velocity)
-    return agreement if agreement < AGAINST and min(rms(moving), rms(velocity)) > SPEED else None
+def _opposed(derived: Array, recorded: Array, plenty: float) -> float | None:
+    """Return how alike two signals are, if they are opposites and larger than what is plenty."""
+    agreement = alike(derived, recorded)
+    return agreement if agreement < AGAINST and min(rms(derived), rms(recorded)) > plenty else None
 
 
 def _leaning(series: Mapping[str, Series]) -> float | None:
@@ -275,8 +269,8 @@ def _leaning(series: Mapping[str, Series]) -> float | None:
 
 
 _PAIRS: Mapping[tuple[str, str], Callable[[Mapping[str, Series]], float | None]] = {
-    ("attitude", "body_rate"): _turning,
-    ("position", "velocity"): _moving,
+    ("attitude", "body_rate"): lambda s: _opposed(*_turning(s, stretch(s)), TURNING),
+    ("position", "velocity"): lambda s: _opposed(*_moving(s, stretch(s)), SPEED),
     ("attitude", "position"): _leaning,
 }
 """Signals that deny each other -> how alike they are, None unless that is certain."""

@@ -15,14 +15,13 @@ import numpy as np
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
-from tuner.recordings.content import Settings, Signals, given_map, read_signals
+from tuner.recordings.content import ReadOptions, Signals, read_signals
 from tuner.recordings.flight import Series
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.loader import load_flights
 from tuner.recordings.missions import IDLE, stretches
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.sources import require_pose
-from tuner.recordings.topics import read_sidecar
 from tuner.recordings.unit_detection import FASTEST_TURN
 
 #: What a recording must hold.
@@ -124,12 +123,13 @@ def read_inertial(
     with contextlib.suppress(RecordingError):  # a fit reads them next, from the cache
         load_flights(path, topics=topics, namespace=namespace)
         return None
-    settings, sidecar = Settings(topics, namespace), read_sidecar(path)
+    options = ReadOptions.of(path, topics, namespace)
     with readable(path):
-        given = given_map(path, settings, sidecar)
-        signals = read_signals(path, settings, sidecar, given, with_pose=False)
+        signals = read_signals(options, with_pose=False)
     if not is_inertial(signals):
-        require_pose(signals.recording, signals.topic_map, signals.places, given=given is not None)
+        require_pose(
+            signals.recording, signals.topic_map, signals.places, given=options.given is not None
+        )
         return None
     runs = flying(signals)
     if (error := obstacle(signals, runs)) is not None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +19,7 @@ from rich.text import Text
 from tuner.core.disk import exists
 from tuner.core.errors import InputError, RecordingError
 from tuner.recordings.cache import cached, digest, load, store
-from tuner.recordings.note_texts import damage_sentence, note_in_words
-from tuner.recordings.notes import Cause, Damage, Note
+from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
     from tuner.recordings.topics import TopicMap
@@ -272,48 +271,34 @@ def as_json(
     content = {
         "schema_version": SCHEMA_VERSION,
         "recordings": [
-            _finite(dataclasses.asdict(inspection))
-            | ({"verdict": _finite(verdicts.get(inspection.path))} if verdicts else {})
+            dataclasses.asdict(inspection)
+            | ({"verdict": verdicts.get(inspection.path)} if verdicts else {})
             for inspection in inspections
         ],
         "errors": [str(error) for error in errors],
     }
+    from pydantic_core import to_jsonable_python  # noqa: PLC0415 (not to answer from the cache)
+
+    content = to_jsonable_python(content, inf_nan_mode="null")
     return json.dumps(content, indent=2, allow_nan=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    if isinstance(value, dict):
-        return {key: _finite(of) for key, of in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(of) for of in value]
-    return value
 
 
 def from_json(content: bytes) -> Inspection | None:
     """Return an inspection that was kept as JSON; None if it is damaged."""
     try:
         raw = json.loads(content)
-        return Inspection(
-            **{
-                **raw,
-                "topics": tuple(
-                    TopicReport(**{**t, "signals": tuple(t["signals"])}) for t in raw["topics"]
-                ),
-                "signals": tuple(
-                    SignalReport(**{**s, "columns": tuple(s["columns"])}) for s in raw["signals"]
-                ),
-                "missions": tuple(
-                    MissionReport(**{**m, "height": tuple(m["height"])}) for m in raw["missions"]
-                ),
-                "inlets": tuple(Inlet(i["name"], tuple(i["missing"])) for i in raw["inlets"]),
-                "coefficients": tuple(Informed(**c) for c in raw["coefficients"]),
-                "battery": tuple(raw["battery"]) if raw["battery"] else None,
-                "notes": tuple(Note.read(note) for note in raw["notes"]),
-                "damage": tuple(Damage(**{**d, "cause": Cause(d["cause"])}) for d in raw["damage"]),
-            }
-        )
+        lists: dict[str, Callable[[Any], object]] = {
+            "topics": lambda t: TopicReport(**t | {"signals": tuple(t["signals"])}),
+            "signals": lambda s: SignalReport(**s | {"columns": tuple(s["columns"])}),
+            "missions": lambda m: MissionReport(**m | {"height": tuple(m["height"])}),
+            "inlets": lambda i: Inlet(i["name"], tuple(i["missing"])),
+            "coefficients": lambda c: Informed(**c),
+            "notes": Note.read,
+            "damage": Damage.read,
+        }
+        parts = {name: tuple(map(read, raw[name])) for name, read in lists.items()}
+        battery = tuple(raw["battery"]) if raw["battery"] else None
+        return Inspection(**raw | parts | {"battery": battery})
     except (ValueError, TypeError, KeyError):
         return None
 

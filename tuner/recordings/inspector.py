@@ -19,9 +19,8 @@ from tuner.core.errors import RecordingError
 from tuner.recordings.clocks import fit_grid, pose_offset
 from tuner.recordings.content import (
     Content,
-    Settings,
+    ReadOptions,
     Signals,
-    given_map,
     read_content,
     read_signals,
 )
@@ -38,13 +37,13 @@ from tuner.recordings.inspection import (
     SignalReport,
     TopicReport,
 )
-from tuner.recordings.interpolation import RATE, derivative, resample, rotate, smooth
+from tuner.recordings.interpolation import RATE, derivative, resample, smooth, upward
 from tuner.recordings.loader import keep_flights
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Recording, Samples, Topic
 from tuner.recordings.sources import Place
-from tuner.recordings.topics import Sidecar, TopicMap, read_sidecar
+from tuner.recordings.topics import Sidecar, TopicMap
 from tuner.vehicle import COEFFICIENTS
 
 NO_DATE = 631_152_000_000_000_000
@@ -85,23 +84,21 @@ def examine(
     ConfigError
         The topic map or the side-car is wrong.
     """
-    settings = Settings(topics, namespace)
-    sidecar = read_sidecar(path)
-    given = given_map(path, settings, sidecar)
+    options = ReadOptions.of(path, topics, namespace)
     with readable(path):
         try:
-            content = read_content(path, settings, sidecar, given)
+            content = read_content(options)
         except RecordingError as err:
             with contextlib.suppress(RecordingError):
-                signals = read_signals(path, settings, sidecar, given, with_pose=False)
+                signals = read_signals(options, with_pose=False)
                 if is_inertial(signals):
                     return _without_pose(signals)
             # Its topics are listed nevertheless, so that the user sees what to map.
-            recording = open_recording(path, given.messages if given else ())
-            return _without_flight(recording, err)
+            messages = options.given.messages if options.given else ()
+            return _without_flight(open_recording(path, messages), err)
     if keep and content.missions:
-        keep_flights(path, content, settings, sidecar, given)
-    return _with_flight(content, sidecar)
+        keep_flights(content, options)
+    return _with_flight(content, options.sidecar)
 
 
 def _without_pose(signals: Signals) -> Inspection:
@@ -267,7 +264,7 @@ def _mission(content: Content, index: int) -> MissionReport:
     position = resample("position", content.series["position"], clock)
     attitude = resample("attitude", content.series["attitude"], clock)
     speed = np.linalg.norm(derivative(smooth(position)), axis=1)
-    up = rotate(attitude, np.tile([0.0, 0.0, 1.0], (len(clock), 1)))[:, 2]
+    up = upward(attitude)[:, 2]
     rates = content.series.get("body_rate")
     turning = None
     if rates is not None:

@@ -156,6 +156,11 @@ def rotate(q: Array, v: Array) -> Array:
     return np.asarray(v + w * twice + np.cross(xyz, twice))
 
 
+def upward(q: Array) -> Array:
+    """Return (n, 3) where the body's z axis points in world axes."""
+    return rotate(q, np.tile([0.0, 0.0, 1.0], (len(q), 1)))
+
+
 def body_rate_of(q: Array) -> Array:
     """Return the (n, 3) body rate, rad/s, of (n, 4) attitudes on the clock."""
     return body_rate_from(q, derivative(q))

@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,13 @@ from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.clocks import Grid, fit_grid
-from tuner.recordings.content import Content, Settings, given_map, read_content
+from tuner.recordings.content import Content, ReadOptions, read_content
 from tuner.recordings.flight import SIGNALS, Array, Flight, InitialState, Series
 from tuner.recordings.interpolation import longest_gap, resample, without_gaps
 from tuner.recordings.missions import Mission, yaw_spin
-from tuner.recordings.notes import Cause, Damage, Note, NoteCode
+from tuner.recordings.notes import Damage, Note, NoteCode
 from tuner.recordings.states import initial_state
-from tuner.recordings.topics import Sidecar, TopicMap, read_sidecar
+from tuner.recordings.topics import TopicMap
 
 #: Seconds before the mission that the series keep.
 BEFORE = 2.0
@@ -32,12 +33,12 @@ BEFORE = 2.0
 AFTER = 0.2
 #: Longer missions, on the uniform clock, come of broken stamps.
 MOST_TICKS = 2_000_000
-_ABOUT = b"flights"
+_PLAIN = ("name", "path", "sha256", "rate", "yaw_rate_setpoint", "level_held", "trajectory")
+
+logger = logging.getLogger(__name__)
 
 
-def make_flight(
-    path: Path, content: Content, index: int, *, sha256: str, sidecar: Sidecar, rate: float
-) -> Flight:
+def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: str) -> Flight:
     """Put one mission of a recording on its uniform clock.
 
     Raises
@@ -45,8 +46,8 @@ def make_flight(
     RecordingError
         The mission is shorter than two ticks.
     """
+    path, rate, series = options.path, options.rate, content.series
     mission = content.missions[index]
-    series = content.series
     grid = _mission_grid(series, mission, rate)
     start = grid.tick_nearest(mission.start) if grid else mission.start
     count = math.floor((mission.end - start) * rate + 1e-6) + 1
@@ -84,7 +85,7 @@ def make_flight(
         initial=initial_state(around),
         yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
         level_held=spin is not None and spin.level_held,
-        trajectory=sidecar.trajectory,
+        trajectory=options.sidecar.trajectory,
         notes=tuple(notes),
         damage=tuple(part.later(-start) for part in content.damage),
     )
@@ -131,13 +132,12 @@ def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> A
     return resample(signal, series, clock)
 
 
-def reading_key(
-    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
-) -> tuple[str, ...]:
-    """Return what a recording's reading depends on, beside the readers themselves."""
+def _kept(options: ReadOptions) -> Path:
+    """Return the file of the cache for the flights of a recording, read so."""
+    path, given = options.path, options.given
     messages = [digest(file) for file in given.messages if file.exists()] if given else []
-    inputs = (settings.namespace, settings.rate, sidecar, given, messages)
-    return (digest(path), path.name, *(repr(value) for value in inputs))
+    inputs = (options.namespace, options.rate, options.sidecar, given, messages)
+    return cached("flights", digest(path), path.name, *map(repr, inputs))
 
 
 def load_flights(
@@ -150,64 +150,45 @@ def load_flights(
 ) -> tuple[Flight, ...]:
     """Read every mission of a recording; see `load_flight`."""
     path = Path(path)
-    settings = Settings(topics, namespace, rate)
     if not exists(path):
         raise RecordingError(path, "no such file", "check the path")
-    sidecar = read_sidecar(path)
-    given = given_map(path, settings, sidecar)
-    kept = None
+    options, kept = ReadOptions.of(path, topics, namespace, rate), None
     if cache:
-        kept = cached("flights", *reading_key(path, settings, sidecar, given))
-        content = load(kept)
-        flights = from_parquet(content) if content is not None else None
+        kept = _kept(options)
+        before = load(kept)
+        flights = from_npz(before) if before is not None else None
         if flights is not None:
             # The same content may lie elsewhere now.
             return tuple(dataclasses.replace(flight, path=str(path)) for flight in flights)
-    flights = _read_flights(path, settings, sidecar, given)
-    if kept is not None:
-        store(kept, to_parquet(flights))
-    return flights
-
-
-def _read_flights(
-    path: Path, settings: Settings, sidecar: Sidecar, given: TopicMap | None
-) -> tuple[Flight, ...]:
     with readable(path):
-        content = read_content(path, settings, sidecar, given)
+        content = read_content(options)
     if not content.missions:
         raise RecordingError(
             path,
             "nothing flies in it: no mission was found",
             "inspect it, or give 'start' and 'end' in a side-car",
         )
-    return _flights_of(path, content, settings, sidecar)
+    flights = _flights_of(content, options)
+    if kept is not None:
+        store(kept, to_npz(flights))
+    return flights
 
 
-def _flights_of(
-    path: Path, content: Content, settings: Settings, sidecar: Sidecar
-) -> tuple[Flight, ...]:
-    sha256 = digest(path)
-    return tuple(
-        make_flight(path, content, i, sha256=sha256, sidecar=sidecar, rate=settings.rate)
-        for i in range(len(content.missions))
-    )
+def _flights_of(content: Content, options: ReadOptions) -> tuple[Flight, ...]:
+    sha256, missions = digest(options.path), range(len(content.missions))
+    return tuple(make_flight(content, options, i, sha256=sha256) for i in missions)
 
 
-def keep_flights(
-    path: Path, content: Content, settings: Settings, sidecar: Sidecar, given: TopicMap | None
-) -> None:
+def keep_flights(content: Content, options: ReadOptions) -> None:
     """Keep the flights of a recording that was read to be inspected: a long one takes a while.
 
     Parameters
     ----------
-    path, settings, sidecar, given
-        As of `read_content`, which returned the content.
-    content
-        What it holds.
+    content, options
+        What it holds, and how it was read.
     """
-    kept = cached("flights", *reading_key(path, settings, sidecar, given))
     with contextlib.suppress(RecordingError):
-        store(kept, to_parquet(_flights_of(path, content, settings, sidecar)))
+        store(_kept(options), to_npz(_flights_of(content, options)))
 
 
 def load_flight(
@@ -252,105 +233,51 @@ def load_flight(
     return flights[mission - 1]
 
 
-logger = logging.getLogger(__name__)
-
-
-def to_parquet(flights: Sequence[Flight]) -> bytes:
-    """Return flights as the bytes of a Parquet file."""
-    import pyarrow as pa  # noqa: PLC0415 (a third of a second)
-    from pyarrow import parquet  # noqa: PLC0415
-
-    layout: list[tuple[int, str, str, int, int]] = []
-    parts: list[Array] = []
-    for i, flight in enumerate(flights):
-        for name, values in flight.signals.items():
-            layout.append((i, "signal", name, *values.shape))
-            parts.append(values.ravel())
-        for name, series in flight.series.items():
-            layout.append((i, "series", name, *series.values.shape))
-            parts += [series.time, series.values.ravel()]
-    numbers = np.concatenate(parts) if parts else np.empty(0)
-    about = {"flights": [_about(flight) for flight in flights], "layout": layout}
-    # From the buffer itself: pyarrow's own conversion would load pandas, half a second.
-    column = pa.Array.from_buffers(pa.float64(), len(numbers), [None, pa.py_buffer(numbers)])
-    table = pa.Table.from_arrays(
-        [column], names=["values"], metadata={_ABOUT: json.dumps(about).encode()}
-    )
+def to_npz(flights: Sequence[Flight]) -> bytes:
+    """Return flights as the bytes of an ``.npz`` file: their arrays, and the rest as JSON."""
+    about, arrays = [], dict[str, Any]()
+    for number, flight in enumerate(flights):
+        known: dict[str, Any] = {name: getattr(flight, name) for name in _PLAIN}
+        for name in ("notes", "damage"):
+            known[name] = [dataclasses.asdict(each) for each in getattr(flight, name)]
+        about.append(known)
+        groups = {
+            "time": {"": flight.time},
+            "signals": flight.signals,
+            "stamps": {name: series.time for name, series in flight.series.items()},
+            "series": {name: series.values for name, series in flight.series.items()},
+            "initial": vars(flight.initial),
+        }
+        for group, held in groups.items():
+            arrays |= {f"{number} {group} {name}": values for name, values in held.items()}
     sink = io.BytesIO()
-    parquet.write_table(table, sink, compression="zstd", use_dictionary=False)
+    np.savez(sink, about=np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays)
     return sink.getvalue()
 
 
-def from_parquet(content: bytes) -> tuple[Flight, ...] | None:
-    """Return the flights in a Parquet file made by `to_parquet`; None if it is damaged."""
-    from pyarrow import parquet  # noqa: PLC0415
-
+def from_npz(content: bytes) -> tuple[Flight, ...] | None:
+    """Return the flights that `to_npz` made bytes of; None if they are damaged."""
     try:
-        # not `read_table`, whose data sets load pandas
-        table = parquet.ParquetFile(io.BytesIO(content)).read(use_threads=False)
-        about = json.loads(table.schema.metadata[_ABOUT])
-        numbers = np.array(np.from_dlpack(table.column("values").combine_chunks()))
-        signals: list[dict[str, Array]] = [{} for _ in about["flights"]]
-        series: list[dict[str, Series]] = [{} for _ in about["flights"]]
-        at = 0
-        for i, kind, name, rows, columns in about["layout"]:
-            time = numbers[at : at + rows] if kind == "series" else numbers[at:at]
-            at += len(time)
-            values = numbers[at : at + rows * columns].reshape(rows, columns)
-            at += rows * columns
-            if kind == "signal":
-                signals[i][name] = values
-            else:
-                series[i][name] = Series(time, values)
-        return tuple(
-            _flight(details, columns_of_flight, raw)
-            for details, columns_of_flight, raw in zip(
-                about["flights"], signals, series, strict=True
-            )
-        )
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        flights = []
+        for number, known in enumerate(json.loads(arrays.pop("about").tobytes())):
+            groups: dict[str, dict[str, Array]] = defaultdict(dict)
+            for key, values in arrays.items():
+                of, group, name = key.split(" ")
+                if int(of) == number:
+                    groups[group][name] = values
+            stamps = groups["stamps"]
+            parts = {
+                "notes": tuple(map(Note.read, known["notes"])),
+                "damage": tuple(map(Damage.read, known["damage"])),
+                "time": groups["time"][""],
+                "signals": groups["signals"],
+                "series": {n: Series(stamps[n], v) for n, v in groups["series"].items()},
+                "initial": InitialState(**groups["initial"]),
+            }
+            flights.append(Flight(**known | parts))
     except Exception as err:  # a damaged cache is read anew, whatever is wrong with it
         logger.info("a cached flight is damaged: %s", err)
         return None
-
-
-def _about(flight: Flight) -> dict[str, Any]:
-    return {
-        "name": flight.name,
-        "path": flight.path,
-        "sha256": flight.sha256,
-        "rate": flight.rate,
-        "count": len(flight.time),
-        "initial": {
-            field.name: getattr(flight.initial, field.name).tolist()
-            for field in dataclasses.fields(flight.initial)
-        },
-        "yaw_rate_setpoint": flight.yaw_rate_setpoint,
-        "level_held": flight.level_held,
-        "trajectory": flight.trajectory,
-        "notes": [dataclasses.asdict(note) for note in flight.notes],
-        "damage": [dataclasses.asdict(damage) for damage in flight.damage],
-    }
-
-
-def _flight(
-    about: Mapping[str, Any], signals: Mapping[str, Array], series: Mapping[str, Series]
-) -> Flight:
-    return Flight(
-        name=about["name"],
-        path=about["path"],
-        sha256=about["sha256"],
-        rate=about["rate"],
-        time=np.arange(about["count"]) / about["rate"],
-        signals=signals,
-        series=series,
-        initial=InitialState(
-            **{name: np.array(values) for name, values in about["initial"].items()}
-        ),
-        yaw_rate_setpoint=about["yaw_rate_setpoint"],
-        level_held=about["level_held"],
-        trajectory=about["trajectory"],
-        notes=tuple(Note.read(note) for note in about["notes"]),
-        damage=tuple(
-            Damage(**{**damage, "cause": Cause(damage["cause"])}) for damage in about["damage"]
-        ),
-    )
+    return tuple(flights)

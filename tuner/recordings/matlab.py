@@ -18,9 +18,17 @@ import numpy as np
 from tuner.core.errors import RecordingError
 from tuner.recordings.columns import guess
 from tuner.recordings.flight import Array
-from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.recording import ROWS, Clock, Contents, Request, Samples, TabularRecording
-from tuner.recordings.times import NEVER, UNIT_NAMES, read_times
+from tuner.recordings.notes import Note
+from tuner.recordings.recording import (
+    ROWS,
+    Clock,
+    Contents,
+    Request,
+    Samples,
+    TabularRecording,
+    reason_of,
+)
+from tuner.recordings.times import NEVER, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
@@ -79,7 +87,7 @@ class MatlabTable(TabularRecording):
             time = self._times.get(name) if clock.field == TIME else clock.field
             if time is not None and len(self._columns[time]) == len(self._columns[name]):
                 groups.setdefault(time, []).append(name)
-        parts, notes = [], []
+        parts, notes = [], list[Note]()
         for field, names in groups.items():
             part, note = self._part(Clock(field=field, unit=clock.unit), names, request.fields)
             parts.append(part)
@@ -94,19 +102,15 @@ class MatlabTable(TabularRecording):
 
     def _part(
         self, clock: Clock, names: list[str], fields: tuple[str, ...]
-    ) -> tuple[Samples, list[Note]]:
+    ) -> tuple[Samples, tuple[Note, ...]]:
         """Return the rows of one structure, NaN in the columns of the others."""
         import pyarrow  # noqa: PLC0415 (a third of a second)
 
         stamps = self._columns[clock.field]
         column = pyarrow.chunked_array([pyarrow.array(stamps)])
         held = {name: self._columns[name] for name in names}
-        time, unit = read_times(self.path, column, clock, held.values())
+        time, notes = read_times(self.path, column, clock, held.values())
         known, nothing = time != NEVER, np.full(len(time), np.nan)
-        notes = []
-        if unit is not None and unit != "s":
-            said = (clock.field, UNIT_NAMES[unit])
-            notes.append(Note(NoteCode.UNIT_READ, topic=ROWS, count=len(time), names=said))
         values = {name: held.get(name, nothing)[known] for name in fields}
         return Samples(time[known], time[known], values), notes
 
@@ -125,15 +129,12 @@ def _load(path: Path) -> Mapping[str, Any]:
     try:
         return dict(loadmat(io.BytesIO(data), simplify_cells=True))
     except Exception as err:  # whatever a hostile file makes of the library
-        reason = " ".join(str(err).split())[:120]
-        raise RecordingError(
-            path, f"is no readable MATLAB file ({reason})", "save it again"
-        ) from None
+        raise _unreadable(path, err) from None
 
 
 def _unreadable(path: Path, err: Exception) -> RecordingError:
-    reason = " ".join(str(err).split())[:120]
-    return RecordingError(path, f"is no readable MATLAB file ({reason})", "save it again")
+    what = f"is no readable MATLAB file ({reason_of(err)})"
+    return RecordingError(path, what, "save it again")
 
 
 def _packed(data: bytes) -> Iterator[tuple[int, bytes]]:
@@ -200,10 +201,7 @@ def _load_hdf5(path: Path) -> Mapping[str, Any]:
     except RecordingError:
         raise
     except Exception as err:  # whatever a hostile file makes of the library
-        reason = " ".join(str(err).split())[:120]
-        raise RecordingError(
-            path, f"is no readable MATLAB file ({reason})", "save it again"
-        ) from None
+        raise _unreadable(path, err) from None
 
 
 def _of_group(h5py: Any, group: Any, read: list[int], depth: int) -> dict[str, Any]:

@@ -20,6 +20,13 @@ from tuner.recordings.notes import Damage, Note
 Nanoseconds = NDArray[np.int64]
 #: Unit of time -> nanoseconds.
 NANOSECONDS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
+
+
+def reason_of(err: Exception) -> str:
+    """Return what a library says of a file in one line, short enough for a message."""
+    return " ".join(str(err).split())[:120]
+
+
 #: The one topic of a table.
 ROWS = ""
 

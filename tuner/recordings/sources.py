@@ -9,10 +9,9 @@ from fnmatch import fnmatchcase
 from typing import Literal
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.columns import recognised
+from tuner.recordings.columns import Found, recognised
 from tuner.recordings.formats import is_tabular
-from tuner.recordings.note_texts import reason_in_words
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import Note, NoteCode, reason_in_words
 from tuner.recordings.recording import Clock, Recording
 from tuner.recordings.topics import Source, TopicMap
 
@@ -132,6 +131,12 @@ def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) 
     return (note,) if others else ()
 
 
+def source_of(name: str, columns: Found) -> Source:
+    """Return the source of a signal, or of an attitude in ``angles``, that some columns hold."""
+    order: Literal["wxyz", "rpy"] = "rpy" if name == "angles" else "wxyz"
+    return Source(fields=columns.fields, unit=columns.unit, quaternion=order)
+
+
 def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tuple[Note, ...]]:
     """Return a map of a table with the columns that it lacks and whose names say what they hold.
 
@@ -159,10 +164,8 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
         signal = "attitude" if name == "angles" else name
         if name == "time" or signal in places or taken & set(columns_of.fields):
             continue
-        order: Literal["wxyz", "rpy"] = "rpy" if name == "angles" else "wxyz"
-        fields = columns_of.fields
-        signals[signal] = (Source(fields=fields, unit=columns_of.unit, quaternion=order),)
-        notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *fields)))
+        signals[signal] = (source_of(name, columns_of),)
+        notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *columns_of.fields)))
     return whole.replace(signals=signals), tuple(notes)
 
 

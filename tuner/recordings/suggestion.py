@@ -9,12 +9,12 @@ import yaml
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.columns import recognised
-from tuner.recordings.content import Settings, read_content
+from tuner.recordings.content import ReadOptions, read_content
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.sources import choose_map, locate
-from tuner.recordings.topics import Sidecar, Source, shipped_maps
+from tuner.recordings.sources import choose_map, locate, source_of
+from tuner.recordings.topics import Source, shipped_maps
 
 LACKING = "position", "attitude", "command", "rotor_speed", "body_rate"
 """Signals that are asked for where no column seems to hold them."""
@@ -52,12 +52,8 @@ def suggested_map(path: Path) -> str:
     found, why, told = {}, {}, _told(path)
     for name, columns_of in known.items():
         if name != "time":
-            signal, order = ("attitude", "rpy") if name == "angles" else (name, "wxyz")
-            found[signal] = Source(
-                fields=columns_of.fields,
-                unit=columns_of.unit,
-                quaternion=order,  # type: ignore[arg-type]
-            )
+            signal = "attitude" if name == "angles" else name
+            found[signal] = source_of(name, columns_of)
             why[signal] = "by the names" + _of_unit(columns_of.unit, told.get(signal), name)
     taken = {field for columns_of in known.values() for field in columns_of.fields}
     lines.insert(0, f"format: {recording.format}")
@@ -67,7 +63,7 @@ def suggested_map(path: Path) -> str:
 def _told(path: Path) -> dict[str, str]:
     """Return in which units signals are by their numbers: signal -> words."""
     with contextlib.suppress(RecordingError):
-        notes = read_content(path, Settings(), Sidecar(), None).notes
+        notes = read_content(ReadOptions(path)).notes
         codes = (NoteCode.UNIT_READ, NoteCode.FRAME_TURNED)
         return {note.names[0]: note.names[1] for note in notes if note.code in codes}
     return {}

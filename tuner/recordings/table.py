@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
-from tuner.recordings.recording import ROWS, Contents, Request, Samples, TabularRecording
-from tuner.recordings.times import NEVER, UNIT_NAMES, numbers_of, read_times
+from tuner.recordings.recording import ROWS, Contents, Request, Samples, TabularRecording, reason_of
+from tuner.recordings.times import NEVER, numbers_of, read_times
 
 if TYPE_CHECKING:
     import pyarrow
@@ -69,11 +69,8 @@ class Table(TabularRecording):
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
         fields = {name: numbers_of(table.column(name)) for name in request.fields}
-        time, unit = read_times(self.path, table.column(clock.field), clock, fields.values())
-        notes = []
-        if unit is not None and unit != "s":
-            told = (clock.field, UNIT_NAMES[unit])
-            notes.append(Note(NoteCode.UNIT_READ, topic=ROWS, count=len(time), names=told))
+        time, told = read_times(self.path, table.column(clock.field), clock, fields.values())
+        notes = list(told)
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
         kept = time != NEVER
         if not kept.all():
@@ -154,7 +151,7 @@ def _single_blanks(path: Path) -> io.BytesIO:
 
 
 def _why(err: Exception) -> str:
-    return f"is no readable table ({' '.join(str(err).split())[:120]})"
+    return f"is no readable table ({reason_of(err)})"
 
 
 #: Bytes and lines within which a table's rows have begun.

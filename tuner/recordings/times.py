@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import Array
-from tuner.recordings.recording import NANOSECONDS, Clock, Nanoseconds
+from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.recording import NANOSECONDS, ROWS, Clock, Nanoseconds
 
 if TYPE_CHECKING:
     import pyarrow
@@ -42,7 +43,7 @@ _DAY = 24 * 3600 * NANOSECONDS["s"]
 
 def read_times(
     path: Path, column: pyarrow.ChunkedArray, clock: Clock, fields: Iterable[Array]
-) -> tuple[Nanoseconds, str | None]:
+) -> tuple[Nanoseconds, tuple[Note, ...]]:
     """Return the times (n,) of a table's rows in ns, `NEVER` where there is none.
 
     Parameters
@@ -59,7 +60,7 @@ def read_times(
     Returns
     -------
     tuple
-        The times, and the unit of `NANOSECONDS` that was told; None where nothing had to be.
+        The times, and a note on their unit where that was told and is not the usual one.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def read_times(
 
     if types.is_timestamp(column.type):
         whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
-        return np.asarray(array_of(compute.fill_null(whole, NEVER)), dtype=np.int64), None
+        return np.asarray(array_of(compute.fill_null(whole, NEVER)), dtype=np.int64), ()
     numbers = numbers_of(column)
     sampled = [np.isfinite(field) for field in list(fields)[:LOOKED_AT]] or [np.isfinite(numbers)]
     if is_text(column) and not np.isfinite(numbers).any():
@@ -79,7 +80,10 @@ def read_times(
         unit = None if clock.unit else _unit(path, clock.field, numbers, sampled)
         times = _whole(column, numbers, NANOSECONDS[clock.unit or unit or "s"])
     _require_digits(path, column, times, sampled)
-    return times, unit
+    if unit is None or unit == "s":
+        return times, ()
+    names = (clock.field, UNIT_NAMES[unit])
+    return times, (Note(NoteCode.UNIT_READ, topic=ROWS, count=len(times), names=names),)
 
 
 def numbers_of(column: pyarrow.ChunkedArray) -> Array:

@@ -13,6 +13,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,28 @@ import numpy as np
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.px4 import USUAL
-from tuner.recordings.recording import NANOSECONDS, Clock, Contents, Request, Samples, Topic, Usual
+from tuner.recordings.recording import (
+    NANOSECONDS,
+    Clock,
+    Contents,
+    Request,
+    Samples,
+    Topic,
+    Usual,
+    reason_of,
+)
 
 #: A ULog message cannot be longer; a format that claims so is no honest one.
 LONGEST_MESSAGE = 65_535
+#: What a log begins with.
+MAGIC = b"ULog\x01\x12\x35"
 #: Logs are read into memory; PX4 writes some 10 MB a minute.
 LARGEST = 4 << 30
 #: Bytes that are looked through at once.
 READ_AT_ONCE = 1 << 22
+
+#: Message -> its fields: type, number, name.
+Formats = dict[str, list[tuple[str, int, str]]]
 
 
 class ULogRecording:
@@ -53,9 +68,8 @@ class ULogRecording:
         self.path = path
         if path.stat().st_size > LARGEST:
             raise RecordingError(path, "is larger than any log of a flight", "cut it")
-        self._formats, self._data_start = _formats(path)
-        self.parameters = dict(_parameters(path))
-        counts, ids, self._behind = _count(path, self._data_start)
+        self._formats, self.parameters, start = _definitions(path)
+        counts, ids, self._behind = _count(path, start)
         self.topics = tuple(
             sorted(
                 (Topic(name, ids[number], count) for number, (name, count) in counts.items()),
@@ -127,22 +141,6 @@ class ULogRecording:
         return Samples(receive, stamp, fields)
 
 
-def _records(path: Path, at: int) -> Iterator[tuple[int, bytes, int, int]]:
-    """Yield type, buffer, start and end of the content of each message, until one is cut."""
-    with path.open("rb") as stream:
-        stream.seek(at)
-        buffer, at = b"", 0
-        while block := stream.read(READ_AT_ONCE):
-            buffer, at = buffer[at:] + block, 0
-            size = len(buffer)
-            while at + 3 <= size:
-                end = at + 3 + (buffer[at] | buffer[at + 1] << 8)
-                if end > size:
-                    break
-                yield buffer[at + 2], buffer, at + 3, end
-                at = end
-
-
 def _blocks(path: Path, at: int) -> Iterator[tuple[bytes, list[int]]]:
     """Yield blocks of a log, each with where its whole messages begin, and the end of the last."""
     with path.open("rb") as stream:
@@ -161,50 +159,48 @@ def _blocks(path: Path, at: int) -> Iterator[tuple[bytes, list[int]]]:
                 yield buffer, places
 
 
-def _formats(path: Path) -> tuple[dict[str, list[tuple[str, int, str]]], int]:
-    """Return the fields of each message format, and where the data begin; check their size."""
+def _definitions(path: Path) -> tuple[Formats, dict[str, float], int]:
+    """Return formats and parameters of a log, and where its data begin; formats are checked."""
     with path.open("rb") as stream:
-        if len(head := stream.read(16)) < 16 or head[:7] != b"ULog\x01\x12\x35":
+        if not stream.read(16).startswith(MAGIC) or stream.tell() < 16:
             raise RecordingError(path, "is no PX4 log", "give the .ulg file itself")
-    formats: dict[str, list[tuple[str, int, str]]] = {}
+    formats: Formats = {}
+    parameters: dict[str, float] = {}
     start = 16
-    for kind, buffer, at, end in _records(path, 16):
+    for kind, content in _messages(path, start):
+        if kind in b"ALCD":
+            break
+        start += 3 + len(content)
         if kind == ord("F"):
-            name, _, fields = buffer[at:end].decode(errors="replace").partition(":")
+            name, _, fields = content.decode(errors="replace").partition(":")
             parts = re.findall(r"([\w/]+)(?:\[(\d{1,6})\])? (\w+);", fields)
             formats[name] = [(what, int(count or 1), field) for what, count, field in parts]
-        elif kind in (ord("A"), ord("L"), ord("C"), ord("D")):
-            break
-        start += 3 + end - at
+        elif kind == ord("P") and content:
+            word, _, name = content[1 : 1 + content[0]].decode(errors="replace").partition(" ")
+            form = {"float": "<f", "int32_t": "<i"}.get(word)
+            if form is not None and len(content) == 1 + content[0] + 4:
+                parameters[name] = float(struct.unpack_from(form, content, 1 + content[0])[0])
     for name in formats:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
-    return formats, start
+    return formats, parameters, start
+
+
+def _messages(path: Path, at: int) -> Iterator[tuple[int, bytes]]:
+    """Yield type and content of each message, until one is cut."""
+    for buffer, places in _blocks(path, at):
+        for begin, end in pairwise(places):
+            yield buffer[begin + 2], buffer[begin + 3 : end]
 
 
 def parameters_of(path: Path) -> dict[str, float]:
     """Return the parameters at the beginning of a PX4 log; none of what is no such log."""
-    if not path.is_file():
-        return {}
-    with path.open("rb") as stream:
-        if stream.read(7) != b"ULog\x01\x12\x35":
-            return {}
-    return dict(_parameters(path))
+    with contextlib.suppress(OSError, RecordingError):
+        return _definitions(path)[1]
+    return {}
 
 
-def _parameters(path: Path) -> Iterator[tuple[str, float]]:
-    """Yield the parameters before the data, bounded by the size of the definitions."""
-    for kind, buffer, at, end in _records(path, 16):
-        if kind in (ord("A"), ord("L"), ord("C"), ord("D")):
-            return
-        length = buffer[at] if end > at else 0
-        word, _, name = buffer[at + 1 : at + 1 + length].decode(errors="replace").partition(" ")
-        form = {"float": "<f", "int32_t": "<i"}.get(word)
-        if kind == ord("P") and form is not None and end - at == 1 + length + 4:
-            yield name, float(struct.unpack_from(form, buffer, at + 1 + length)[0])
-
-
-def _has(formats: Mapping[str, list[tuple[str, int, str]]], kind: str, path: list[str]) -> bool:
+def _has(formats: Formats, kind: str, path: list[str]) -> bool:
     """Return whether a format has a field such as ``esc[0].esc_rpm``, in its parts."""
     name, _, index = path[0].partition("[")
     for what, count, field in formats.get(kind, []):
@@ -215,7 +211,7 @@ def _has(formats: Mapping[str, list[tuple[str, int, str]]], kind: str, path: lis
     return False
 
 
-def _size(formats: Mapping[str, list[tuple[str, int, str]]], name: str, depth: int) -> int:
+def _size(formats: Formats, name: str, depth: int) -> int:
     """Return the numbers in a format, at most a little more than a message can hold."""
     if depth > 8:
         return LONGEST_MESSAGE + 1
@@ -262,7 +258,5 @@ def _parse(path: Path, names: list[str]) -> tuple[Any, str]:
         with contextlib.redirect_stdout(printed):
             return ULog(str(path), names), printed.getvalue()
     except Exception as err:  # pyulog's own and whatever a hostile log makes of it
-        complaint = " ".join(str(err).split())[:120]
-        raise RecordingError(
-            path, f"is no readable PX4 log ({complaint})", "record it again"
-        ) from None
+        what = f"is no readable PX4 log ({reason_of(err)})"
+        raise RecordingError(path, what, "record it again") from None

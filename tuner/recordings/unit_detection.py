@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import GRAVITY
 from tuner.recordings.flight import Array
-from tuner.recordings.interpolation import rotate
+from tuner.recordings.interpolation import upward
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.units import ATTITUDE_READINGS, UNITS, quaternion_of, to_si
 
@@ -210,7 +210,7 @@ def pull_and_tilt(
     push = (at[2 * REACH :] - 2 * at[REACH:-REACH] + at[: -2 * REACH]) / (REACH * BIN) ** 2
     norm = np.linalg.norm(attitude.values, axis=1, keepdims=True)
     turned = attitude.values / np.where(norm > 0.5, norm, np.nan)
-    up = rotate(turned, np.tile([0.0, 0.0, 1.0], (len(turned), 1)))
+    up = upward(turned)
     weights = np.convolve(np.ones(REACH), np.ones(REACH)) / REACH**2
     columns = _binned(Stamped(attitude.time, up), centres).T
     leant = np.column_stack([np.convolve(c, weights, "valid")[1:-1] for c in columns])

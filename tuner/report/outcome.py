@@ -13,8 +13,7 @@ from pathlib import Path
 from tuner.core.phrases import listed
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding, remedy, sentence
-from tuner.ground.bench_json import BenchRecord
-from tuner.ground.texts import bench_in_words
+from tuner.ground.bench_json import BenchRecord, bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
 from tuner.result import FlightResult, RunResult

@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from tuner.core.disk import write_text
 from tuner.core.spans import span
-from tuner.design.texts import proposals_in_words
+from tuner.design.proposals import proposals_in_words
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
 from tuner.report.outcome import (

@@ -12,13 +12,13 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
-from tuner.design import candidate_problem
+from tuner.design import candidates as proposed
 from tuner.design.candidates import CLEARANCE, Arena, candidates
-from tuner.design.next_flight_json import (
+from tuner.design.proposals import (
     Proposals,
+    proposals_in_words,
 )
 from tuner.design.ranking import rank_next_flights
-from tuner.design.texts import proposals_in_words
 from tuner.objective import flown
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
@@ -106,7 +106,7 @@ def test_fewer_samples_of_larger_weight_carry_nearly_the_same_information(
     proposals: Proposals,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(candidate_problem, "SAMPLE_RATE", 50.0)
+    monkeypatch.setattr(proposed, "SAMPLE_RATE", 50.0)
     coarser = ranked(examination, fitted)
     by_name = {row.name: row for row in coarser.flights}
     for row in proposals.flights:

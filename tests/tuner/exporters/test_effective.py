@@ -15,8 +15,8 @@ from tuner.exporters.effective import (
     lost_terms,
     pose_rmse,
     refitted,
-    without,
 )
+from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
 from tuner.result import PoseRmse
@@ -64,7 +64,7 @@ def test_what_gazebo_lacks_is_named_by_groups_and_taken_away(fit):
     )
     lost = lost_terms(vehicle, fitted)
     assert lost == {"quadratic": ("quadratic",), "linear_drag": ("linear_drag_x",)}
-    bare = without(vehicle, ["quadratic", "linear_drag_x"])
+    bare = GAZEBO_CLASSIC.lacking(vehicle, ["quadratic", "linear_drag_x"])
     assert bare.motor.quadratic == 0.0
     assert set(bare.effects) == {"linear_drag_z", "rotor_drag_ratio_y"}
     assert lost_terms(bare, fitted) == {}
@@ -99,7 +99,11 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays():
     names = ("linear_drag_x", "linear_drag_y")
     progressed = []
     end, effective = refitted(
-        job, fitted, without(vehicle, names), names, lambda _, now: progressed.append(now)
+        job,
+        fitted,
+        GAZEBO_CLASSIC.lacking(vehicle, names),
+        names,
+        lambda _, now: progressed.append(now),
     )
     before, after = values_of(vehicle), values_of(effective)
     assert progressed
@@ -118,7 +122,7 @@ def test_nothing_free_is_nothing_refitted(fit):
     job, fitted = extended(job, fitted, ("fuselage_drag",))
     held = {name: name for name in job.space.names}
     vehicle = vehicle_file().replace(effects={"fuselage_drag": DRAG})
-    bare = without(vehicle, ["fuselage_drag"])
+    bare = GAZEBO_CLASSIC.lacking(vehicle, ["fuselage_drag"])
     _, effective = refitted(
         job, replace(fitted, held=held), bare, ("fuselage_drag",), lambda *_: None
     )

@@ -1,20 +1,32 @@
 import difflib
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from lxml import etree
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
 from tuner.exporters.draft import write
+from tuner.exporters.sdf.composite import Inertial, Pose, base_for, pose_of, together
 from tuner.exporters.sdf.model import read_model
 from tuner.exporters.sdf.patch import sdf_draft
-from tuner.exporters.sdf.read_back import composite, values_in
 from tuner.exporters.sdf.snippet import snippet_draft
-from tuner.exporters.sdf.tags import carried_values
-from tuner.exporters.sdf.template import blanked, rendered
+from tuner.exporters.sdf.spans import (
+    Edit,
+    append_child,
+    apply,
+    blanked,
+    number,
+    parse,
+    rendered,
+    set_value,
+)
+from tuner.exporters.sdf.tags import carried_values, composite, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import Choices, not_carried, target_of
 from tuner.exporters.targets.sdf import TARGET
@@ -399,3 +411,156 @@ def test_format_and_model_agree_about_the_simulator():
         TARGET.chosen(Choices(GZ, "gazebo-classic"))
     with pytest.raises(ExportError, match="--format gz-sim is not for gazebo-classic"):
         target_of("gz-sim").chosen(Choices(CLASSIC))
+
+
+def solid_box(mass, pose, sides):
+    x, y, z = (np.asarray(sides) ** 2).tolist()
+    return Inertial(mass, pose, mass / 12 * np.diag([y + z, x + z, x + y]))
+
+
+def test_two_half_bars_are_a_bar():
+    halves = [solid_box(1.0, pose_of([side, 0, 0, 0, 0, 0]), [1, 0.1, 0.1]) for side in (-0.5, 0.5)]
+    bar = solid_box(2.0, pose_of([0] * 6), [2, 0.1, 0.1])
+    assert together(halves).mass == 2
+    np.testing.assert_allclose(together(halves).inertia, bar.inertia, atol=1e-15)
+    np.testing.assert_allclose(together(halves).pose.position, 0, atol=1e-15)
+
+
+def test_a_quarter_turn_about_z_swaps_x_and_y():
+    turned = pose_of([1, 2, 3, 0, 0, np.pi / 2])
+    np.testing.assert_allclose(turned.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    box = Inertial(1.0, turned, np.diag([1.0, 2.0, 2.5]))
+    np.testing.assert_allclose(box.in_model, np.diag([2.0, 1.0, 2.5]), atol=1e-15)
+
+
+def test_angles_are_about_fixed_axes_roll_first():
+    both = pose_of([0, 0, 0, np.pi / 2, np.pi / 2, 0]).rotation
+    np.testing.assert_allclose(both @ [0, 1, 0], [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(both @ both.T, np.eye(3), atol=1e-15)
+
+
+def test_poses_chain():
+    outer, inner = pose_of([1, 0, 0, 0, 0, np.pi / 2]), pose_of([1, 0, 0, 0, 0, 0])
+    np.testing.assert_allclose((outer @ inner).position, [1, 1, 0], atol=1e-15)
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(0.001, 0.05), *[st.floats(-0.2, 0.2)] * 3, *[st.floats(-3, 3)] * 3),
+        max_size=5,
+    ),
+    st.tuples(*[st.floats(-0.1, 0.1)] * 3, *[st.floats(-3, 3)] * 3),
+)
+def test_base_and_others_together_are_the_wanted_whole(others, base):
+    bodies = [solid_box(mass, pose_of(pose), [0.02, 0.1, 0.03]) for mass, *pose in others]
+    wanted = np.diag([0.05, 0.06, 0.08])
+    base_body = base_for(2.0, wanted, pose_of(base), bodies)
+    whole = together([base_body, *bodies])
+    assert whole.mass == pytest.approx(2.0, rel=1e-12)
+    np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
+
+
+def test_the_base_moves_to_where_the_common_centre_is_wanted():
+    other = solid_box(0.5, pose_of([0.1, 0, 0.05, 0, 0, 1.0]), [0.02, 0.1, 0.03])
+    wanted, centre = np.diag([0.05, 0.06, 0.08]), np.array([0.003, -0.002, 0.015])
+    base = base_for(2.0, wanted, pose_of([0.3, 0, 0, 0.2, 0, 0]), [other], centre=centre)
+    whole = together([base, other])
+    np.testing.assert_allclose(whole.pose.position, centre, atol=1e-16)
+    np.testing.assert_allclose(whole.inertia, wanted, atol=1e-14)
+
+
+def test_links_heavier_than_the_vehicle_are_refused():
+    heavy = solid_box(3.0, pose_of([0] * 6), [1, 1, 1])
+    with pytest.raises(ValueError, match="weigh 3 kg, the vehicle only 2 kg"):
+        base_for(2.0, np.diag([0.05, 0.06, 0.08]), pose_of([0] * 6), [heavy])
+    far = Inertial(0.5, Pose(np.array([0.5, 0, 0]), np.eye(3)), np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="more inertia than"):
+        base_for(2.0, np.diag([0.05, 0.06, 0.08]), pose_of([0] * 6), [far])
+
+
+PATH = Path("model.sdf")
+
+
+def changed(text, tag, value):
+    element = next(parse(text, PATH).all(tag))
+    return apply(text, [set_value(element, text, value)])
+
+
+def test_places_are_places_in_the_text_whatever_characters_stand_before():
+    text = "<a é='ü>\"'><!-- ≥ <b>0</b> --><b>1.5</b>\n<c/></a>"
+    root = parse(text, PATH)
+    b, c = root.children
+    assert text[b.start : b.end] == "<b>1.5</b>"
+    assert text[b.content : b.content_end] == "1.5"
+    assert text[c.start : c.end] == "<c/>"
+    assert (root.start, root.end) == (0, len(text))
+    assert number(b, text) == 1.5
+    assert number(c, text) is None
+
+
+def test_a_value_changes_and_nothing_else():
+    assert changed("<a>\n <b> 1e-3 </b></a>", "b", "2") == "<a>\n <b> 2 </b></a>"
+    assert changed("<a><b>1 <!-- kg: 3 --></b></a>", "b", "2") == "<a><b>2 <!-- kg: 3 --></b></a>"
+    assert changed("<a><b><!-- 3 -->1</b></a>", "b", "2") == "<a><b><!-- 3 -->2</b></a>"
+    assert changed("<a><b/></a>", "b", "2") == "<a><b>2</b></a>"
+    assert changed("<a><b x='/' /></a>", "b", "2") == "<a><b x='/'>2</b></a>"
+    assert changed("<a><b></b></a>", "b", "2") == "<a><b>2</b></a>"
+    assert changed("<a><b>word</b></a>", "b", "2") == "<a><b>2</b></a>"
+
+
+def test_a_new_child_stands_like_the_last():
+    text = "<a>\n  <b>1</b>\n</a>"
+    edit = append_child(parse(text, PATH), text, "c", "2")
+    assert apply(text, [edit]) == "<a>\n  <b>1</b>\n  <c>2</c>\n</a>"
+    flat = "<a><b>1</b></a>"
+    assert apply(flat, [append_child(parse(flat, PATH), flat, "c", "2")]) == (
+        "<a><b>1</b><c>2</c></a>"
+    )
+
+
+@given(
+    st.recursive(
+        st.text(st.characters(exclude_categories=["Cs", "Cc"]), max_size=5),
+        lambda inner: st.lists(inner, max_size=4),
+        max_leaves=12,
+    )
+)
+def test_every_element_is_cut_out_whole(tree):
+    def build(value, parent):
+        element = etree.SubElement(parent, "e", {"a": "x>'/"})
+        if isinstance(value, str):
+            element.text = value
+        else:
+            for child in value:
+                build(child, element)
+
+    top = etree.Element("e")
+    build(tree, top)
+    text = etree.tostring(top, encoding="unicode")
+
+    def same(ours, theirs):
+        cut = text[ours.start : ours.end]
+        cut_out, whole = etree.fromstring(cut), etree.fromstring(etree.tostring(theirs))
+        assert etree.tostring(cut_out, method="c14n") == etree.tostring(whole, method="c14n")
+        assert len(ours.children) == len(theirs)
+        for our, their in zip(ours.children, theirs, strict=True):
+            same(our, their)
+
+    same(parse(text, PATH), top)
+
+
+def test_edits_that_overlap_are_our_mistake():
+    with pytest.raises(ValueError, match="overlap"):
+        apply("abcd", [Edit(0, 2, ""), Edit(1, 3, "")])
+
+
+@pytest.mark.parametrize("text", ["<a>", "", "<a></b>", "words", "<a>&bomb;</a>"])
+def test_what_is_not_xml_is_refused(text):
+    with pytest.raises(ExportError, match="not well-formed"):
+        parse(text, PATH)
+
+
+def test_document_types_are_refused():
+    bomb = '<!DOCTYPE a [<!ENTITY b "b"><!ENTITY c "&b;&b;">]><a>&c;</a>'
+    with pytest.raises(ExportError, match="document type"):
+        parse(bomb, PATH)

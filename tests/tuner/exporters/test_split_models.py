@@ -15,8 +15,8 @@ from tuner.exporters.draft import read_file, write
 from tuner.exporters.sdf.includes import assembled
 from tuner.exporters.sdf.model import read_model
 from tuner.exporters.sdf.patch import sdf_draft
-from tuner.exporters.sdf.read_back import composite
-from tuner.exporters.sdf.template import rendered
+from tuner.exporters.sdf.spans import rendered
+from tuner.exporters.sdf.tags import composite
 from tuner.exporters.simulators import GZ_SIM
 from tuner.vehicle import values_of
 

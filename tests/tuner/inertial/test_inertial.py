@@ -11,7 +11,7 @@ from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
 from tuner.evaluate.simulate import simulate
 from tuner.findings.findings import Code, one_line
-from tuner.inertial.ahead import rate_errors
+from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed
 from tuner.job.without_pose import fit_without_pose, without_pose

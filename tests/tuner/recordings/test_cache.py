@@ -13,6 +13,7 @@ from tests.tuner.recordings import making
 from tuner.recordings import Flight, load_flight
 from tuner.recordings import loader as loading
 from tuner.recordings.cache import digest, own_folder
+from tuner.recordings.content import ReadOptions
 
 
 @pytest.fixture
@@ -42,9 +43,9 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     seen: list[Path] = []
     original = loading.read_content
 
-    def read(path: Path, *rest: object) -> object:
-        seen.append(path)
-        return original(path, *rest)  # type: ignore[arg-type]
+    def read(options: ReadOptions) -> object:
+        seen.append(options.path)
+        return original(options)
 
     monkeypatch.setattr(loading, "read_content", read)
     return seen

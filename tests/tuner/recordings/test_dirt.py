@@ -17,8 +17,7 @@ from tuner.core.yaml_section import build
 from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.frames import correct_frames
-from tuner.recordings.note_texts import damage_sentence
-from tuner.recordings.notes import Cause, Note, NoteCode
+from tuner.recordings.notes import Cause, Note, NoteCode, damage_sentence
 from tuner.search.job_flights import load_flights
 
 POSE = "/optitrack/pose"

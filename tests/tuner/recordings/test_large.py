@@ -21,13 +21,12 @@ IMAGE = "sensor_msgs/msg/Image"
 #: Reads a recording in a process of its own; prints seconds, bytes read and the peak of memory.
 MEASURE = """
 import json, pathlib, sys, time
-from tuner.recordings.content import Settings, read_content
-from tuner.recordings.topics import Sidecar
+from tuner.recordings.content import ReadOptions, read_content
 def read():
     lines = pathlib.Path("/proc/self/io").read_text().split()
     return int(lines[lines.index("rchar:") + 1])
 before, started = read(), time.process_time()
-content = read_content(pathlib.Path(sys.argv[1]), Settings(), Sidecar(), None)
+content = read_content(ReadOptions(pathlib.Path(sys.argv[1])))
 # Not getrusage's: that remembers the process from which this one was forked.
 lines = pathlib.Path("/proc/self/status").read_text().split()
 peak = int(lines[lines.index("VmHWM:") + 1])

@@ -1,16 +1,20 @@
-"""Topic maps: what a user may write, and how a wrong one is refused."""
+"""Topic maps and side-cars are checked, and signals are found where they say."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tuner.core.errors import ConfigError
+from tests.tuner.recordings import making
+from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.shipped import configs_folder
-from tuner.recordings import SIGNALS
+from tuner.recordings import SIGNALS, load_flight
+from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
 from tuner.recordings.units import UNITS, to_enu_flu
 
@@ -97,3 +101,129 @@ def test_what_the_guide_shows_is_valid(tmp_path: Path) -> None:
         assert f"`{signal}`" in guide
     for unit in UNITS:
         assert f"`{unit}`" in guide
+
+
+LAB = "name: lab\nformat: ros\nsignals:\n  attitude: /optitrack/pose\n"
+
+
+def own_map(folder: Path, lines: str) -> Path:
+    path = folder / "lab.yaml"
+    path.write_text(LAB + lines)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("  position: /optitrack/pos\n", "similar are /optitrack/pose"),
+        (
+            "  position: {topic: /optitrack/pose, fields: [pose.position.x, pose.y, pose.z]}\n",
+            "/optitrack/pose has no field 'pose.y' for the position",
+        ),
+        ("  position: /mavros/battery\n", "it is not known where /mavros/battery"),
+        ("  velocity: /mavros/local_position/velocity_local\n", "names no topic for position"),
+    ],
+)
+def test_what_a_map_has_wrong_is_named(
+    short: Path, tmp_path: Path, lines: str, message: str
+) -> None:
+    with pytest.raises(RecordingError) as caught:
+        load_flight(short, topics=own_map(tmp_path, lines))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_nearest_column_of_a_table_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "f.csv"
+    rows = [f"{t / 100},0,0,1,1,0,0,0" for t in range(300)]
+    path.write_text("\n".join(["time,px,py,pz,qw,qx,qy,qz", *rows]))
+    text = "name: own\nformat: table\ntime: time\nsignals:\n  position: [px, py, pzz]\n"
+    (tmp_path / "own.yaml").write_text(text + "  attitude: [qw, qx, qy, qz]\n")
+    with pytest.raises(RecordingError, match="no column 'pzz' for the position, did you mean 'pz'"):
+        load_flight(path, topics=tmp_path / "own.yaml")
+    (tmp_path / "own.yaml").write_text(text.replace("pzz", "pz").replace("time: time", "time: t"))
+    with pytest.raises(RecordingError, match="finds no time: no column t;"):
+        load_flight(path, topics=tmp_path / "own.yaml")
+
+
+def test_columns_that_the_map_does_not_name_are_said(tmp_path: Path) -> None:
+    path = tmp_path / "f.csv"
+    spare = [f"pwm_{number}" for number in range(14)]
+    rows = [f"{t / 100},0,0,1,1,0,0,0" + ",0.5" * 14 for t in range(300)]
+    path.write_text("\n".join([",".join(["time,x,y,z,qw,qx,qy,qz", *spare]), *rows]))
+    (note,) = (n for n in load_flight(path).notes if n.code is NoteCode.COLUMNS_UNREAD)
+    assert note_in_words(note) == (
+        "14 columns are not read, which the topic map does not name: "
+        + ", ".join(spare[:12])
+        + ", ..."
+    )
+
+
+def test_a_pattern_takes_the_busiest_topic_and_says_so(short: Path, tmp_path: Path) -> None:
+    names = {
+        "/optitrack/pose": "/vrpn_client_node/quad/pose",
+        "/mavros/local_position/pose": "/vrpn_client_node/wand/pose",
+    }
+    path = making.rewrite(short, tmp_path / "vrpn.bag", rename=lambda name: names.get(name, name))
+    got = load_flight(path)
+    assert len(got.series["position"].time) > 1100
+    note = next(note for note in got.notes if note.code is NoteCode.OTHERS_MATCH)
+    assert note.topic == "/vrpn_client_node/quad/pose"
+    assert note.names == ("position", "/vrpn_client_node/wand/pose")
+
+
+def test_a_damaged_definition_costs_its_signals_only(short: Path, tmp_path: Path) -> None:
+    raw = short.read_bytes().replace(b"float32 voltage", b"float32 voltag[")
+    path = tmp_path / "odd.bag"
+    path.write_bytes(raw)
+    got = load_flight(path)
+    assert not got.has("battery_voltage")
+    assert got.has("position")
+    (note,) = (note for note in got.notes if note.code is NoteCode.FIELD_MISSING)
+    assert (note.topic, note.names[1]) == ("/mavros/battery", "battery_voltage")
+
+
+def test_definitions_come_from_msg_files_where_the_recording_has_none(
+    short: Path, tmp_path: Path
+) -> None:
+    """As in databases that ROS 2 Humble wrote."""
+    import sqlite3  # noqa: PLC0415
+
+    folder = making.to_ros2(short, tmp_path / "humble", making.StoragePlugin.SQLITE3)
+    with sqlite3.connect(folder / "humble.db3") as database:
+        database.execute("DROP TABLE message_definitions")
+    database.close()
+    expected = load_flight(short)
+    got = load_flight(folder)
+    assert got.has("body_rate")  # a type that every ROS 2 has
+    assert not got.has("command")
+    (tmp_path / "mavros_msgs" / "msg").mkdir(parents=True)
+    text = "std_msgs/Header header\nuint16[] channels\n"
+    (tmp_path / "mavros_msgs" / "msg" / "RCOut.msg").write_text(text)
+    topics = tmp_path / "lab.yaml"
+    topics.write_text(
+        "name: lab\nformat: ros\nmessages: mavros_msgs/msg\nsignals:\n"
+        "  position: /optitrack/pose\n  attitude: /optitrack/pose\n  command: /mavros/rc/out\n"
+    )
+    got = load_flight(folder, topics=topics)
+    assert got.signals["command"][200].tolist() == pytest.approx(
+        expected.signals["command"][200 + round(4.0 * 100)].tolist(), abs=0.2
+    )
+    assert got.has("command")
+
+
+def test_single_tachometers_of_four_rotors_are_put_in_their_columns(
+    short: Path, tmp_path: Path
+) -> None:
+    def change(topic: str, time: int, message: Any) -> list[tuple[int, Any]]:
+        if topic != "/mavros/rpm":
+            return [(time, message)]
+        message.index = (time // 10_000_000) % 4
+        message.frequency += 100 * message.index
+        return [(time, message)]
+
+    got = load_flight(making.rewrite(short, tmp_path / "four.bag", change))
+    level = [float(v) for v in got.signals["rotor_speed"][50:150].mean(axis=0)]
+    steps = [(b - a) * 60 / 6.283185 for a, b in pairwise(level)]
+    assert steps == pytest.approx([100, 100, 100], abs=30)
+    assert not any(note.code is NoteCode.NO_TACHOMETER for note in got.notes)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.shipped import find_config
-from tuner.design.log_proposal import LogProposal
+from tuner.design.proposals import LogProposal
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.forces import Forces
 from tuner.evaluate.records import PredictedErrors

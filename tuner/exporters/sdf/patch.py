@@ -16,9 +16,8 @@ from tuner.exporters.sdf import spans, tags
 from tuner.exporters.sdf.composite import Inertial, base_for, together
 from tuner.exporters.sdf.includes import MERGED, Whole, assembled
 from tuner.exporters.sdf.model import Model, inertials, read_model
-from tuner.exporters.sdf.read_back import rotor_origin, values_in
-from tuner.exporters.sdf.spans import Edit, Element
-from tuner.exporters.sdf.template import blanked, rendered
+from tuner.exporters.sdf.spans import Edit, Element, blanked, rendered
+from tuner.exporters.sdf.tags import rotor_origin, values_in
 from tuner.exporters.simulators import (
     FASTEST_GZ,
     GAZEBO_CLASSIC,

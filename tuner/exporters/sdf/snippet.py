@@ -8,7 +8,7 @@ from jinja2 import Environment, StrictUndefined
 
 from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf import tags
-from tuner.exporters.sdf.read_back import values_in
+from tuner.exporters.sdf.tags import values_in
 from tuner.exporters.simulators import GZ_SIM, Simulator, gz_unit, with_speeds_in
 from tuner.vehicle import VehicleFile
 

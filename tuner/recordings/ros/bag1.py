@@ -12,9 +12,8 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -27,9 +26,11 @@ from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import (
     LARGEST_CHUNK,
     NEAR,
+    Chunk,
+    ChunkedFile,
     Connection,
     DamagedError,
-    read_pieces,
+    read_wanted,
     u32,
     unpack,
 )
@@ -43,47 +44,21 @@ LONGEST_DATA = 1 << 24
 
 
 @dataclass(frozen=True)
-class _Chunk:
-    """A chunk.
+class _Chunk(Chunk):
+    """A chunk, whose position is that of its data; they are ``size`` bytes when unpacked.
 
-    Attributes
-    ----------
-    position, packed
-        Where its data lie in the file, and how many bytes they are.
-    size
-        Bytes of its data when unpacked.
-    compression
-        How they are packed.
-    counts
-        Connection -> messages in the chunk.
-    start, end
-        s since 1970 of the first and the last message; None where no index says so.
+    ``compression`` says how they are packed.
     """
 
-    position: int
-    packed: int
-    size: int
-    compression: str
-    counts: dict[int, int]
-    start: float | None = None
-    end: float | None = None
+    size: int = 0
+    compression: str = ""
 
 
 @dataclass
-class Bag1:
-    """A ROS 1 bag.
+class Bag1(ChunkedFile[_Chunk]):
+    """A ROS 1 bag."""
 
-    Raises
-    ------
-    RecordingError
-        The file is no bag, or nothing of it can be read.
-    """
-
-    path: Path
     aligned: bool = False
-    connections: dict[int, Connection] = field(default_factory=dict)
-    damage: list[Damage] = field(default_factory=list)
-    _chunks: list[_Chunk] = field(default_factory=list)
     _indexed: bool = True
 
     def __post_init__(self) -> None:
@@ -100,31 +75,8 @@ class Bag1:
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
 
-    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
-        """Yield the messages of some connections, chunk by chunk."""
-        lost: list[_Chunk] = []
-        with self.path.open("rb") as stream:
-            for chunk in self._chunks:
-                present = [number for number in wanted if chunk.counts.get(number)]
-                if not present:
-                    continue
-                try:
-                    located = self._locate(stream, chunk, present)
-                except DamagedError:
-                    lost.append(chunk)
-                    continue
-                yield from located
-        if lost:
-            self.damage.append(
-                Damage(
-                    Cause.CHUNKS_DAMAGED,
-                    lost=sum(chunk.counts.get(number, 0) for chunk in lost for number in wanted),
-                    bytes_lost=sum(chunk.packed for chunk in lost),
-                    occurrences=len(lost),
-                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
-                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
-                )
-            )
+    def _lost(self, chunks: Sequence[_Chunk], wanted: Collection[int]) -> int:
+        return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
 
     def _read_index(self, stream: BinaryIO) -> None:
         """Learn connections and chunks from the end of the bag."""
@@ -146,11 +98,9 @@ class Bag1:
             header = _header(stream, CHUNK)
             (packed,) = struct.unpack("<I", _read(stream, 4))
             self._chunks.append(replace(_chunk(header, stream.tell(), packed), **info))
-            counts.update(info["counts"])
-        self.connections = {
-            number: Connection(number, topic, kind, text, counts[number])
-            for number, topic, kind, text in records
-        }
+            counts.update(info["held"])
+        self.connections = {record.id: record for record in records}
+        self._count(counts)
 
     def _walk(self, stream: BinaryIO, first: int, cause: Cause) -> None:
         """Learn connections and chunks from front to end, as far as records can be followed."""
@@ -174,16 +124,13 @@ class Bag1:
                     chunk, read = self._scan(self._content(stream, chunk), chunk)
                 except DamagedError:
                     read = 0
-                unread += chunk.packed - read if chunk.compression in ("none", "") else 0
+                unread += chunk.length - read if chunk.compression in ("none", "") else 0
                 last = last if chunk.end is None else max(last or 0.0, chunk.end)
                 self._chunks.append(chunk)
-                counts.update(chunk.counts)
+                counts.update(chunk.held)
             reached = min(position + length, size)
             stream.seek(reached)
-        self.connections = {
-            number: Connection(number, c.topic, c.type, c.definition, counts[number])
-            for number, c in self.connections.items()
-        }
+        self._count(counts)
         self.damage.append(
             Damage(
                 cause,
@@ -200,36 +147,39 @@ class Bag1:
         for header, start, end in _inside(content):
             op = header.get(b"op")
             if op == bytes([CONNECTION]):
-                data = content[start:end].tobytes()
-                number, topic, kind, text = _connection(header, data)
-                self.connections.setdefault(number, Connection(number, topic, kind, text, 0))
+                record = _connection(header, content[start:end].tobytes())
+                self.connections.setdefault(record.id, record)
             elif op == bytes([MESSAGE]):
                 number = _number(header, b"conn", 4)
                 counts[number] += 1
                 last = max(last or 0, _time(header.get(b"time", b"")))
             read = end
-        return replace(chunk, counts=counts, end=None if last is None else last * 1e-9), read
+        return replace(chunk, held=counts, end=None if last is None else last * 1e-9), read
 
     def _content(self, stream: BinaryIO, chunk: _Chunk) -> Bytes:
-        if chunk.packed > LARGEST_CHUNK:
-            raise DamagedError(f"a chunk claims {chunk.packed} bytes")
+        if chunk.length > LARGEST_CHUNK:
+            raise DamagedError(f"a chunk claims {chunk.length} bytes")
         stream.seek(chunk.position)
-        packed = stream.read(chunk.packed)
+        packed = stream.read(chunk.length)
         return np.frombuffer(unpack(chunk.compression, packed, chunk.size), dtype=np.uint8)
 
     def _locate(
         self, stream: BinaryIO, chunk: _Chunk, wanted: list[int]
     ) -> list[tuple[int, Block]]:
-        """Return the blocks of a chunk, by the index behind it or by walking it."""
         if self._indexed:
             try:
-                stream.seek(chunk.position + chunk.packed)
-                entries = [_index(stream) for _ in range(len(chunk.counts))]
+                stream.seek(chunk.position + chunk.length)
+                entries = dict(_index(stream) for _ in range(len(chunk.held)))
             except DamagedError:
-                entries = []
+                entries = {}
             if entries:
-                content, entries = self._needed(stream, chunk, entries, wanted)
-                return [(n, _block(content, n, *rest)) for n, *rest in entries]
+                if chunk.compression != "none" or chunk.length < 4 * NEAR:
+                    content = self._content(stream, chunk)
+                else:  # only the wanted pieces of one that may hold images unpacked
+                    content, entries = read_wanted(
+                        stream, chunk.position, chunk.length, entries, wanted
+                    )
+                return [(n, _block(content, n, *entries[n])) for n in entries if n in wanted]
         located: dict[int, list[tuple[int, int, int]]] = {number: [] for number in wanted}
         content = self._content(stream, chunk)
         for header, start, end in _inside(content):
@@ -242,22 +192,6 @@ class Bag1:
             for number, rows in located.items()
             if rows
         ]
-
-    def _needed(
-        self,
-        stream: BinaryIO,
-        chunk: _Chunk,
-        entries: list[tuple[int, Index, Index]],
-        wanted: list[int],
-    ) -> tuple[Bytes, list[tuple[int, Index, Index]]]:
-        """Read a chunk, or only the wanted pieces of one that holds images unpacked."""
-        kept = [entry for entry in entries if entry[0] in wanted]
-        if chunk.compression != "none" or chunk.packed < 4 * NEAR:
-            return self._content(stream, chunk), kept
-        bounds = np.unique(np.concatenate([entry[2] for entry in entries]))
-        starts = np.unique(np.concatenate([entry[2] for entry in kept]))
-        content, moved = read_pieces(stream, chunk.position, chunk.packed, starts, bounds)
-        return content, [(n, time, moved[np.searchsorted(starts, at)]) for n, time, at in kept]
 
 
 def _read(stream: BinaryIO, size: int) -> bytes:
@@ -313,7 +247,7 @@ def _time(value: bytes) -> int:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def _connection(header: dict[bytes, bytes], data: bytes) -> tuple[int, str, str, MessageDefinition]:
+def _connection(header: dict[bytes, bytes], data: bytes) -> Connection:
     inner = _fields(data)
     try:
         topic = header[b"topic"].decode()
@@ -322,31 +256,32 @@ def _connection(header: dict[bytes, bytes], data: bytes) -> tuple[int, str, str,
     except (KeyError, UnicodeDecodeError, ValueError):
         raise DamagedError("a connection record makes no sense") from None
     definition = MessageDefinition(MessageDefinitionFormat.MSG, text)
-    return _number(header, b"conn", 4), "/" + topic.strip("/"), kind, definition
+    return Connection(_number(header, b"conn", 4), "/" + topic.strip("/"), kind, definition, 0)
 
 
 def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[str, Any]]:
-    """Return where a chunk lies, and its counts, start and end as the index has them."""
+    """Return where a chunk lies, and its messages, start and end as the index has them."""
     if len(data) % 8:
         raise DamagedError("a chunk's entry in the index makes no sense")
     start, end = (_time(header.get(name, b"")) * 1e-9 for name in (b"start_time", b"end_time"))
-    counts = dict(struct.iter_unpack("<II", data))
-    return _number(header, b"chunk_pos", 8), {"counts": counts, "start": start, "end": end}
+    held = dict(struct.iter_unpack("<II", data))
+    return _number(header, b"chunk_pos", 8), {"held": held, "start": start, "end": end}
 
 
 def _chunk(header: dict[bytes, bytes], position: int, packed: int) -> _Chunk:
     compression = header.get(b"compression", b"").decode(errors="replace")
-    return _Chunk(position, packed, _number(header, b"size", 4), compression, {})
+    size = _number(header, b"size", 4)
+    return _Chunk(position, packed, {}, size=size, compression=compression)
 
 
-def _index(stream: BinaryIO) -> tuple[int, Index, Index]:
+def _index(stream: BinaryIO) -> tuple[int, tuple[Index, Index]]:
     """Read the index of one connection in a chunk: its number, times and offsets."""
     header, data = _record(stream, INDEX)
     if len(data) % 12:
         raise DamagedError("an index makes no sense")
     entries = np.frombuffer(data, dtype="<u4").reshape(-1, 3).astype(np.int64)
     time = entries[:, 0] * 1_000_000_000 + entries[:, 1]
-    return _number(header, b"conn", 4), time, entries[:, 2]
+    return _number(header, b"conn", 4), (time, entries[:, 2])
 
 
 def _block(content: Bytes, connection: int, time: Index, offset: Index) -> Block:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, BinaryIO, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, BinaryIO, Generic, Protocol, TypeVar
 
 import numpy as np
 from rosbags.interfaces import MessageDefinition
@@ -132,6 +134,123 @@ def joined(times: list[int], payloads: list[bytes]) -> Block:
     end = np.cumsum(lengths)
     content = np.frombuffer(b"".join(payloads), dtype=np.uint8)
     return Block(content, end - lengths, end, np.array(times, dtype=np.int64))
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """A chunk of a file, in which messages of several connections are packed together.
+
+    Attributes
+    ----------
+    position, length
+        Where it lies in the file, and how many bytes.
+    held
+        Connection -> the messages in the chunk, or what else says that there are any.
+    start, end
+        s since 1970 of the first and the last message; None where no index says so.
+    """
+
+    position: int
+    length: int
+    held: dict[int, int]
+    start: float | None = None
+    end: float | None = None
+
+
+C = TypeVar("C", bound=Chunk)
+
+
+@dataclass
+class ChunkedFile(ABC, Generic[C]):
+    """A container of chunks.
+
+    Raises
+    ------
+    RecordingError
+        The file is no such container, or nothing of it can be read.
+    """
+
+    path: Path
+    aligned: bool = True
+    connections: dict[int, Connection] = field(default_factory=dict)
+    damage: list[Damage] = field(default_factory=list)
+    _chunks: list[C] = field(default_factory=list)
+
+    @abstractmethod
+    def _locate(self, stream: BinaryIO, chunk: C, wanted: list[int]) -> Iterable[tuple[int, Block]]:
+        """Return the blocks of a chunk, by the indexes behind it or by walking it."""
+
+    def _lost(self, chunks: Sequence[C], wanted: Collection[int]) -> int | None:  # noqa: ARG002
+        """Return how many wanted messages some chunks held, where that is known."""
+        return None
+
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+        """Yield the messages of some connections, chunk by chunk."""
+        lost: list[C] = []
+        with self.path.open("rb") as stream:
+            for chunk in self._chunks:
+                present = [number for number in wanted if number in chunk.held]
+                if not present:
+                    continue
+                try:
+                    located = list(self._locate(stream, chunk, present))
+                except DamagedError:
+                    lost.append(chunk)
+                    continue
+                yield from located
+        if lost:
+            self.damage.append(
+                Damage(
+                    Cause.CHUNKS_DAMAGED,
+                    lost=self._lost(lost, wanted),
+                    bytes_lost=sum(chunk.length for chunk in lost),
+                    occurrences=len(lost),
+                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
+                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
+                )
+            )
+
+    def _count(self, counts: Mapping[int, int]) -> None:
+        """Tell the connections how many messages each has."""
+        self.connections = {
+            number: replace(known, count=counts.get(number, 0))
+            for number, known in self.connections.items()
+        }
+
+
+def read_wanted(
+    stream: BinaryIO,
+    origin: int,
+    size: int,
+    entries: Mapping[int, tuple[Index, Index]],
+    wanted: Collection[int],
+) -> tuple[Bytes, dict[int, tuple[Index, Index]]]:
+    """Read the wanted connections' records of an unpacked chunk.
+
+    Parameters
+    ----------
+    stream, origin, size
+        As of `read_pieces`.
+    entries
+        Connection -> times (n,) ns and offsets (n,) of its records in the chunk.
+    wanted
+        Connections among them.
+
+    Returns
+    -------
+    tuple
+        The bytes read, and the wanted entries with their offsets in them.
+    """
+    kept = {number: entry for number, entry in entries.items() if number in wanted}
+    if not kept:
+        raise DamagedError("an index points nowhere")
+    bounds = np.unique(np.concatenate([offset for _, offset in entries.values()]))
+    starts = np.unique(np.concatenate([offset for _, offset in kept.values()]))
+    content, moved = read_pieces(stream, origin, size, starts, bounds)
+    return content, {
+        number: (time, moved[np.searchsorted(starts, offset)])
+        for number, (time, offset) in kept.items()
+    }
 
 
 def read_pieces(

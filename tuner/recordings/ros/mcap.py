@@ -14,7 +14,6 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -26,9 +25,12 @@ from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import (
     LARGEST_CHUNK,
     NEAR,
+    Chunk,
+    ChunkedFile,
     Connection,
     DamagedError,
     read_pieces,
+    read_wanted,
     u16,
     u64,
     unpack,
@@ -53,42 +55,14 @@ _FORMATS = {
 }
 
 
-@dataclass(frozen=True)
-class _Chunk:
-    """A chunk.
-
-    Attributes
-    ----------
-    position, length
-        Where its record lies in the file, and the bytes of its content.
-    indexes
-        Channel -> where the index of its messages lies; 0 where there is none.
-    start, end
-        s since 1970 of the first and the last message; None where no index says so.
-    """
-
-    position: int
-    length: int
-    indexes: dict[int, int]
-    start: float | None = None
-    end: float | None = None
-
-
 @dataclass
-class Mcap:
+class Mcap(ChunkedFile[Chunk]):
     """An MCAP file with ROS messages.
 
-    Raises
-    ------
-    RecordingError
-        The file is no MCAP, or nothing of it can be read.
+    Its chunks' positions are those of their records, and ``held`` says where the index of a
+    channel's messages lies; 0 where there is none.
     """
 
-    path: Path
-    connections: dict[int, Connection] = field(default_factory=dict)
-    damage: list[Damage] = field(default_factory=list)
-    aligned: bool = True
-    _chunks: list[_Chunk] = field(default_factory=list)
     _loose: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
     _schemas: dict[int, tuple[str, MessageDefinition]] = field(default_factory=dict)
 
@@ -104,32 +78,12 @@ class Mcap:
             raise RecordingError(self.path, "holds no ROS messages", "record it again")
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
-        """Yield the messages of some connections, chunk by chunk."""
-        lost: list[_Chunk] = []
+        """Yield the messages of some connections, chunk by chunk, then those outside of chunks."""
+        yield from super().blocks(wanted)
         with self.path.open("rb") as stream:
-            for chunk in self._chunks:
-                present = [number for number in wanted if number in chunk.indexes]
-                if not present:
-                    continue
-                try:
-                    located = list(self._locate(stream, chunk, present))
-                except DamagedError:
-                    lost.append(chunk)
-                    continue
-                yield from located
             for number in wanted:
                 if self._loose.get(number):
                     yield from self._loose_blocks(stream, number)
-        if lost:
-            self.damage.append(
-                Damage(
-                    Cause.CHUNKS_DAMAGED,
-                    bytes_lost=sum(chunk.length for chunk in lost),
-                    occurrences=len(lost),
-                    start=min((chunk.start for chunk in lost if chunk.start), default=None),
-                    end=max((chunk.end for chunk in lost if chunk.end), default=None),
-                )
-            )
 
     def _read_summary(self, stream: BinaryIO) -> None:
         """Learn channels and chunks from the end of the file."""
@@ -173,7 +127,7 @@ class Mcap:
                 break
             if op == CHUNK:
                 chunk, in_chunk, missed = self._scan(
-                    stream, _Chunk(at, min(length, size - at - 9), {})
+                    stream, Chunk(at, min(length, size - at - 9), {})
                 )
                 unread += missed
                 last = last if chunk.end is None else max(last or 0.0, chunk.end)
@@ -198,7 +152,7 @@ class Mcap:
             )
         )
 
-    def _scan(self, stream: BinaryIO, chunk: _Chunk) -> tuple[_Chunk, dict[int, int], int]:
+    def _scan(self, stream: BinaryIO, chunk: Chunk) -> tuple[Chunk, dict[int, int], int]:
         """Learn the channels inside a chunk; return also its messages and the bytes not read."""
         try:
             content = self._content(stream, chunk)
@@ -217,7 +171,7 @@ class Mcap:
                     self._learn(op, content[at:end])
         known = dict.fromkeys(counts, 0)
         seconds = None if last is None else last * 1e-9
-        return replace(chunk, indexes=known, end=seconds), counts, len(content) - read
+        return replace(chunk, held=known, end=seconds), counts, len(content) - read
 
     def _learn(self, op: int, content: bytes) -> None:
         """Take in a schema or a channel."""
@@ -243,38 +197,24 @@ class Mcap:
         except (struct.error, ValueError):
             raise DamagedError("a channel makes no sense") from None
 
-    def _count(self, counts: dict[int, int]) -> None:
-        self.connections = {
-            number: replace(known, count=counts.get(number, 0))
-            for number, known in self.connections.items()
-        }
-
-    def _content(self, stream: BinaryIO, chunk: _Chunk) -> bytes:
+    def _content(self, stream: BinaryIO, chunk: Chunk) -> bytes:
         """Return the unpacked records of a chunk."""
         compression, position, packed, size = _chunk_header(stream, chunk)
         stream.seek(position)
         return unpack(compression, stream.read(packed), size)
 
     def _locate(
-        self, stream: BinaryIO, chunk: _Chunk, wanted: list[int]
+        self, stream: BinaryIO, chunk: Chunk, wanted: list[int]
     ) -> Iterator[tuple[int, Block]]:
-        """Yield the blocks of a chunk, by the indexes behind it or by walking it."""
-        if all(chunk.indexes.values()):
-            entries = {n: _index(stream, at, n) for n, at in chunk.indexes.items()}
+        if all(chunk.held.values()):
+            entries = {n: _index(stream, at, n) for n, at in chunk.held.items()}
             compression, position, packed, _ = _chunk_header(stream, chunk)
-            kept = {number: entries[number] for number in wanted}
             if compression or packed < 4 * NEAR:
                 content = np.frombuffer(self._content(stream, chunk), dtype=np.uint8)
-            else:
-                offsets = [entry[1] for entry in entries.values()]
-                bounds = np.unique(np.concatenate(offsets))
-                starts = np.unique(np.concatenate([entry[1] for entry in kept.values()]))
-                content, moved = read_pieces(stream, position, packed, starts, bounds)
-                kept = {
-                    n: (time, moved[np.searchsorted(starts, at)]) for n, (time, at) in kept.items()
-                }
-            for number, (time, offset) in kept.items():
-                yield number, _block(content, number, time, offset)
+            else:  # only the wanted pieces of one that may hold images unpacked
+                content, entries = read_wanted(stream, position, packed, entries, wanted)
+            for number in wanted:
+                yield number, _block(content, number, *entries[number])
             return
         raw = self._content(stream, chunk)
         rows: dict[int, list[tuple[int, int]]] = {number: [] for number in wanted}
@@ -317,7 +257,7 @@ def _string(content: bytes, at: int) -> tuple[str, int]:
     return content[at + 4 : at + 4 + length].decode(errors="replace"), at + 4 + length
 
 
-def _chunk_index(content: bytes, size: int) -> _Chunk:
+def _chunk_index(content: bytes, size: int) -> Chunk:
     try:
         start, end, position, length, indexes = struct.unpack_from("<QQQQI", content)
         pairs = content[36 : 36 + indexes]
@@ -326,7 +266,7 @@ def _chunk_index(content: bytes, size: int) -> _Chunk:
         raise DamagedError("its summary makes no sense") from None
     if position + length > size or length < 9 or any(at >= size for at in index_positions.values()):
         raise DamagedError("its summary points nowhere")
-    return _Chunk(position, length - 9, index_positions, start * 1e-9, end * 1e-9)
+    return Chunk(position, length - 9, index_positions, start * 1e-9, end * 1e-9)
 
 
 def _counts(content: bytes) -> dict[int, int]:
@@ -335,7 +275,7 @@ def _counts(content: bytes) -> dict[int, int]:
     return dict(struct.iter_unpack("<HQ", content[46:]))
 
 
-def _chunk_header(stream: BinaryIO, chunk: _Chunk) -> tuple[str, int, int, int]:
+def _chunk_header(stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
     """Return a chunk's compression, where its records lie, how long they are, packed and not."""
     stream.seek(chunk.position + 9)
     head = stream.read(40 + 16)

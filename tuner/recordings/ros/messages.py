@@ -12,7 +12,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
 from tuner.core.errors import InputError, RecordingError
-from tuner.recordings.recording import Usual
+from tuner.recordings.recording import Usual, reason_of
 
 #: Fields of a message type in their order: name and rosbags' description of what it holds.
 Fields = list[tuple[str, Any]]
@@ -104,10 +104,8 @@ def _parse(path: Path, text: MessageDefinition, kind: str) -> dict[str, Fields]:
     except InputError:
         raise
     except Exception as err:  # the parser meets hostile text and has no common error class
-        reason = " ".join(str(err).split())[:120]
-        raise RecordingError(
-            path, f"the definition of {kind} makes no sense ({reason})", "record it again"
-        ) from None
+        what = f"the definition of {kind} makes no sense ({reason_of(err)})"
+        raise RecordingError(path, what, "record it again") from None
 
 
 @lru_cache(maxsize=64)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from tuner.ground.bench_json import CurveRecord, ExperimentRecord
-from tuner.ground.texts import agreement_in_words, numbers_in_words, remarks_in_words
+from tuner.ground.bench_json import (
+    ExperimentRecord,
+    agreement_in_words,
+    numbers_in_words,
+    remarks_in_words,
+)
+from tuner.ground.measurement import Curve
 from tuner.report.chart import FITTED, GREY, PALETTE, Chart, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Section, Table
@@ -55,7 +60,7 @@ def _charts(number: int, experiment: ExperimentRecord) -> list[Chart]:
     ]
 
 
-def _panels(curve: CurveRecord) -> list[Panel]:
+def _panels(curve: Curve) -> list[Panel]:
     used = np.array(curve.used, bool)
     x, measured = np.array(curve.x), np.array(curve.measured)
     marks = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tuner.design.texts import proposals_in_words
+from tuner.design.proposals import proposals_in_words
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section

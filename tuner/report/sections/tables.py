@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 
 from tuner.core.phrases import percent
-from tuner.design.texts import next_log_in_words
+from tuner.design.proposals import next_log_in_words
 from tuner.findings.findings import remedy, sentence
 from tuner.report.contents import Contents
 from tuner.report.result_texts import effective_in_words, refits_in_words, rmse_in_words

@@ -9,8 +9,7 @@ from functools import cache
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
-from tuner.recordings.note_texts import damage_sentence, note_in_words
-from tuner.recordings.notes import Cause, Damage, Note
+from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
@@ -49,7 +48,7 @@ def environment() -> Environment:
         "flight": flight_name,
         "web": on_the_web,
         "note": lambda raw: note_in_words(Note.read(raw)),
-        "damage": lambda raw: damage_sentence(Damage(**raw | {"cause": Cause(raw["cause"])})),
+        "damage": lambda raw: damage_sentence(Damage.read(raw)),
     }
     made.filters |= filters
     made.globals |= {"states": STATES, "visitor": VISITOR.get}

@@ -9,11 +9,9 @@ from tests.tuner.job.test_attitude import settings_of, sparse_log
 from tests.tuner.job.test_windows import job_through
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import errors_of
-from tuner.design import log_job as next_log
-from tuner.design import next_log as design
-from tuner.design.log_job import what_to_log
-from tuner.design.log_proposal import LogProposal
-from tuner.design.texts import next_log_in_words
+from tuner.design import next_log
+from tuner.design.next_log import what_to_log
+from tuner.design.proposals import LogProposal, next_log_in_words
 from tuner.objective.information import information_at
 from tuner.recordings.flight import Series
 from tuner.search.fitted import Fitted
@@ -82,7 +80,7 @@ def test_what_is_foreseen_is_what_comes_of_it(full_flight, full_bag, updated, mo
     assert sentence.startswith("Log the rotor speed, at 100 Hz and good to")
 
     # speeds without noise would say what turns commands into speeds, and leave the rest to itself
-    monkeypatch.setattr(design, "TACHOMETER", 1e-6)
+    monkeypatch.setattr(next_log, "TACHOMETER", 1e-6)
     (exact,) = (p for p in what_to_log(job, fitted, known, updated) if p.change == "added")
     rest = [job.space.names.index(name) for name in ("motor_constant", "inertia_xx")]
     alone = errors_of(known[np.ix_(rest, rest)]) / errors_of(known)[rest]
@@ -113,15 +111,15 @@ def test_a_log_too_slow_to_be_thinned_is_no_error(full_flight, full_bag, updated
 def test_what_twice_the_rate_wins_follows_from_what_half_of_it_loses(power):
     losses = [3.0 + 0.2 * between**power for between in (1.0, 2.0, 4.0, 0.5)]
     *coarser, finer = losses
-    share = design.share_at_twice_the_rate(coarser)
+    share = next_log.share_at_twice_the_rate(coarser)
     assert share == pytest.approx(np.sqrt(finer / losses[0]), rel=1e-9)
 
 
 def test_no_more_is_promised_than_is_seen():
-    assert design.share_at_twice_the_rate([3.0, 2.9, 4.0]) == 1.0
-    all_missed = design.share_at_twice_the_rate([8.26, 30.17, 30.30])
+    assert next_log.share_at_twice_the_rate([3.0, 2.9, 4.0]) == 1.0
+    all_missed = next_log.share_at_twice_the_rate([8.26, 30.17, 30.30])
     assert np.sqrt(5.32 / 8.26) < all_missed < 1.0  # the losses of a simulated flight; first 400 Hz
-    assert design.share_at_twice_the_rate([1.0, 5.0, 13.0]) == 0.5
+    assert next_log.share_at_twice_the_rate([1.0, 5.0, 13.0]) == 0.5
 
 
 @pytest.mark.slow

@@ -18,6 +18,8 @@ UNKNOWN = 1e-11
 """Share of the best-known direction's information below which a direction is not measured."""
 DISAGREE = 0.01
 """p-value below which the experiments are said to disagree."""
+SMALL = 1e-6
+"""Share of a coefficient that may lie in unmeasured directions, for rounding."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,6 @@ def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> 
         p_value=float(chdtrc(freedom, chi_square)) if freedom > 0 else 1.0,
         conflicts=_conflicts(measurements, names, start),
     )
-
-
-SMALL = 1e-6
-"""Share of a coefficient that may lie in unmeasured directions, for rounding."""
 
 
 def _inverse(information: Array, names: Sequence[str]) -> tuple[Array, Array]:

@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from tuner.recordings.note_texts import PASSED_OVER, TEXTS, note_in_words
-from tuner.recordings.notes import Note, NoteCode
+from tuner.recordings.notes import PASSED_OVER, TEXTS, Note, NoteCode, note_in_words
 
 NUMBERS = dict.fromkeys(
     ["seconds", "longest", "lower", "upper", "agreement", "upright", "left", "number", "drift"], 0.5

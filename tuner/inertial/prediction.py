@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tuner.inertial.response import Lags, rotor_speeds
-from tuner.inertial.signals import Stretch, smoothed
+from tuner.inertial.signals import Lags, Stretch, rotor_speeds, smoothed
 from tuner.objective.explained import levers
 from tuner.recordings.flight import Array
 from tuner.vehicle import ControllerFile, VehicleFile, values_of

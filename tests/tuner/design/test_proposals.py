@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from tuner.design.next_flight_json import Proposal, Proposals
-from tuner.design.texts import proposals_in_words
+from tuner.design.proposals import Proposal, Proposals, proposals_in_words
 
 
 def proposals(*flights: Proposal) -> Proposals:

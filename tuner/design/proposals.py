@@ -1,20 +1,120 @@
-"""What to fly and what to log next, and for which coefficient, as sentences."""
+"""What to fly and what to log next, as ``next_flight.json`` holds it and in sentences."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal
 
+import numpy as np
+from pydantic import JsonValue
+
+from tuner.core.disk import write_text
+from tuner.core.files import Part, ResultFile, csv_text
 from tuner.core.phrases import listed
-from tuner.design.log_proposal import LogProposal
-from tuner.design.next_flight_json import Proposals
 
+NEXT_FLIGHT_TABLE = "next_flight.csv"
 WORTH_FLYING = 0.9
 """An interval that a flight leaves wider than this share of what it was is not narrowed."""
 HALVED = (0.45, 0.55)
 """Shares of an interval that are called half of it."""
-UNITS: Mapping[str, str] = {"rotor_speed": " rad/s", "body_rate": " rad/s", "command": ""}
 MOST = 4
 """Coefficients that a sentence names, those that gain most."""
+
+
+class LogProposal(Part):
+    """A signal that could be logged, and by how much it would narrow the intervals.
+
+    Attributes
+    ----------
+    signal
+        Its name.
+    change
+        Whether it would be ``added``, logged ``faster``, or so fast that it can be ``fed`` into the
+        simulation in place of the attitude.
+    rate
+        Hz at which it would be logged.
+    noise
+        Standard deviation that it is taken to have, in its unit; None where it is logged already.
+    shrinks
+        Coefficient -> width of its interval with it over that without; of one that is not fitted
+        so far, that without is its prior's.
+    """
+
+    signal: str
+    change: Literal["added", "faster", "fed"]
+    rate: float
+    noise: float | None = None
+    shrinks: dict[str, float]
+
+
+class Proposal(Part):
+    """A flight that could be flown, and by how much it would narrow the intervals.
+
+    Attributes
+    ----------
+    name
+        Its shape, size and speed in words.
+    trajectory
+        The options of ``tune simulate`` for it.
+    shrinks
+        Coefficient -> width of its interval after the flight over that before.
+    volume
+        Factor on the geometric mean of the half axes of the fitted coefficients' confidence
+        ellipsoid.
+    """
+
+    name: str
+    trajectory: dict[str, JsonValue]
+    shrinks: dict[str, float]
+    volume: float
+
+    @property
+    def mean(self) -> float:
+        """Root mean square of the factors, which an A-optimal flight minimises."""
+        return float(np.sqrt(np.mean(np.square(list(self.shrinks.values())))))
+
+
+class Proposals(ResultFile):
+    """The content of ``next_flight.json``.
+
+    Attributes
+    ----------
+    arena
+        m along x, y and up.
+    seconds
+        How long each flight would last.
+    targets
+        The fitted coefficients that are not well known yet; if there are none, as ``all_known``
+        says, the fixed ones that would not be, were they fitted; else all fitted ones.
+    fixed_targets
+        Those of the targets that were not fitted.
+    flights
+        Best first.
+    """
+
+    FILE = "next_flight.json"
+
+    schema_version: int = 2
+    arena: tuple[float, float, float]
+    seconds: float
+    targets: list[str]
+    fixed_targets: list[str]
+    all_known: bool
+    flights: list[Proposal]
+
+    def write(self, folder: Path) -> None:
+        """Write ``next_flight.json`` and, for other programs, ``next_flight.csv``."""
+        super().write(folder)
+        header = ("flight", "mean_shrink", "volume_shrink", *self.targets)
+        rows = [
+            [flight.name, flight.mean, flight.volume, *map(flight.shrinks.get, self.targets)]
+            for flight in self.flights
+        ]
+        write_text(folder / NEXT_FLIGHT_TABLE, csv_text(header, rows))
+
+
+UNITS: Mapping[str, str] = {"rotor_speed": " rad/s", "body_rate": " rad/s", "command": ""}
 
 
 def proposals_in_words(proposals: Proposals) -> list[str]:

@@ -3,8 +3,13 @@ from pathlib import Path
 
 import tuner.ground
 import tuner.inertial
-from tuner.ground.bench_json import ExperimentRecord, RemarkRecord
-from tuner.ground.texts import REMARKS, numbers_in_words, remarks_in_words
+from tuner.ground.bench_json import (
+    REMARKS,
+    ExperimentRecord,
+    numbers_in_words,
+    remarks_in_words,
+)
+from tuner.ground.measurement import Remark
 
 
 def test_every_remark_has_a_sentence():
@@ -20,7 +25,7 @@ def experiment(*remarks, rows=({"motor_constant": 1.0},), value=(-11.0,), std_er
         rows=list(rows),
         value=list(value),
         std_error=list(std_error),
-        remarks=[RemarkRecord(code=code, numbers=numbers) for code, numbers in remarks],
+        remarks=[Remark(code, numbers) for code, numbers in remarks],
         curves=[],
     )
 

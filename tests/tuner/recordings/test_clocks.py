@@ -1,4 +1,4 @@
-"""The uniform clock lies on the true ticks, whatever the delay of the stamps."""
+"""The uniform clock is laid onto the ticks of what was published regularly."""
 
 from __future__ import annotations
 

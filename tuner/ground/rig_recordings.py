@@ -1,0 +1,281 @@
+"""Recordings of rigs and flights for ground measurements: columns by name, means of steady flight.
+
+Columns come in SI units by their names; of a flight count the steady part of a hover or a spin, and
+a pendulum's angle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tuner.core.errors import RecordingError
+from tuner.ground.measurement import Array, Curve
+from tuner.ground.plateaus import levels_of, without_outliers
+from tuner.recordings.content import Content, ReadOptions, read_content
+from tuner.recordings.recording import ROWS, Clock, Request
+from tuner.recordings.table import Table
+
+MAX_BYTES = 200_000_000
+MOST = 60_000
+"""Samples beyond which a recording is thinned: steps of seconds need no more."""
+FEWEST = 20
+RPM = 2 * math.pi / 60
+"""rad/s per revolution a minute."""
+FASTEST = 4000.0
+"""rad/s that no rotor of a multirotor turns: a column beyond it holds revolutions a minute."""
+SLOWEST = 30.0
+"""rad/s below which a rotor that is measured at all does not turn: such rpm are rad/s, or Hz."""
+FULL_COMMAND = 1.5
+
+COLUMNS: Mapping[str, Mapping[str, float]] = {
+    "angle": {
+        "angle": 1.0,
+        "angle_rad": 1.0,
+        "angle_deg": math.pi / 180,
+        "angle_degrees": math.pi / 180,
+    },
+    "rotor_speed": {"rotor_speed": 1.0, "rpm": RPM},
+    "force": {"force": 1.0},
+    "command": {"command": 1.0},
+    "voltage": {"voltage": 1.0},
+    "qw": {"qw": 1.0},
+    "qx": {"qx": 1.0},
+    "qy": {"qy": 1.0},
+    "qz": {"qz": 1.0},
+}
+TIMES = ("time", "t")
+"""Quantity -> column name -> factor to SI units."""
+SHORTEST = 3.0
+"""s of steady flight without which there is no mean."""
+STEP = 0.05
+"""Change of the mean rotor speed, relative to its median, beyond which flight is not steady."""
+TABLES = (".csv", ".tsv", ".txt", ".parquet")
+AXES = ("x", "y", "z")
+VERTICAL = 0.9
+"""Least cosine between the body axis that hangs vertical and the vertical."""
+
+
+def open_table(path: Path) -> Table:
+    """Open a CSV or Parquet file.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, is too large, or is no table.
+    """
+    try:
+        if path.is_dir() or path.stat().st_size > MAX_BYTES:
+            raise RecordingError(path, "is a folder or larger than 200 MB", "cut it to the rig's")
+        return Table(path)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "no valid path"
+        raise RecordingError(path, f"cannot be read ({reason})", "check the path") from None
+
+
+def read_columns(
+    path: Path, wanted: tuple[str, ...], optional: tuple[str, ...] = ()
+) -> dict[str, Array]:
+    """Return quantity -> (n,) samples in SI units, NaN where a cell holds no number.
+
+    Parameters
+    ----------
+    path
+        A CSV or Parquet file.
+    wanted, optional
+        Quantities of `COLUMNS`; those that are optional may lack.
+
+    Returns
+    -------
+    dict
+        ``time`` in s from the first sample, and the quantities; no more than `MOST` samples.
+
+    Raises
+    ------
+    RecordingError
+        The file cannot be read, a column is missing, times do not rise, or a unit is implausible.
+    """
+    table = open_table(path)
+    chosen = {}
+    for quantity in (*wanted, *optional):
+        column = next((name for name in COLUMNS[quantity] if name in table.columns), None)
+        if column is not None:
+            chosen[quantity] = column
+        elif quantity in wanted:
+            names = " or ".join(COLUMNS[quantity])
+            needed = ", ".join(("time", *wanted))
+            raise RecordingError(path, f"has no column {names}", f"it needs {needed}")
+    if not any(name in table.columns for name in TIMES):
+        raise RecordingError(path, "has no column time", "add it, in s")
+    clocks = tuple(Clock(field=name, unit="s") for name in TIMES)
+    contents = table.read({ROWS: Request(tuple(chosen.values()), clocks)})
+    rows = contents.samples[ROWS]
+    if len(rows.receive) < FEWEST:
+        what = f"holds {len(rows.receive)} samples with a time"
+        raise RecordingError(path, what, "record the whole experiment")
+    time = (rows.receive - rows.receive[0]) * 1e-9
+    if (np.diff(time) <= 0).any():
+        raise RecordingError(path, "has times that do not rise", "sort it, one row a sample")
+    samples = {"time": time}
+    for quantity, column in chosen.items():
+        samples[quantity] = rows.fields[column] * COLUMNS[quantity][column]
+        _check_unit(path, quantity, column, samples[quantity])
+    stride = -(-len(time) // MOST)
+    return {quantity: values[::stride] for quantity, values in samples.items()}
+
+
+def _check_unit(path: Path, quantity: str, column: str, values: Array) -> None:
+    known = np.abs(values[np.isfinite(values)])
+    if len(known) < FEWEST:
+        raise RecordingError(path, f"column {column} holds hardly a number", "check the file")
+    top = float(np.quantile(known, 0.99))
+    complaints = {
+        "rotor_speed": (
+            (top > FASTEST, f"reaches {top:.0f} rad/s, too fast for a rotor",
+             "name the column rpm if it holds revolutions a minute"),
+            (top < SLOWEST, f"stays below {top:.1f} rad/s, too slow for a rotor",
+             "name the column rotor_speed if it holds rad/s"),
+        ),
+        "angle": (
+            (top > math.pi, f"reaches {top:.1f} rad, more than half a turn",
+             "name the column angle_deg if it holds degrees"),
+        ),
+        "command": (
+            (top > FULL_COMMAND, f"reaches {top:.0f}, commands lie in 0..1",
+             "scale it to 0..1 of full command"),
+        ),
+    }  # fmt: skip
+    for wrong, what, remedy in complaints.get(quantity, ()):
+        if wrong:
+            raise RecordingError(path, f"column {column} {what}", remedy)
+
+
+@dataclass(frozen=True)
+class SteadyFlight:
+    """Means over the longest steady part of a flight.
+
+    Attributes
+    ----------
+    rotor_speed
+        (4,) rad/s in PX4's motor order.
+    yaw_rate
+        rad/s; NaN where it was not recorded.
+    curve
+        Shows which samples were used.
+    """
+
+    rotor_speed: Array
+    yaw_rate: float
+    curve: Curve
+
+
+def is_table(path: Path) -> bool:
+    """Return whether a recording is a table by its name, with columns of a rig's."""
+    return path.suffix.lower() in TABLES
+
+
+def attitude_of(path: Path) -> tuple[Array, Array]:
+    """Return times (n,) s and attitudes (n, 4) w, x, y, z of any recording that `tune` reads.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read or holds no pose.
+    """
+    series = _content(path).series["attitude"]
+    return series.time - series.time[0], series.values
+
+
+def steady_flight(path: Path) -> SteadyFlight:
+    """Return the means over the longest steady part of a flight.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read, lacks rotor speeds, or is never steady.
+    """
+    series = _content(path).series
+    if "rotor_speed" not in series:
+        raise RecordingError(path, "has no rotor speeds", "give the point by its numbers")
+    time, speeds = series["rotor_speed"].time, series["rotor_speed"].values
+    measured = np.isfinite(speeds).any(axis=1)
+    time, speeds = time[measured], speeds[measured]
+    if len(time) < 20:
+        raise RecordingError(path, "has hardly a rotor speed", "give the point by its numbers")
+    mean = np.nanmean(speeds, axis=1)
+    parts = levels_of(mean, time, shortest=SHORTEST, step=STEP * float(np.median(mean)))
+    turning = [part for part in parts if np.median(mean[part.samples]) > 0.5 * mean.max()]
+    if not turning:
+        what = f"is nowhere steady for {SHORTEST:g} s"
+        raise RecordingError(path, what, "hold the hover or the spin longer")
+    longest = max(turning, key=lambda part: part.end - part.begin)
+    inside = longest.samples
+    used = np.zeros(len(time), bool)
+    used[inside] = True
+    rotors = []
+    for column in speeds[inside].T:
+        if not np.isfinite(column).any():
+            raise RecordingError(path, "lacks a rotor's speed", "give the point by its numbers")
+        rotors.append(float(column[without_outliers(column)].mean()))
+    yaw_rate = np.nan
+    if "body_rate" in series:
+        rates = series["body_rate"]
+        within = (rates.time >= longest.begin) & (rates.time <= longest.end)
+        yaw_rate = float(np.nanmean(rates.values[within, 2])) if within.any() else np.nan
+    level = np.array([mean[inside].mean()])
+    titles = (f"Steady part of {path.name}", "time, s", "mean rotor speed, rad/s")
+    middle = np.array([0.5 * (longest.begin + longest.end)])
+    curve = Curve.of(titles, (time, mean), (middle, level), used=used, law=False)
+    return SteadyFlight(np.array(rotors), yaw_rate, curve)
+
+
+def _content(path: Path) -> Content:
+    if not path.exists():
+        raise RecordingError(path, "does not exist", "check the path")
+    return read_content(ReadOptions.of(path))
+
+
+def angle_of_attitude(path: str, quaternion: Array, axis: str) -> Array:
+    """Return the angle (n,), rad, about the vertical, of a body that hangs by one of its axes.
+
+    Parameters
+    ----------
+    path
+        Of the recording.
+    quaternion
+        (n, 4) w, x, y, z: body to world, world z up; rows that are not finite give NaN.
+    axis
+        The body axis that ought to hang vertical.
+
+    Raises
+    ------
+    RecordingError
+        Another body axis, or none, hangs vertical.
+    """
+    norm = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    w, x, y, z = (quaternion / np.where(norm > 0.1, norm, np.nan)).T
+    up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)])
+    mean = np.nanmean(up, axis=1) if np.isfinite(w).any() else np.zeros(3)
+    hanging = int(np.argmax(np.abs(mean)))
+    if abs(mean[hanging]) < VERTICAL:
+        raise RecordingError(path, "hangs by no body axis", "hang it by the axis to be measured")
+    if AXES[hanging] != axis:
+        what = f"hangs by its body axis {AXES[hanging]}, and axis says {axis}"
+        raise RecordingError(path, what, "correct the axis, or hang it by the other one")
+    # the heading of a body axis that lies level tells the turn about the vertical
+    level = (hanging + 1) % 3
+    columns = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z)),
+        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z)),
+        (2 * (x * z + w * y), 2 * (y * z - w * x)),
+    )
+    forward, left = columns[level]
+    heading = np.arctan2(left, forward)
+    known = np.isfinite(heading)
+    angle = np.full(len(heading), np.nan)
+    angle[known] = np.unwrap(heading[known])
+    return np.asarray(angle - np.nanmean(angle))
