@@ -29,7 +29,7 @@ from tuner.ground.plan import (
     YawSpin,
 )
 from tuner.ground.propeller import propeller, read_static_table
-from tuner.ground.rig_recordings import (
+from tuner.ground.rig_data import (
     angle_of_attitude,
     attitude_of,
     is_table,
