@@ -16,11 +16,11 @@ import numpy as np
 from tuner.core.errors import ExportError
 from tuner.core.numerics import GRAVITY
 from tuner.exporters.draft import read_file
-from tuner.exporters.px4_parameters import outside_range, read_parameters
 from tuner.exporters.sdf.composite import Array, Inertial, together
 from tuner.exporters.sdf.includes import assembled
 from tuner.exporters.sdf.model import Model, inertials, read_model
 from tuner.exporters.sdf.spans import Element, number, rendered
+from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
 from tuner.vehicle import values_of
 

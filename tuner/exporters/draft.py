@@ -56,7 +56,7 @@ class Draft:
     others
         Further files -> their text, where a model is split over several.
     flier
-        Flies it in its own simulator, as of `tuner.exporters.elsewhere.flier`; None where that is
+        Flies it in its own simulator, as of `tuner.exporters.flier.flier`; None where that is
         not installed.
     """
 

@@ -12,7 +12,7 @@ from tuner.core.disk import check_file, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draft import Draft, Gate, write
 from tuner.exporters.draws import draws_of, write_draws
-from tuner.exporters.gates import Refly, check, check_elsewhere, check_hover, not_flown
+from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
 from tuner.exporters.provenance import (
     Refit,
     exported_vehicle,
@@ -130,7 +130,7 @@ def export(
     )
     flown: tuple[str, ...] = ()
     if draft.flier is not None and target.simulator is not None and run.result.flights:
-        gate, sentence = check_elsewhere(run, draft, refly, target.simulator.title)
+        gate, sentence = check_in_simulator(run, draft, refly, target.simulator.title)
         gates, flown = (*gates, gate), (sentence,)
     refuse(run.folder, gates, accept, "fit again")
     write(draft, *places)

@@ -53,7 +53,7 @@ def check(run: Run, vehicle: VehicleFile, refly: Refly) -> tuple[Gate, ...]:
     return tuple(Gate(name, tuple(o)) for name, o in zip(OF_FLIGHTS, objections, strict=True))
 
 
-def check_elsewhere(
+def check_in_simulator(
     run: Run, draft: Draft, refly: Callable[..., Mapping[str, AxesRmse]], title: str
 ) -> tuple[Gate, str]:
     """Check what is exported by flying it in its own simulator, which is installed.

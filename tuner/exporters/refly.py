@@ -35,7 +35,7 @@ def refly(
     vehicle
         What flies now.
     flier
-        Flies it in another simulator, as of `tuner.exporters.elsewhere.flier`.
+        Flies it in another simulator, as of `tuner.exporters.flier.flier`.
 
     Raises
     ------

@@ -10,9 +10,8 @@ from tests.tuner.exporters.conftest import MODELS
 from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.exporters.audit import audit
-from tuner.exporters.px4_parameters import parameters_text
 from tuner.exporters.simulators import GZ_SIM
-from tuner.exporters.targets.px4 import parameters
+from tuner.exporters.targets.px4 import parameters, parameters_text
 
 CLASSIC, GZ = MODELS / "quad_x.sdf", MODELS / "quad_x_gz.sdf"
 SHIPPED = Path(__file__).resolve().parents[4] / "shared" / "models"

@@ -4,10 +4,15 @@ import pytest
 
 from tuner.core.errors import ExportError
 from tuner.exporters.draft import write
-from tuner.exporters.px4_parameters import Parameter, outside_range, read_parameters
 from tuner.exporters.simulators import GZ_SIM, SIH
 from tuner.exporters.target import Choices
-from tuner.exporters.targets.px4 import parameters, px4_draft
+from tuner.exporters.targets.px4 import (
+    Parameter,
+    outside_range,
+    parameters,
+    px4_draft,
+    read_parameters,
+)
 
 
 def value(vehicle, simulator=SIH):

@@ -15,7 +15,6 @@ from tuner.exporters.draft import write
 from tuner.exporters.sdf.composite import Inertial, Pose, base_for, pose_of, together
 from tuner.exporters.sdf.model import read_model
 from tuner.exporters.sdf.patch import sdf_draft
-from tuner.exporters.sdf.snippet import snippet_draft
 from tuner.exporters.sdf.spans import (
     Edit,
     append_child,
@@ -29,7 +28,7 @@ from tuner.exporters.sdf.spans import (
 from tuner.exporters.sdf.tags import carried_values, composite, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
 from tuner.exporters.target import Choices, not_carried, target_of
-from tuner.exporters.targets.sdf import TARGET
+from tuner.exporters.targets.sdf import TARGET, snippet_draft
 from tuner.vehicle import REGISTRY, Written, values_of
 
 CLASSIC, GZ, TEMPLATE = (

@@ -15,7 +15,7 @@ from tuner.core.disk import file_name
 from tuner.core.numerics import GRAVITY
 from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, Gate, differences, read_file
-from tuner.exporters.elsewhere import flier
+from tuner.exporters.flier import flier
 from tuner.exporters.hover import rotor_speed, thrust_at
 from tuner.exporters.simulators import DRONE_MODELS
 from tuner.exporters.target import Choices, Target
@@ -114,7 +114,7 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
     inverse = np.linalg.inv(arrays["J"])
 
     class Flying:
-        """As of `tuner.exporters.elsewhere.Body`."""
+        """As of `tuner.exporters.flier.Body`."""
 
         def __init__(self, step: float) -> None:
             self.period, self.state = step, np.zeros(17)

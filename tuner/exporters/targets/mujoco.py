@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
 from tuner.exporters.draft import Draft, differences, read_file
-from tuner.exporters.elsewhere import flier
+from tuner.exporters.flier import flier
 from tuner.exporters.hover import full_thrust, rotor_speed, thrust_at
 from tuner.exporters.simulators import MUJOCO, drag_at_hover
 from tuner.exporters.target import Choices, Target
@@ -150,7 +150,7 @@ def _flier(text: str, vehicle: VehicleFile) -> Callable[..., Any] | None:
     count, constant = len(vehicle.rotors), vehicle.aerodynamics.motor_constant
 
     class Flying:
-        """As of `tuner.exporters.elsewhere.Body`."""
+        """As of `tuner.exporters.flier.Body`."""
 
         def __init__(self, step: float) -> None:
             model.opt.timestep = step

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, differences, read_file
-from tuner.exporters.elsewhere import flier
+from tuner.exporters.flier import flier
 from tuner.exporters.hover import rotor_speed
 from tuner.exporters.simulators import ROTORPY
 from tuner.exporters.target import Choices, Target
@@ -95,7 +95,7 @@ def _flier(params: dict[str, Any]) -> Callable[..., Any] | None:
     }
 
     class Flying:
-        """As of `tuner.exporters.elsewhere.Body`."""
+        """As of `tuner.exporters.flier.Body`."""
 
         def __init__(self, step: float) -> None:
             self.vehicle, self.period = Multirotor(arrays), step

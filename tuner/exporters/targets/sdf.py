@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from tuner.exporters.draft import Draft
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined
+
+from tuner.exporters.draft import Draft, differences, read_file
+from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
-from tuner.exporters.sdf.snippet import snippet_draft
-from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
+from tuner.exporters.sdf.tags import values_in
+from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
 from tuner.exporters.target import Choices, Target
 from tuner.vehicle import VehicleFile
+
+TEMPLATE = Path(__file__).parents[1] / "sdf" / "snippet.sdf.jinja"
 
 
 def sdf_or_snippet(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
@@ -16,6 +23,68 @@ def sdf_or_snippet(vehicle: VehicleFile, provenance: str, choices: Choices) -> D
         simulator = GZ_SIM if choices.simulator == GZ_SIM.name else GAZEBO_CLASSIC
         return snippet_draft(vehicle, simulator, provenance)
     return sdf_draft(choices.into, vehicle, provenance)
+
+
+def snippet_draft(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> Draft:
+    """Return inertial, motor plugins and, for Gazebo classic, control channels of a vehicle.
+
+    Parameters
+    ----------
+    vehicle
+        Whose coefficients.
+    simulator
+        Whose plugins.
+    provenance
+        One line that says where they come from.
+    """
+
+    def held_by(text: str, path: Path) -> dict[str, float]:
+        model = f"<model><link name='base_link'>{text}</link></model>"
+        return values_in(model, path, vehicle)
+
+    notes = tags.lost_in(vehicle)
+    vehicle = simulator.flown(vehicle)
+    unit = gz_unit(vehicle) if simulator is GZ_SIM else 1.0
+    vehicle = with_speeds_in(vehicle, unit)
+    wanted = tags.carried_values(vehicle, channels=simulator is not GZ_SIM)
+    text = _text(vehicle, simulator, provenance)
+    return Draft(
+        text,
+        with_speeds_in(tags.as_flown(vehicle, wanted | held_by(text, TEMPLATE)), 1.0 / unit),
+        notes,
+        lambda path: differences(wanted, held_by(read_file(path), path)),
+    )
+
+
+def _text(vehicle: VehicleFile, simulator: Simulator, provenance: str) -> str:
+    environment = Environment(
+        undefined=StrictUndefined, keep_trailing_newline=True, autoescape=True
+    )
+    inertia, uneven, centre = (
+        vehicle.inertia,
+        tags.motor_constants(vehicle),
+        tags.center_of_mass(vehicle),
+    )
+    motor = {tag: tags.as_text(value) for tag, value in tags.values(vehicle, "motor").items()}
+    motors = [
+        motor
+        if uneven is None
+        else motor | {tags.MOTOR_CONSTANT: tags.as_text(uneven[tags.of_rotor(index)])}
+        for index in range(len(vehicle.rotors))
+    ]
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        provenance=provenance.replace("--", "- -"),
+        simulator=simulator.name,
+        mass=tags.as_text(vehicle.mass),
+        ixx=tags.as_text(inertia.xx),
+        iyy=tags.as_text(inertia.yy),
+        izz=tags.as_text(inertia.zz),
+        center_of_mass=None if centre is None else " ".join(map(tags.as_text, centre)),
+        rotors=list(zip(vehicle.rotors, motors, strict=True)),
+        channel={
+            tag: tags.as_text(value) for tag, value in tags.values(vehicle, "channel").items()
+        },
+    )
 
 
 TARGET = Target(
