@@ -20,7 +20,7 @@ from tuner.exporters.simulators import GAZEBO_CLASSIC
 from tuner.objective.criterion import Point
 from tuner.objective.normal import with_conditions
 from tuner.result import PoseRmse
-from tuner.terms.candidates import extended
+from tuner.terms.candidates import with_terms
 from tuner.vehicle import values_of
 
 DRAG = 0.04
@@ -119,8 +119,11 @@ def test_coefficients_stand_in_for_a_term_that_is_lost_and_the_set_up_stays():
 
 def test_nothing_free_is_nothing_refitted(fit):
     job, fitted = fit
-    job, fitted = extended(job, fitted, ("fuselage_drag",))
-    held = {name: name for name in job.space.names}
+    objective, point = with_terms(
+        fitted.objective, fitted.point, ("fuselage_drag",), job.settings.job
+    )
+    fitted = replace(fitted, objective=objective, point=point)
+    held = {name: name for name in objective.space.names}
     vehicle = vehicle_file().replace(effects={"fuselage_drag": DRAG})
     bare = GAZEBO_CLASSIC.lacking(vehicle, ["fuselage_drag"])
     _, effective = refitted(
