@@ -26,6 +26,7 @@ from tuner.service.service import Service
 from tuner.service.shapes import API, Problem
 from tuner.service.web.pages import web
 from tuner.service.web.rendering import render
+from tuner.service.words import over_http
 
 logger = logging.getLogger(__name__)
 
@@ -125,6 +126,7 @@ def _problem(request: Request, status: int, where: str, what: str, remedy: str) 
     detail = " ".join(f"{where}: {what}; {remedy}".split())
     if _is_for_people(request):
         return render("problem.html.jinja", status, title="This does not work", sentence=detail)
+    where, what, remedy, detail = map(over_http, (where, what, remedy, detail))
     problem = Problem(where=where, what=what, remedy=remedy, detail=detail)
     headers = {"retry-after": "5"} if status in (429, 503) else {}
     if status == 401:

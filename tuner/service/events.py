@@ -14,6 +14,7 @@ from tuner.service.errors import ServiceError
 from tuner.service.service import Service
 from tuner.service.shapes import JobAnswer
 from tuner.service.tables import EventRow, JobRow
+from tuner.service.words import over_http
 
 LOOK = 0.5
 """s between two looks into the table"""
@@ -35,7 +36,10 @@ async def follow(service: Service, job: str, after: int) -> AsyncIterator[str]:
             yield _event("problem", {"detail": str(error)})
             return
         for event in new:
-            yield _event(event.kind, event.content, event.number)
+            content = dict(event.content)
+            if event.kind == "message":
+                content["text"] = over_http(str(content["text"]))
+            yield _event(event.kind, content, event.number)
             after = event.number
         standing = JobAnswer.model_validate(row).model_dump_json()
         if standing != shown:

@@ -6,9 +6,10 @@ import datetime
 from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
 from tuner.service.tables import EventRow, FileRow, JobRow, RecordingRow, State
+from tuner.service.words import over_http
 
 API = "/api/v1"
 
@@ -79,7 +80,7 @@ class JobAnswer(BaseModel):
     submitted: Moment
     started: Moment | None
     ended: Moment | None
-    error: str | None
+    error: Annotated[str | None, AfterValidator(lambda text: text and over_http(text))]
     exit_status: int | None
     files: Annotated[
         list[str],
@@ -185,6 +186,6 @@ def full_job(row: JobRow, events: Sequence[EventRow]) -> FullJobAnswer:
             FlightAnswer(id=flight.sha256, name=flight.name, holdout=flight.holdout)
             for flight in row.flights
         ],
-        log=[str(event.content["text"]) for event in events if event.kind == "message"],
+        log=[over_http(str(e.content["text"])) for e in events if e.kind == "message"],
         links=links(row, answer.files),
     )

@@ -19,7 +19,7 @@ from tuner.service import errors, inspection, recordings
 from tuner.service import upload as upload_module
 from tuner.service.service import Service
 from tuner.service.settings import MIB
-from tuner.service.web.words import FIELDS, on_the_web
+from tuner.service.words import FIELDS, on_the_web, over_http
 
 BAG = FLIGHTS / "yaw_spin_3rps.bag"
 
@@ -265,6 +265,13 @@ def test_a_card_has_the_page_s_fields_in_place_of_options(client):
 )
 def test_options_become_fields_of_the_page(text, words):
     assert on_the_web(text) == words
+
+
+def test_over_http_a_message_names_the_keys_of_a_request():
+    assert over_http("--holdout: holds out all; use --config FILE") == (
+        "holdout: holds out all; use settings FILE"
+    )
+    assert "--" not in over_http("fix it with --fix mass, or use --force and --cross-validate")
 
 
 def test_every_option_that_becomes_a_field_is_one():

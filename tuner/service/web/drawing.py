@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from tuner.service.shapes import CoefficientHistory, Point
 
-WIDTH, HEIGHT = 640.0, 240.0
-LEFT, RIGHT, TOP, BOTTOM = 92.0, 12.0, 10.0, 28.0
+WIDTH, HEIGHT = 640.0, 270.0
+LEFT, RIGHT, TOP, BOTTOM = 92.0, 12.0, 28.0, 46.0
 MOST_POINTS = 600
 """Points of a curve: more would not be seen."""
 

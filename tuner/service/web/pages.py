@@ -37,7 +37,7 @@ from tuner.service.tables import JobRow, RecordingRow, State
 from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render
-from tuner.service.web.words import on_the_web
+from tuner.service.words import on_the_web
 
 web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -14,7 +14,7 @@ from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
 from tuner.service.tables import State
-from tuner.service.web.words import on_the_web
+from tuner.service.words import on_the_web
 
 #: State -> what is said of it, and the class of its badge, as the report's verdicts have.
 STATES: Mapping[str, tuple[str, str]] = {
