@@ -89,11 +89,11 @@ def effective_fit(
     comparisons: dict[frozenset[str], Comparison] = {}
 
     def flown(flying: VehicleFile, missing: Collection[str]) -> dict[str, AxesRmse]:
-        around = frozenset(missing).intersection(fitted.objective.conditions)
-        if around not in comparisons:
-            still = replace(fitted, point=_without_conditions(fitted, around))
-            comparisons[around] = comparison_of(job, still)
-        errors = comparisons[around].fly(flying, computed=_effects(names))
+        conditions = frozenset(missing).intersection(fitted.objective.conditions)
+        if conditions not in comparisons:
+            still = replace(fitted, point=_without_conditions(fitted, conditions))
+            comparisons[conditions] = comparison_of(job, still)
+        errors = comparisons[conditions].fly(flying, computed=_effects(names))
         return {name: flight.rmse for name, flight in errors.items()}
 
     def over_flights(rmse: Mapping[str, AxesRmse]) -> PoseRmse:
@@ -124,11 +124,11 @@ def effective_fit(
 def lost_terms(vehicle: VehicleFile, fitted: Fitted) -> dict[str, tuple[str, ...]]:
     """Return group -> its coefficients that act and that Gazebo flies at another value."""
     rows = np.asarray(fitted.point.offsets)[len(OFFSETS) :]
-    around = {
+    conditions = {
         name: float(np.abs(row).max())
         for name, row in zip(fitted.objective.conditions, rows, strict=True)
     }
-    return GAZEBO_CLASSIC.lost(values_of(vehicle) | around)
+    return GAZEBO_CLASSIC.lost(values_of(vehicle) | conditions)
 
 
 def carried_terms(vehicle: VehicleFile) -> tuple[str, ...]:
@@ -238,7 +238,7 @@ def _about(parameter: Parameter, value: float) -> Parameter:
 
 
 def _without_conditions(fitted: Fitted, names: Collection[str]) -> Point:
-    """Return a fit's point where some of what surrounds its flights is not there."""
+    """Return a fit's point without some of its per-flight conditions."""
     of_flight = fitted.objective.of_flight
     keep = np.array([name not in names for name in of_flight])
     return Point(fitted.point.coefficients, fitted.point.offsets * keep[:, None])

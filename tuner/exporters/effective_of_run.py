@@ -162,12 +162,12 @@ def lost_terms(
 
     What its laws change beside them is a group of its own, without coefficients.
     """
-    around = {
+    conditions = {
         name: max(abs(recording.conditions.get(name, 0.0)) for recording in recordings)
         for recording in recordings
         for name in recording.conditions
     }
-    groups = simulator.lost(values_of(vehicle) | around)
+    groups = simulator.lost(values_of(vehicle) | conditions)
     if not same_flight(simulator.laws(vehicle), vehicle):
         groups[LAWS] = ()
     return groups
@@ -224,12 +224,12 @@ def _fit(
     recordings: tuple[Recording, ...],
 ) -> tuple[dict[str, float], bool]:
     """Return the values of free coefficients that meet the flights best."""
-    around = tuple(sorted({name for r in recordings for name in r.conditions}))
+    conditions = tuple(sorted({name for r in recordings for name in r.conditions}))
     old = settings.job
     job = JobFile(
         free=tuple(free),
         ties=tuple(tie for tie in simulator.ties if set(tie) <= set(free)),
-        terms=around or "none",
+        terms=conditions or "none",
         disturbances="none",
         channels=old.channels,
         weights=old.weights,

@@ -1,4 +1,4 @@
-"""The content of ``bench.json``: what the experiments said, for a fit's prior and in sentences."""
+"""The content of ``bench.json``: what the experiments gave, for a fit's prior and in sentences."""
 
 from __future__ import annotations
 

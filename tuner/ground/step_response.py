@@ -28,7 +28,7 @@ GUESSES = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """Time constants, s, from the best of which the fit begins."""
 EARLIEST = 0.05
 """s by which a speed may react before its command's stamp, where two loggers wrote them."""
-TOLD = 2.0
+REPORT_ABOVE = 2.0
 """Standard errors by which it must do so for a remark."""
 MOST_STEPS = 200
 MOST = 12_000
@@ -92,12 +92,12 @@ def step_response(name: str, path: str, samples: Mapping[str, Array]) -> Measure
     covariance[2, 2] += interval**2 / 12
     latency = delay + 0.5 * interval
     early = max(-latency, 0.0)
-    told = early > TOLD * math.sqrt(covariance[2, 2])
+    reported = early > REPORT_ABOVE * math.sqrt(covariance[2, 2])
     covariance[2, 2] += early**2  # clocks that differ may do so in either direction
     outliers = int((~kept).sum())
     numbers = {"up": int(rises.sum()), "down": int((~rises).sum()), "outliers": outliers}
     remarks = [Remark("steps", numbers)]
-    if told:
+    if reported:
         remarks.append(Remark("command_late", {"seconds": early}))
     richer = _fit(steps, speed, kept, lags, second=True)
     plain = steps.simulated(lags, speed, kept)

@@ -14,7 +14,15 @@ from itertools import pairwise
 import numpy as np
 
 from tuner.recordings.flight import Array, Series
-from tuner.recordings.interpolation import RATE, alike, body_rate_of, on_clock, rms, smooth, stretch
+from tuner.recordings.interpolation import (
+    RATE,
+    body_rate_of,
+    correlation,
+    on_clock,
+    rms,
+    smooth,
+    stretch,
+)
 from tuner.recordings.notes import Kind, Note, NoteCode
 from tuner.recordings.recording import Nanoseconds, Samples
 
@@ -40,7 +48,7 @@ ALIKE = 0.6
 WINDOW = 0.1
 
 
-def believe(
+def message_times(
     samples: Mapping[str, Samples],
     receive_only: Collection[str] = (),
     unhurried: Collection[str] = (),
@@ -253,7 +261,7 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
 def _shifted(late: Array, early: Array, lag: int) -> float:
     """Return how alike two signals are when the first is moved back by some samples."""
     n = len(late)
-    return alike(late[max(0, lag) : n + min(0, lag)], early[max(0, -lag) : n - max(0, lag)])
+    return correlation(late[max(0, lag) : n + min(0, lag)], early[max(0, -lag) : n - max(0, lag)])
 
 
 def align_pose(

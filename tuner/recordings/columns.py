@@ -222,17 +222,17 @@ def recognised(columns: Sequence[str], units: Mapping[str, str]) -> dict[str, Fo
     units
         Column -> unit, of a row of units.
     """
-    said = {name: guess(name, units.get(name)) for name in columns}
-    times = [name for name, g in said.items() if g and g.signal == "time"]
+    guesses = {name: guess(name, units.get(name)) for name in columns}
+    times = [name for name, g in guesses.items() if g and g.signal == "time"]
     stamps = [name for name in times if name.endswith("header.stamp")]  # rather than of recording
     time = next(iter((*stamps, *times)), None)
     found = {}
     if time is not None:
-        known = said[time]
+        known = guesses[time]
         found["time"] = Found((time,), known.unit if known else None, "")
     for signal, axes in AXES.items():
         groups: dict[str, dict[str, str]] = {}
-        for name, g in said.items():
+        for name, g in guesses.items():
             if g is not None and g.signal == signal:
                 groups.setdefault(g.group, {}).setdefault(g.axis, name)
         for group, held in sorted(groups.items(), key=lambda item: _rank(item[0])):
@@ -244,8 +244,8 @@ def recognised(columns: Sequence[str], units: Mapping[str, str]) -> dict[str, Fo
             )
             if wanted is not None:
                 names = tuple(held[axis] for axis in wanted)
-                told = {g.unit for name in names if (g := said[name]) is not None}
-                found[signal] = Found(names, told.pop() if len(told) == 1 else None, group)
+                written = {g.unit for name in names if (g := guesses[name]) is not None}
+                found[signal] = Found(names, written.pop() if len(written) == 1 else None, group)
                 break
     if "attitude" in found:
         found.pop("angles", None)

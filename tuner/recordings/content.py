@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.clocks import align_pose, believe
+from tuner.recordings.clocks import align_pose, message_times
 from tuner.recordings.defects import clean, without_stale
 from tuner.recordings.flight import SIGNALS, Array, Series
 from tuner.recordings.formats import is_tabular, open_recording
@@ -385,9 +385,9 @@ def extract(
     receive_only = {p.topic for p in places.values() if p.source.stamp == "receive"}
     kinds = {t: {s for s, place in places.items() if place.topic == t} for t in wanted}
     unhurried = {topic for topic, held in kinds.items() if held <= UNHURRIED}
-    times, notes = believe(contents.samples, receive_only, unhurried)
+    times, notes = message_times(contents.samples, receive_only, unhurried)
     signals: dict[str, Raw] = {}
-    told: list[Note] = []
+    inferred: list[Note] = []
     for signal in sorted(places, key=lambda name: name in ATTITUDES):  # which positions may tell
         place = places[signal]
         samples = contents.samples.get(place.topic)
@@ -398,7 +398,7 @@ def extract(
         unit = _unit(recording, signal, place, raw, signals.get("position"))
         if unit != place.unit:
             count, names = len(time), (signal, NAMES[unit])
-            told.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
+            inferred.append(Note(NoteCode.UNIT_READ, "warning", place.topic, count, names=names))
         values = _values(samples, signal, place, to_si(values, unit))
         if is_tabular(recording.format):  # a row without the signal is no sample of it
             there = np.isfinite(values).any(axis=1)
@@ -406,7 +406,7 @@ def extract(
         if len(time):
             signals[signal] = Raw(place.topic, time, values)
     ordered = {signal: signals[signal] for signal in places if signal in signals}
-    return ordered, contents, (*notes, *told)
+    return ordered, contents, (*notes, *inferred)
 
 
 def _columns(samples: Samples, signal: str, place: Place) -> Array:

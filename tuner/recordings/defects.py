@@ -120,7 +120,7 @@ def clean(
         time, values, odd = _unit_quaternions(time, values)
         note(odd, NoteCode.NO_UNIT_QUATERNION)
 
-    if signal in HONEST:
+    if signal in LIMITS:
         time, values = _without_outliers(signal, time, values, note)
     return time, values, tuple(notes)
 
@@ -129,18 +129,18 @@ def _without_outliers(
     signal: str, time: Array, values: Array, note: Callable[..., None]
 ) -> tuple[Array, Array]:
     """Drop what cannot be true, and note it."""
-    honest = HONEST[signal]
+    limits = LIMITS[signal]
     if signal in ("position", "attitude"):
-        stuck = frozen(time, values, honest)
+        stuck = repeated(time, values, limits)
         note(int(stuck.sum()), NoteCode.REPEATED)
-        away, lasting = excursions(time[~stuck], values[~stuck], honest)
+        away, lasting = excursions(time[~stuck], values[~stuck], limits)
         note(int(away.sum()), NoteCode.AWAY_AND_BACK)
         note(lasting, NoteCode.AWAY_FOR_GOOD, "warning")
         time, values = time[~stuck][~away], values[~stuck][~away]
     outlier = np.zeros(values.shape, dtype=np.bool_)
     for column in range(values.shape[1]):
         measured = np.flatnonzero(np.isfinite(values[:, column]))
-        outlier[measured, column] = sticking_out(time[measured], values[measured, column], honest)
+        outlier[measured, column] = outliers(time[measured], values[measured, column], limits)
     note(int(outlier.any(axis=1).sum()), NoteCode.OUTLIERS)
     if signal == "rotor_speed":
         values = np.where(outlier, np.nan, values)
@@ -192,7 +192,7 @@ def _unit_quaternions(time: Array, values: Array) -> tuple[Array, Array, int]:
 
 
 @dataclass(frozen=True)
-class Honest:
+class Limits:
     """How far noise and honest motion take a sample from its neighbours.
 
     Attributes
@@ -219,16 +219,16 @@ class Honest:
         return max(self.floor, self.share * level)
 
 
-HONEST: Mapping[str, Honest] = {
-    "position": Honest(floor=0.02, curvature=30.0, jump=0.08),
-    "attitude": Honest(floor=0.03, curvature=100.0, jump=0.15),
-    "rotor_speed": Honest(floor=30.0, share=0.05),
+LIMITS: Mapping[str, Limits] = {
+    "position": Limits(floor=0.02, curvature=30.0, jump=0.08),
+    "attitude": Limits(floor=0.03, curvature=100.0, jump=0.15),
+    "rotor_speed": Limits(floor=30.0, share=0.05),
 }
 """Signals with an outlier test. A quadcopter reaches 3 g; its quaternion bends by half the angular
 acceleration; a rotor that turns at some 600 rad/s needs tens of ms for 30 up and back."""
 
 
-def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
+def outliers(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     """Return which samples of a signal stick out on one side of all that surrounds them.
 
     A sample is compared with the medians of the three samples before and the three after it. Ramps
@@ -241,7 +241,7 @@ def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_
         (n,) s, strictly increasing.
     values
         (n,) one column.
-    honest
+    limits
         What the signal may do by itself.
     """
     if len(values) < 7:
@@ -255,7 +255,7 @@ def sticking_out(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_
     excess = np.maximum(np.maximum(low - values, values - high), 0.0)
     rough = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 12, mode="symmetric"), 25)
     apart = np.pad((time[4:] - time[:-4]) / 4, 2, mode="edge")
-    bound = honest.floor_of(values) + 2 * honest.curvature * apart**2
+    bound = limits.floor_of(values) + 2 * limits.curvature * apart**2
     usual = np.sort(rough, axis=1)[:, 20]  # the fifth largest of 25
     return np.asarray(excess > np.maximum(bound, THRESHOLD * usual), dtype=np.bool_)
 
@@ -265,7 +265,7 @@ def _middle(a: Array, b: Array, c: Array) -> Array:
     return np.asarray(np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c)))
 
 
-def frozen(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
+def repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     """Return which samples of (n, k) values repeat the one before although the vehicle moved on.
 
     Motion capture that loses its markers goes on sending the last pose. A vehicle at rest in a
@@ -280,12 +280,12 @@ def frozen(time: Array, values: Array, honest: Honest) -> NDArray[np.bool_]:
         if behind - first < 3 or behind >= len(values):
             continue
         leap = np.abs(values[behind] - values[behind - 1]).max()
-        usual = honest.floor / 4 + honest.curvature * (time[behind] - time[behind - 1]) ** 2
+        usual = limits.floor / 4 + limits.curvature * (time[behind] - time[behind - 1]) ** 2
         stuck[first:behind] = leap > usual
     return stuck
 
 
-def excursions(time: Array, values: Array, honest: Honest) -> tuple[NDArray[np.bool_], int]:
+def excursions(time: Array, values: Array, limits: Limits) -> tuple[NDArray[np.bool_], int]:
     """Return which samples of (n, k) values lie between a leap away and the leap back.
 
     Returns
@@ -298,14 +298,14 @@ def excursions(time: Array, values: Array, honest: Honest) -> tuple[NDArray[np.b
         return away, 0
     span = np.diff(time)
     speed = np.diff(values, axis=0) / span[:, None]
-    if np.abs(np.diff(speed, axis=0) * span[1:, None]).max() < honest.jump / 4:
+    if np.abs(np.diff(speed, axis=0) * span[1:, None]).max() < limits.jump / 4:
         return away, 0  # nothing leaps at all, and running medians take their time
     windows = np.lib.stride_tricks.sliding_window_view(
         np.pad(speed, ((5, 5), (0, 0)), mode="edge"), 11, axis=0
     )
     leap = np.diff(values, axis=0) - np.median(windows, axis=2) * span[:, None]
     size = np.sqrt((leap**2).sum(axis=1))
-    at = np.flatnonzero(size > honest.jump + honest.curvature * span**2)
+    at = np.flatnonzero(size > limits.jump + limits.curvature * span**2)
     lasting = 0
     i = 0
     while i < len(at):
@@ -314,7 +314,7 @@ def excursions(time: Array, values: Array, honest: Honest) -> tuple[NDArray[np.b
                 j
                 for j in range(i + 1, min(len(at), i + 40))
                 if time[at[j]] - time[at[i]] < AWAY
-                and np.linalg.norm(leap[at[i]] + leap[at[j]]) < 0.3 * size[at[i]] + honest.floor
+                and np.linalg.norm(leap[at[i]] + leap[at[j]]) < 0.3 * size[at[i]] + limits.floor
             ),
             None,
         )

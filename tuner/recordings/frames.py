@@ -18,8 +18,8 @@ import numpy as np
 from tuner.core.numerics import GRAVITY
 from tuner.recordings.flight import Array, Series
 from tuner.recordings.interpolation import (
-    alike,
     body_rate_of,
+    correlation,
     derivative,
     on_clock,
     rms,
@@ -123,12 +123,12 @@ def _judge_attitude(series: Mapping[str, Series], clock: Array) -> _Judgement:
         up = upward(turned)
         scores = []
         if rms(push[:, :2]) > ENOUGH_PUSH:
-            scores.append(alike(smooth(up[:, :2], 0.2), push[:, :2]))
+            scores.append(correlation(smooth(up[:, :2], 0.2), push[:, :2]))
         if gyro is not None and rms(gyro) > ENOUGH_TURNING:
             # The gyro's own axes may be wrong too, though two errors are less likely than one.
             turning = smooth(body_rate_of(turned))
-            in_flu = alike(turning, smooth(gyro))
-            in_frd = alike(turning, smooth(_RATES[0].read(gyro)))
+            in_flu = correlation(turning, smooth(gyro))
+            in_frd = correlation(turning, smooth(_RATES[0].read(gyro)))
             scores.append(max(in_flu, in_frd - UNLIKELY))
         carried = up if force is None else rotate(turned, force) / GRAVITY
         upright = float(np.nanmean(carried[:, 2]))
@@ -178,7 +178,7 @@ def _judge_rate(series: Mapping[str, Series], clock: Array) -> _Judgement:
     here = _left(turning, gyro)
     best = min(_RATES, key=lambda r: _left(turning, r.read(gyro)))
     there = _left(turning, best.read(gyro))
-    of_another_unit = there < here / 20 and alike(turning, best.read(gyro)) > GOOD
+    of_another_unit = there < here / 20 and correlation(turning, best.read(gyro)) > GOOD
     if (there < 0.7 and there < here / 2) or of_another_unit:
         return best, None
     doubt = Note(NoteCode.BODY_RATE_DOUBTED, numbers={"left": here})
@@ -200,7 +200,7 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     moving, velocity = _moving(series, clock)
     if min(rms(moving), rms(velocity)) < ENOUGH_SPEED:
         return None, None
-    fit = alike(moving, velocity)
+    fit = correlation(moving, velocity)
     if fit > 0.8:
         return None, None
     measured = series["velocity"]
@@ -209,8 +209,8 @@ def _judge_velocity(series: Mapping[str, Series], clock: Array) -> _Judgement:
     in_body = Reading("in body axes", lambda _: rotate(at_samples, measured.values))
     ned = Reading("in NED axes", lambda v: to_enu_flu(v, "velocity"))
     fits = {
-        in_body: alike(moving, rotate(on_clock(series, "attitude", clock), velocity)),
-        ned: alike(moving, to_enu_flu(velocity, "velocity")),
+        in_body: correlation(moving, rotate(on_clock(series, "attitude", clock), velocity)),
+        ned: correlation(moving, to_enu_flu(velocity, "velocity")),
     }
     best = max(fits, key=lambda r: fits[r])
     if fits[best] > max(0.8, fit + 0.15):
@@ -242,13 +242,13 @@ def contradiction(series: Mapping[str, Series], missions: Sequence[Mission]) -> 
 
 
 def noted_contradiction(notes: Sequence[Note]) -> Note | None:
-    """Return what `contradiction` said when a recording was read."""
+    """Return the contradiction that was noted when a recording was read."""
     return next((note for note in notes if note.code is NoteCode.CONTRADICTED), None)
 
 
 def _opposed(derived: Array, recorded: Array, plenty: float) -> float | None:
     """Return how alike two signals are, if they are opposites and larger than what is plenty."""
-    agreement = alike(derived, recorded)
+    agreement = correlation(derived, recorded)
     return agreement if agreement < AGAINST and min(rms(derived), rms(recorded)) > plenty else None
 
 
@@ -258,13 +258,13 @@ def _leaning(series: Mapping[str, Series]) -> float | None:
         Stamped(series[name].time, series[name].values) for name in ("position", "attitude")
     )
     pull, tilt = pull_and_tilt(position, attitude)
-    agreement, pushed, leant = alike(pull, tilt), rms(pull), GRAVITY * rms(tilt)
+    agreement, pushed, leant = correlation(pull, tilt), rms(pull), GRAVITY * rms(tilt)
     if pushed < PUSH or leant < PUSH:
         return None
     if agreement < AGAINST:
         return agreement
     alike_in_size = 1 / COMMENSURATE < pushed / leant < COMMENSURATE
-    moves = alike(pull[1:], pull[:-1]) > LASTING
+    moves = correlation(pull[1:], pull[:-1]) > LASTING
     return agreement if abs(agreement) < UNRELATED and alike_in_size and moves else None
 
 

@@ -150,7 +150,7 @@ def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
 
 
 def _with_signals(read: Signals) -> Inspection:
-    """Return what is said of a recording's topics and signals, whatever they make."""
+    """Return the report of a recording's topics and signals, whatever they make."""
     recording, samples = read.recording, read.samples
     times = [s.receive for s in samples.values() if len(s.receive)]
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)

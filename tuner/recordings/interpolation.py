@@ -179,7 +179,7 @@ def body_rate_from(q: Array, turning: Array) -> Array:
     )
 
 
-def alike(a: Array, b: Array) -> float:
+def correlation(a: Array, b: Array) -> float:
     """Return the correlation of two (n, k) signals over all their columns, -1..1."""
     known = np.isfinite(a).all(axis=1) & np.isfinite(b).all(axis=1)
     if known.sum() < 20:

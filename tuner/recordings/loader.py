@@ -58,9 +58,9 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
-    around = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
+    nearby = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
     until = mission.end - start + 1e-6
-    mission_series = {name: data.between(-np.inf, until) for name, data in around.items()}
+    mission_series = {name: data.between(-np.inf, until) for name, data in nearby.items()}
     mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
     ticks = dataclasses.replace(grid, origin=grid.origin - start) if grid else None
     notes = list(content.notes)
@@ -71,7 +71,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         notes.append(Note(NoteCode.ONE_OF_SEVERAL, "info", count=of, numbers=number))
     if not mission.fitted:
         notes.append(Note(NoteCode.NOT_CHOSEN, "info"))
-    signals = {name: _on_clock(name, around[name], clock, ticks) for name in mission_series}
+    signals = {name: _on_clock(name, nearby[name], clock, ticks) for name in mission_series}
     notes.extend(gaps_in(signals, mission_series, rate))
     spin = yaw_spin(mission_series.get("rate_setpoint"), 0.0, float(clock[-1]))
     return Flight(
@@ -82,7 +82,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         time=clock,
         signals=signals,
         series=mission_series,
-        initial=initial_state(around),
+        initial=initial_state(nearby),
         yaw_rate_setpoint=None if spin is None else spin.yaw_rate,
         level_held=spin is not None and spin.level_held,
         trajectory=options.sidecar.trajectory,

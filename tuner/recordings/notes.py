@@ -17,7 +17,7 @@ class Worded(StrEnum):
 
     text: str
 
-    def __new__(cls, value: str, text: str) -> Self:
+    def __new__(cls, value: str, text: str = "") -> Self:
         """Keep the text beside the code."""
         code = str.__new__(cls, value)
         code._value_, code.text = value, text

@@ -49,18 +49,18 @@ def suggested_map(path: Path) -> str:
         about = "unit" if unit else "its unit is told by its step"
         field = {"field": known["time"].fields[0], **({"unit": unit} if unit else {})}
         lines = [f"time: {_inline(field)}      # by its name; {about}"]
-    found, why, told = {}, {}, _told(path)
+    found, why, inferred = {}, {}, _inferred(path)
     for name, columns_of in known.items():
         if name != "time":
             signal = "attitude" if name == "angles" else name
             found[signal] = source_of(name, columns_of)
-            why[signal] = "by the names" + _of_unit(columns_of.unit, told.get(signal), name)
+            why[signal] = "by the names" + _of_unit(columns_of.unit, inferred.get(signal), name)
     taken = {field for columns_of in known.values() for field in columns_of.fields}
     lines.insert(0, f"format: {recording.format}")
     return _text(path, lines, found, why, [c for c in columns if c not in taken])
 
 
-def _told(path: Path) -> dict[str, str]:
+def _inferred(path: Path) -> dict[str, str]:
     """Return in which units signals are by their numbers: signal -> words."""
     with contextlib.suppress(RecordingError):
         notes = read_content(ReadOptions(path)).notes
@@ -69,9 +69,9 @@ def _told(path: Path) -> dict[str, str]:
     return {}
 
 
-def _of_unit(unit: str | None, told: str | None, name: str) -> str:
-    if told:
-        return f"; by the numbers {told}"
+def _of_unit(unit: str | None, inferred: str | None, name: str) -> str:
+    if inferred:
+        return f"; by the numbers {inferred}"
     if unit or name == "attitude":
         return ""
     return "; no unit among them: SI as it seems, add it if that is wrong"

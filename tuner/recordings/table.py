@@ -69,8 +69,8 @@ class Table(TabularRecording):
         names = list(dict.fromkeys([clock.field, *request.fields]))
         table = self._read(names)
         fields = {name: numbers_of(table.column(name)) for name in request.fields}
-        time, told = read_times(self.path, table.column(clock.field), clock, fields.values())
-        notes = list(told)
+        time, noted = read_times(self.path, table.column(clock.field), clock, fields.values())
+        notes = list(noted)
         damage = [Damage(Cause.ROWS_MALFORMED, lost=self._skipped)] if self._skipped else []
         kept = time != NEVER
         if not kept.all():

@@ -1,7 +1,7 @@
-"""Units that no topic map gives, told by physics and by the range of the numbers.
+"""Units that no topic map gives, inferred from physics and from the range of the numbers.
 
 What is certain is read so; what is not stays as it is, and is asked for where it matters. The unit
-of lengths is told by gravity: a multirotor is pushed along its thrust and pulled down by gravity,
+of lengths follows from gravity: a multirotor is pushed along its thrust and pulled down by gravity,
 so that its recorded attitude alone says how fast it accelerates:
 
     a_xy = (g + a_z) t
@@ -68,7 +68,7 @@ NAMES = {
     "pwm_16bit": "of 16 bits",
     "signed": "from -1 to 1",
 }
-"""Units that are told, and how a sentence calls them."""
+"""Units that are inferred, and how a sentence calls them."""
 FORCE = (0.75, 1.4)
 """How far a steady specific force, as recorded, is from gravity, of a vehicle that flies or
 stands."""
@@ -252,11 +252,11 @@ def _share_a_unit(position: Stamped, speed: Stamped) -> bool:
     centres = _centres(position, speed)
     if len(centres) < 2:
         return False
-    moved, said = np.gradient(_binned(position, centres), BIN, axis=0), _binned(speed, centres)
-    known = np.isfinite(moved).all(axis=1) & np.isfinite(said).all(axis=1)
+    moved, speeds = np.gradient(_binned(position, centres), BIN, axis=0), _binned(speed, centres)
+    known = np.isfinite(moved).all(axis=1) & np.isfinite(speeds).all(axis=1)
     if not known.any():
         return False
-    lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, said))
+    lengths = (np.median(np.linalg.norm(values[known], axis=1)) for values in (moved, speeds))
     slower, faster = sorted(lengths)
     return bool(faster < SAME * slower)
 

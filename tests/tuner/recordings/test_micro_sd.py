@@ -15,7 +15,7 @@ from tests.tuner.recordings.micro_sd import log_of, write_micro_sd
 from tuner.core.errors import RecordingError
 from tuner.recordings import inspect_recordings, load_flight
 from tuner.recordings.formats import open_recording
-from tuner.recordings.interpolation import alike, body_rate_of, smooth
+from tuner.recordings.interpolation import body_rate_of, correlation, smooth
 from tuner.recordings.micro_sd import MicroSdRecording
 from tuner.recordings.notes import Cause
 from tuner.recordings.recording import Request
@@ -121,7 +121,7 @@ def test_real_logs_are_read_in_the_units_and_axes_of_a_flight(path: Path) -> Non
     flight = load_flight(path, cache=False)
     assert 4 < flight.duration < 20
     turning = smooth(body_rate_of(flight.signals["attitude"]), 0.1)
-    assert alike(turning[:, :2], smooth(flight.signals["body_rate"], 0.1)[:, :2]) > 0.7
+    assert correlation(turning[:, :2], smooth(flight.signals["body_rate"], 0.1)[:, :2]) > 0.7
     thrust = np.nanmedian(flight.signals["commanded_thrust"])
     assert 0.2 < thrust < 0.5  # N as commanded, of 32 to 42 g
     if flight.has("acceleration"):

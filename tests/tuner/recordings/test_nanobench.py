@@ -10,7 +10,7 @@ import pytest
 
 from tuner.core.shipped import find_config
 from tuner.recordings import Flight, inspect_recordings, load_flight
-from tuner.recordings.interpolation import alike, body_rate_of, smooth
+from tuner.recordings.interpolation import body_rate_of, correlation, smooth
 from tuner.vehicle import read_vehicle
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))
@@ -38,7 +38,7 @@ def test_the_flown_part_is_whole(flight: Flight) -> None:
 
 def test_gyro_and_attitude_agree(flight: Flight) -> None:
     turning = smooth(body_rate_of(flight.signals["attitude"]), 0.1)
-    assert alike(turning, smooth(flight.signals["body_rate"], 0.1)) > 0.7
+    assert correlation(turning, smooth(flight.signals["body_rate"], 0.1)) > 0.7
 
 
 def test_specific_force_is_in_si(flight: Flight) -> None:
@@ -59,7 +59,8 @@ def test_motors_in_px4_order_turn_the_vehicle_the_right_way(flight: Flight) -> N
     turned = np.gradient(smooth(flight.signals["body_rate"], 0.05), 0.01, axis=0)
     for axis in range(3):
         late = max(
-            alike(torque[: len(torque) - lag, [axis]], turned[lag:, [axis]]) for lag in range(8)
+            correlation(torque[: len(torque) - lag, [axis]], turned[lag:, [axis]])
+            for lag in range(8)
         )
         assert late > 0.15, axis
 
