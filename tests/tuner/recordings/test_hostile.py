@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bz2
+import io
 import json
 import sqlite3
 import struct
@@ -15,6 +16,7 @@ from pathlib import Path
 from time import process_time
 
 import lz4.frame
+import numpy as np
 import pytest
 from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
@@ -22,7 +24,7 @@ from tests.tuner.recordings import fuzz, making
 from tuner.core.errors import InputError, RecordingError
 from tuner.recordings import inspect_recordings, load_flight
 from tuner.recordings.notes import Cause, NoteCode
-from tuner.recordings.ros.container import DamagedError, unpack, zstd
+from tuner.recordings.ros.container import DamagedError, read_wanted, unpack, zstd
 from tuner.recordings.ros.messages import Definitions
 from tuner.recordings.ros.wire import UnknownFieldError, plan
 
@@ -185,6 +187,12 @@ def test_message_stamped_later_than_any_clock(tmp_path: Path) -> None:
         (inspection,), errors = inspect_recordings([path], cache=False)
     assert not errors
     assert Cause.END_MISSING in {damage.cause for damage in inspection.damage}
+
+
+def test_index_of_a_chunk_that_names_other_connections() -> None:
+    start = np.zeros(1, dtype=np.int64)
+    with pytest.raises(DamagedError, match="points nowhere"):
+        read_wanted(io.BytesIO(bytes(100)), 0, 100, {7: (start, start)}, [8])
 
 
 def test_table_with_a_line_without_end(tmp_path: Path) -> None:
