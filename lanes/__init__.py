@@ -10,8 +10,9 @@ blocks of lanes on several threads. What has no rule runs through `jax.vmap` and
 Nothing here knows what is computed.
 """
 
+from lanes.dependence import dependent
 from lanes.layout import Argument
 from lanes.machine import keep_code_in
 from lanes.program import Program, Run, joined
 
-__all__ = ["Argument", "Program", "Run", "joined", "keep_code_in"]
+__all__ = ["Argument", "Program", "Run", "dependent", "joined", "keep_code_in"]

@@ -50,6 +50,10 @@ def _is_tangent(value: Value) -> bool:
     return any(isinstance(e, tuple) for e in value.ravel())
 
 
+def _flags(found: Sequence[int]) -> list[bool]:
+    return list(map(bool, found))
+
+
 def _rebuilt(value: Value, parts: Sequence[ir.Value]) -> Value:
     """Return an array in registers with other LLVM values, in the order of `_parts`."""
     assert isinstance(value, np.ndarray)
@@ -151,7 +155,7 @@ def _row(lower: Lowering, value: Value, number: ir.Value) -> Value:
 def _laid_before(lower: Lowering, value: Value, *, indexed: bool) -> Value:
     """Return what a loop reads, in memory where it is long or read row by row; for reading only."""
     if isinstance(value, np.ndarray) and value.size and (value.size > SPILLED or indexed):
-        value = lower.spilled(value)
+        value = lower.readable(value)
     if isinstance(value, Memory) and value.storage.writable:
         if value.version != value.storage.version:
             raise UnsupportedError("an array that is read after it was changed in place")
@@ -167,8 +171,8 @@ def _scan(lower: Lowering, eqn: JaxprEqn, operands: list[Value], bound: Bound) -
     fixed = [_laid_before(lower, v, indexed=False) for v in operands[:consts]]
     rows = [_laid_before(lower, v, indexed=not once) for v in operands[consts + carried :]]
     given = [*fixed, *operands[consts : consts + carried], *rows]
-    lanes = dependent_in_scan(p, [_is_lanes(v) for v in given])
-    columns = dependent_in_scan(p, [_is_tangent(v) for v in given])
+    lanes = _flags(dependent_in_scan(p, [_is_lanes(v) for v in given]))
+    columns = _flags(dependent_in_scan(p, [_is_tangent(v) for v in given]))
     into = [
         bound[var]
         if var in bound
@@ -230,8 +234,8 @@ def _while(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> l
         *operands[conds + consts :],
     ]
     of_cond, of_body = operands[:conds], operands[conds : conds + consts]
-    lanes = dependent_in_while(p, [_is_lanes(v) for v in operands])
-    columns = dependent_in_while(p, [_is_tangent(v) for v in operands])
+    lanes = _flags(dependent_in_while(p, [_is_lanes(v) for v in operands]))
+    columns = _flags(dependent_in_while(p, [_is_tangent(v) for v in operands]))
     kinds = list(zip(lanes, columns, strict=True))
     carry = _Carry(lower, operands[conds + consts :], kinds, operands[: conds + consts])
     before, head = b.block, b.function.append_basic_block("while")
@@ -268,8 +272,8 @@ def _cond(lower: Lowering, eqn: JaxprEqn, operands: list[Value], _: Bound) -> li
     lanes = [False] * len(eqn.outvars)
     columns = [False] * len(eqn.outvars)
     for branch in branches:
-        by_lane = dependent(branch.jaxpr, [_is_lanes(v) for v in rest])
-        by_column = dependent(branch.jaxpr, [_is_tangent(v) for v in rest])
+        by_lane = _flags(dependent(branch.jaxpr, [_is_lanes(v) for v in rest]))
+        by_column = _flags(dependent(branch.jaxpr, [_is_tangent(v) for v in rest]))
         lanes = [a or b for a, b in zip(lanes, by_lane, strict=True)]
         columns = [a or b for a, b in zip(columns, by_column, strict=True)]
     lanes = [lane or is_vector(which) for lane in lanes]

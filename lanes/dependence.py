@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import or_
 from typing import Any
 
 from jax.extend.core import Jaxpr, Literal
@@ -32,22 +34,22 @@ def called(params: Any) -> tuple[Jaxpr, Sequence[Any]]:
     return (inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())
 
 
-def dependent(jaxpr: Jaxpr, flags: Sequence[bool]) -> list[bool]:
+def dependent(jaxpr: Jaxpr, flags: Sequence[int]) -> list[int]:
     """Return for each output whether it depends on a flagged input.
 
-    What decides a branch or the length of a loop counts too.
+    What decides a branch or the length of a loop counts too. A flag is a truth value, or a set of
+    bits: then an output has the bits of all inputs that it depends on.
     """
-    known = {var for var, flag in zip(jaxpr.invars, flags, strict=True) if flag}
+    known = dict(zip(jaxpr.invars, flags, strict=True))
     for eqn in jaxpr.eqns:
-        ins = [not isinstance(v, Literal) and v in known for v in eqn.invars]
+        ins = [0 if isinstance(v, Literal) else known.get(v, 0) for v in eqn.invars]
         if not any(ins):
             continue
         name = eqn.primitive.name
         if name == "cond":
             outs = [ins[0]] * len(eqn.outvars)
             for branch in eqn.params["branches"]:
-                inner = dependent(branch.jaxpr, ins[1:])
-                outs = [a or b for a, b in zip(outs, inner, strict=True)]
+                outs = list(map(or_, outs, dependent(branch.jaxpr, ins[1:])))
         elif name == "scan":
             outs = dependent_in_scan(eqn.params, ins)
         elif name == "while":
@@ -55,25 +57,25 @@ def dependent(jaxpr: Jaxpr, flags: Sequence[bool]) -> list[bool]:
         elif name in CALLS:
             outs = dependent(called(eqn.params)[0], ins)
         else:
-            outs = [True] * len(eqn.outvars)
-        known.update(var for var, out in zip(eqn.outvars, outs, strict=True) if out)
-    return [not isinstance(v, Literal) and v in known for v in jaxpr.outvars]
+            outs = [reduce(or_, ins)] * len(eqn.outvars)
+        known.update(zip(eqn.outvars, outs, strict=True))
+    return [0 if isinstance(v, Literal) else known.get(v, 0) for v in jaxpr.outvars]
 
 
-def dependent_in_scan(params: Any, flags: Sequence[bool]) -> list[bool]:
+def dependent_in_scan(params: Any, flags: Sequence[int]) -> list[int]:
     """Return for each output of a scan, carry first, whether it depends on a flagged operand."""
     body, consts, carried = params["jaxpr"].jaxpr, params["num_consts"], params["num_carry"]
     now = list(flags)
     while True:
         outs = dependent(body, now)
         carry = now[consts : consts + carried]
-        after = [a or b for a, b in zip(carry, outs[:carried], strict=True)]
+        after = list(map(or_, carry, outs))
         if after == carry:
             return after + outs[carried:]
         now[consts : consts + carried] = after
 
 
-def dependent_in_while(params: Any, flags: Sequence[bool]) -> list[bool]:
+def dependent_in_while(params: Any, flags: Sequence[int]) -> list[int]:
     """Return for each carried value of a while loop whether it depends on a flagged operand."""
     conds, consts = params["cond_nconsts"], params["body_nconsts"]
     of_cond, of_body = list(flags[:conds]), list(flags[conds : conds + consts])
@@ -81,7 +83,7 @@ def dependent_in_while(params: Any, flags: Sequence[bool]) -> list[bool]:
     while True:
         ends = dependent(params["cond_jaxpr"].jaxpr, of_cond + carry)[0]
         outs = dependent(params["body_jaxpr"].jaxpr, of_body + carry)
-        after = [a or b or ends for a, b in zip(carry, outs, strict=True)]
+        after = [a | b | ends for a, b in zip(carry, outs, strict=True)]
         if after == carry:
             return after
         carry = after

@@ -33,6 +33,9 @@ class Argument:
         Of its numbers.
     lanes
         Whether each lane has its own: then it is given with the lanes along a last axis.
+    apart
+        Whether each lane's own lies together: then it is given with the lanes along a first axis,
+        and not copied.
     moves
         Whether the function is differentiated by it: tangents are then given with the columns along
         a first axis, the same for all lanes.
@@ -42,6 +45,7 @@ class Argument:
     dtype: Any
     lanes: bool
     moves: bool = False
+    apart: bool = False
 
 
 class _Frame(NamedTuple):
@@ -81,7 +85,7 @@ class Layout:
     columns: int
     lengths: Lengths
     outputs: Sequence[Any]
-    moved: Sequence[bool]
+    moved: Sequence[int]
 
     def written(self, closed: Any, width: int) -> str:
         """Return the module of a traced function, as text, for so many lanes at a time.
@@ -178,14 +182,16 @@ class Layout:
             shape, tangent = tuple(var.aval.shape), number >= count
             by_lane = argument.lanes or tangent
             row = (frame.lanes if tangent else frame.own_lanes) if by_lane else None
-            column, *strides = lower.row_major((0, *shape), row)
+            apart = argument.apart and not tangent
+            column, *strides = lower.row_major((0, *shape), None if apart else row)
             storage = Storage(
                 frame.given[number],
                 type_of(var.aval.dtype),
                 tuple(strides),
-                constant(I64, 1) if by_lane else None,
+                (column if apart else constant(I64, 1)) if by_lane else None,
                 (frame.first_lane if tangent else frame.own_lane) if by_lane else None,
                 column_stride=column if tangent else None,
+                scattered=[lower.b.mul(own, column) for own in frame.segment] if apart else (),
             )
             memory = Memory(storage, shape)
             values.append(lower.elements(memory) if prod(shape) <= IN_REGISTERS else memory)
@@ -198,6 +204,7 @@ class Layout:
         for turn in frame.turn:
             is_first = b.or_(is_first, b.icmp_signed("==", turn, constant(I64, 0)))
         memories = []
+        nowhere = ir.Constant(I64, 0)
         for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
             if moved:
                 in_loop = is_laid_by_loop(shape, self.lengths)
@@ -224,7 +231,9 @@ class Layout:
                 column_stride=constant(I64, 1) if moved else None,
                 scattered=begins,
                 writable=True,
-                guard=None if moved else is_first,
+                guard=None
+                if moved
+                else b.and_(is_first, b.icmp_unsigned("!=", b.ptrtoint(pointer, I64), nowhere)),
             )
             memories.append(Memory(storage, tuple(shape.shape)))
         return memories

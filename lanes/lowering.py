@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import reduce
 from itertools import product
 from math import prod
@@ -255,7 +256,7 @@ class Lowering:
             return self._load(array, index)
         if all(isinstance(i, ir.Constant) for i in index):
             return array[tuple(i.constant for i in index)]
-        return self._load(self.spilled(array), index)
+        return self._load(self.readable(array), index)
 
     def _load(self, memory: Memory, index: Index) -> Element:
         storage = memory.storage
@@ -267,12 +268,37 @@ class Lowering:
 
     def _load_column(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
         if any(map(is_vector, index)):
+            if storage.scattered:
+                raise UnsupportedError("an index of each lane's own where lanes lie apart")
             return self._gathered(storage, index, column)
-        place = self._place(storage, index, column)
-        wide = storage.lane_stride is not None
         if storage.scattered:
-            raise UnsupportedError("reading an array whose lanes lie apart")
-        return self._read_at(storage, place, wide=wide)
+            return self._collected(storage, index, 1)[0]
+        place = self._place(storage, index, column)
+        return self._read_at(storage, place, wide=storage.lane_stride is not None)
+
+    def _collected(self, storage: Storage, index: Index, count: int) -> list[ir.Value]:
+        """Read so many numbers that lie side by side in each lane's part."""
+        place, width = self._place(storage, index, None), self.e.width
+        lanes = [self.b.gep(storage.pointer, [self._sum(own, place)]) for own in storage.scattered]
+        found: list[ir.Value] = []
+        whole = count // width * width if storage.kind != BOOL else 0
+        for begin in range(0, whole, width):
+            rows = []
+            for lane in lanes:
+                pointer = self.b.gep(lane, [constant(I64, begin)])
+                row = self.b.load(self.b.bitcast(pointer, self.e.vector(storage.kind).as_pointer()))
+                row.align = _bytes(storage.kind)
+                rows.append(row)
+            found += self._transposed(rows)
+        for number in range(whole, count):
+            element = ir.Constant(self.e.vector(storage.kind), ir.Undefined)
+            for lane_number, lane in enumerate(lanes):
+                one = self._read_at(
+                    replace(storage, pointer=lane), constant(I64, number), wide=False
+                )
+                element = self.b.insert_element(element, one, constant(ir.IntType(32), lane_number))
+            found.append(element)
+        return found
 
     def _gathered(self, storage: Storage, index: Index, column: int | None) -> ir.Value:
         """Read at an index of each lane's own; where all are the same, at once."""
@@ -324,7 +350,8 @@ class Lowering:
         place = constant(I64, 0)
         for i, stride in zip(index, storage.strides, strict=True):
             place = self._sum(place, self._product(self.as_index(i), stride))
-        if storage.lane_stride is not None and storage.first_lane is not None:
+        if storage.first_lane is not None and not storage.scattered:
+            assert storage.lane_stride is not None
             place = self._sum(place, self._product(storage.first_lane, storage.lane_stride))
         if column and storage.column_stride is not None:
             step = self._product(storage.column_stride, constant(I64, column))
@@ -469,6 +496,14 @@ class Lowering:
         )
         self.storages.append(storage)
         return Memory(storage, shape)
+
+    def readable(self, elements: Elements) -> Memory:
+        """Return an array in registers as memory that is only read: constants as the program's."""
+        flat = elements.ravel().tolist()
+        if all(isinstance(e, ir.Constant) and not is_vector(e) and e.type != BOOL for e in flat):
+            numbers = np.array([e.constant for e in flat]).reshape(elements.shape)
+            return self._laid_out(numbers, flat[0].type)
+        return self.spilled(elements)
 
     def spilled(self, value: Value, *, lane: bool = False, column: bool = False) -> Memory:
         """Return an array as memory of this lowering's own, a copy of what lies elsewhere."""
@@ -723,7 +758,9 @@ def _dynamic_slice(lower: Lowering, eqn: JaxprEqn, operands: list[Value]) -> Val
         for s, length, size in zip(operands[1:], value.shape, sizes, strict=True)
     ]
     if isinstance(value, np.ndarray) and not all(isinstance(s, ir.Constant) for s in starts):
-        value = lower.spilled(value)
+        value = lower.readable(value)
+    if isinstance(value, Memory) and value.storage.scattered and prod(sizes[:-1]) == 1:
+        return array_of(lower._collected(value.storage, starts, sizes[-1]), sizes)
     found = [
         lower.at(
             value, [lower._sum(constant(I64, i), s) for i, s in zip(place, starts, strict=True)]

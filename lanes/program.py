@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
+from math import lcm
 from typing import Any, TypeAlias
 
 import jax
@@ -167,19 +168,30 @@ class Program:
         """Whether it runs as a kernel; else through XLA."""
         return self._compiled is not None
 
-    def __call__(self, values: Any, tangents: Any = None, *, lanes: int, turns: int = 0) -> Run:
+    def __call__(
+        self,
+        values: Any,
+        tangents: Any = None,
+        *,
+        lanes: int,
+        turns: int = 0,
+        wanted: Any = None,
+    ) -> Run:
         """Run.
 
         Parameters
         ----------
         values
-            Pytree of arrays: (\\*shape, lanes) where each lane has its own, else (\\*shape).
+            Pytree of arrays: (\\*shape, lanes) where each lane has its own, (lanes, \\*shape) where
+            those lie apart, else (\\*shape).
         tangents
             Of the arguments that move, in the order of their leaves: (Q, \\*shape) each.
         lanes
             How many there are.
         turns
             The length named ``turns``, of loops.
+        wanted
+            Pytree of truth values, one an output: None stands for one that is not. All by default.
         """
         leaves = [
             np.asarray(leaf, a.dtype)
@@ -190,16 +202,17 @@ class Program:
         kernel = self._compiled
         if kernel is None:
             return self.by_xla(values, tangents, turns=turns)
-        return kernel.run(leaves, moved, lengths, lanes)
+        return kernel.run(leaves, moved, lengths, lanes, wanted)
 
     def _lengths(self, leaves: Sequence[NDArray[Any]], turns: int) -> dict[str, int]:
         lengths = {"turns": turns}
         for leaf, argument in zip(leaves, self.arguments, strict=True):
             for axis, length in enumerate(argument.shape):
                 if isinstance(length, str):
-                    given = lengths.setdefault(length, leaf.shape[axis])
-                    if given != leaf.shape[axis]:
-                        raise ValueError(f"{length} is {given} and {leaf.shape[axis]}")
+                    own = leaf.shape[axis + argument.apart]
+                    given = lengths.setdefault(length, own)
+                    if given != own:
+                        raise ValueError(f"{length} is {given} and {own}")
         return lengths
 
     def by_xla(self, values: Any, tangents: Any = None, *, turns: int = 0) -> Run:
@@ -222,7 +235,7 @@ class Program:
     def _xla(self, lengths: tuple[tuple[str, int], ...]) -> Callable[..., Any]:
         known: dict[Any, Callable[..., Any]] = self.__dict__.setdefault("_programs", {})
         if lengths not in known:
-            axes = [-1 if a.lanes else None for a in self.arguments]
+            axes = [(0 if a.apart else -1) if a.lanes else None for a in self.arguments]
             pushed = self._pushed(dict(lengths))
             by_lane = jax.vmap(pushed, in_axes=(axes, None))
             if self.moving:
@@ -276,6 +289,7 @@ class _Compiled:
         tangents: Sequence[NDArray[Any]],
         lengths: Mapping[str, int],
         lanes: int,
+        wanted: Any = None,
     ) -> Run:
         """Compute all lanes and columns."""
         program, width, at_once = self.program, self.width, max(self.program.columns, 1)
@@ -285,19 +299,24 @@ class _Compiled:
         # several passes, many have a block for themselves and another one for each pass.
         own_lanes = -(-lanes // width) * width
         tables = sum(
-            leaf.nbytes for leaf, a in zip(leaves, program.arguments, strict=True) if a.lanes
+            leaf.nbytes
+            for leaf, a in zip(leaves, program.arguments, strict=True)
+            if a.lanes and not a.apart
         )
         if passes > 1 and own_lanes - lanes > WASTE * lanes and tables * passes <= REPEATED:
             own_lanes = lanes
         total = own_lanes * passes
         blocks = -(-total // width)
-        place = np.minimum(np.arange(blocks * width), total - 1)
-        # lanes that fill a block up compute, and write, the last one's again
-        segment, turn = np.minimum(place % own_lanes, lanes - 1), place // own_lanes
-        own_blocks = blocks if own_lanes % width else own_lanes // width
+        place = np.arange(blocks * width)
+        # lanes that fill a block up compute, and write, what others do
+        segment = np.minimum(place % own_lanes, lanes - 1)
+        turn = np.minimum(place // own_lanes, passes - 1)
+        own_blocks = min(lcm(own_lanes, width) // width, blocks)
         taken = segment[: own_blocks * width]
         given = [
-            _side_by_side(leaf, taken, lanes) if a.lanes else np.ascontiguousarray(leaf)
+            _side_by_side(leaf, taken, lanes)
+            if a.lanes and not a.apart
+            else np.ascontiguousarray(leaf)
             for leaf, a in zip(leaves, program.arguments, strict=True)
         ]
         for number, t in zip(program.moving, tangents, strict=True):
@@ -306,8 +325,14 @@ class _Compiled:
             by_pass = np.moveaxis(rows.reshape(passes, at_once, *t.shape[1:]), 0, -1)
             given.append(np.ascontiguousarray(by_pass[..., turn]))
         sizes = {stand_in: lengths[name] for name, stand_in in self.lengths.items()}
-        found = []
-        for shape, moved in zip(self.outputs, self.moved, strict=True):
+        asked = (
+            [True] * len(self.outputs) if wanted is None else self.structure.flatten_up_to(wanted)
+        )
+        found: list[Any] = []
+        for shape, moved, is_wanted in zip(self.outputs, self.moved, asked, strict=True):
+            if not (moved or is_wanted):
+                found.append(None)
+                continue
             own = tuple(sizes.get(n, n) for n in shape.shape)
             if moved:
                 axis = 1 if is_laid_by_loop(shape, self.lengths) else 0
@@ -377,5 +402,6 @@ def _is_real(dtype: Any) -> bool:
     return np.issubdtype(np.dtype(dtype), np.floating)
 
 
-def _addresses(arrays: Sequence[NDArray[Any]]) -> Any:
-    return (ctypes.c_void_p * max(len(arrays), 1))(*[a.ctypes.data for a in arrays])
+def _addresses(arrays: Sequence[NDArray[Any] | None]) -> Any:
+    pointers = [None if a is None else a.ctypes.data for a in arrays]
+    return (ctypes.c_void_p * max(len(arrays), 1))(*pointers)

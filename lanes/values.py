@@ -63,8 +63,8 @@ class Storage:
     column_stride: ir.Value | None = None
     """Numbers from one column to the next; None where it is no tangent."""
     scattered: Sequence[ir.Value] = ()
-    """Of an output: where in it the numbers of each lane of the block begin. Empty where the lanes
-    of an element lie beside each other."""
+    """Where the numbers of each lane of the block begin, of an output or an argument whose lanes
+    lie apart. Empty where the lanes of an element lie beside each other."""
     writable: bool = False
     guard: ir.Value | None = None
     """When it is written to; None for always."""

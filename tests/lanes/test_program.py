@@ -15,7 +15,7 @@ import pytest
 from jax import lax
 
 import lanes.program
-from lanes import Argument, Program, joined, keep_code_in
+from lanes import Argument, Program, dependent, joined, keep_code_in
 from lanes.machine import object_code
 
 RANDOM = np.random.default_rng(1)
@@ -82,6 +82,69 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
     want = program.by_xla(values, tangents, turns=turns)
     for mine, theirs in zip(flat(got), flat(want), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 9])
+def test_lanes_that_lie_apart_are_read_as_those_that_lie_beside_each_other(count):
+    """By whole rows, by single numbers and by vectors of them; passes take turns with lanes."""
+
+    def summed(given, lengths):
+        table, gain = given["table"], given["gain"]
+
+        def turn(total, number):
+            row = lax.dynamic_slice(table, (number, 1, 0), (1, 1, 19))[0, 0]
+            part = lax.dynamic_slice(table, (number, 0, 2), (1, 2, 3))[0]
+            return total + gain * jnp.sum(row) * part[1, 2], row[:5] * gain
+
+        return lax.scan(turn, given["x"], jnp.arange(lengths["turns"]))
+
+    rng = np.random.default_rng(count)
+    values = {
+        "x": rng.normal(size=count),
+        "gain": np.array(0.3),
+        "table": rng.normal(size=(count, 6, 2, 19)).astype(np.float32),
+    }
+    found = []
+    for apart in (True, False):
+        arguments = {
+            "x": Argument((), float, lanes=True),
+            "gain": Argument((), float, lanes=False, moves=True),
+            "table": Argument(("rows", 2, 19), np.float32, lanes=True, apart=apart),
+        }
+        table = values["table"] if apart else np.moveaxis(values["table"], 0, -1)
+        program = Program(summed, arguments)
+        assert program.is_kernel
+        run = program({**values, "table": table}, [np.arange(1.0, 6.0)], lanes=count, turns=6)
+        found.append(jax.tree.leaves((run.values, run.columns)))
+        by_xla = program.by_xla({**values, "table": table}, [np.arange(1.0, 6.0)], turns=6)
+        np.testing.assert_allclose(run.values[0], by_xla.values[0], rtol=1e-6)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_what_is_not_wanted_is_not_returned_and_changes_nothing(program):
+    values, moved = given(5, 8)
+    whole = program(values, moved, lanes=5, turns=8)
+    wanted = jax.tree.map(lambda _: True, (whole.values, whole.columns))
+    wanted[0][0]["high"] = wanted[0][0]["twice"] = False
+    some = program(values, moved, lanes=5, turns=8, wanted=wanted)
+    assert some.values[0]["high"] is None
+    np.testing.assert_array_equal(some.values[0]["state"], whole.values[0]["state"])
+    np.testing.assert_array_equal(some.columns[0]["twice"], whole.columns[0]["twice"])
+
+
+def test_an_output_has_the_bits_of_all_inputs_that_it_depends_on():
+    def function(x, y, z, flag):
+        chosen = lax.cond(flag > 0.0, lambda: x, lambda: x * 2.0)
+        total = lax.fori_loop(0, 3, lambda _, t: t + y, z)
+        ended = lax.while_loop(lambda t: t < x, lambda t: t + 1.0, y)
+        return x * y, chosen, total, ended, lax.stop_gradient(z), jnp.ones(())
+
+    jaxpr = jax.make_jaxpr(function)(*[1.0] * 4).jaxpr
+    assert dependent(jaxpr, [1, 2, 4, 8]) == [3, 9, 6, 3, 4, 0]
+    assert list(map(bool, dependent(jaxpr, [False, True, False, False]))) == [
+        True, False, True, True, False, False,
+    ]  # fmt: skip
 
 
 def test_results_do_not_depend_on_threads_nor_on_other_lanes(program, monkeypatch):

@@ -4,114 +4,234 @@ Propagated column by column, through the loop's own derivative: F P Fᵀ takes t
 the linearised loop as the state has numbers, where products of matrices would take many times the
 operations. The m samples of a tick, whose noise is independent, are taken one after the other
 (Anderson and Moore, "Optimal filtering", 1979, 6.4), which is the Cholesky factorisation of their
-covariance, row by row.
+covariance, row by row; what all of them tell is taken off the covariance as it is propagated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array, lax
 
-Matrices = tuple[Array, Array]
-_Carried = tuple[Array, Array, Array]
+from lanes import dependent
+
+BESIDE = 16
+"""Numbers of a row that stay in registers while others are added to them."""
 
 
-def updated(
-    matrices: Matrices, samples: tuple[Array, Array, Array], sampled: Array
-) -> tuple[Matrices, tuple[Array, Array]]:
-    """Return covariance and gains after the samples of a tick, and their innovations.
+class Sparse(NamedTuple):
+    """A sparse matrix.
+
+    Attributes
+    ----------
+    rows
+        Each row's columns that are not zero.
+    groups
+        Of each column: those of one group meet in no row.
+    values
+        (groups, rows) each row's number in the column of a group that it has.
+    """
+
+    rows: tuple[tuple[int, ...], ...]
+    groups: tuple[int, ...]
+    values: Array
+
+    @staticmethod
+    def of(push: Callable[[list[Array]], list[Array]], columns: int) -> Sparse:
+        """Return the matrix of a linear map of so many numbers, given each by itself, to vectors.
+
+        A group of columns is pushed at once: Curtis, Powell and Reid, "On the estimation of sparse
+        Jacobian matrices", 1974.
+        """
+        closed = jax.make_jaxpr(push)([jnp.zeros(())] * columns)
+        found = dependent(closed.jaxpr, [1 << number for number in range(columns)])
+        lengths = [var.aval.shape[0] for var in closed.jaxpr.outvars]
+        masks = np.repeat(found, lengths).tolist()
+        rows = tuple(tuple(k for k in range(columns) if mask >> k & 1) for mask in masks)
+        groups, taken = [], list[int]()
+        for column in range(columns):
+            met = sum(1 << i for i, row in enumerate(rows) if column in row)
+            group = next((g for g, others in enumerate(taken) if not others & met), len(taken))
+            taken[group : group + 1] = [met | (taken[group] if group < len(taken) else 0)]
+            groups.append(group)
+
+        def pushed(group: Array) -> Array:
+            unit = jnp.where(np.array(groups) == group, 1.0, 0.0)
+            return jnp.concatenate(push([unit[number] for number in range(columns)]))
+
+        return Sparse(rows, tuple(groups), rows_of(pushed, len(taken)))
+
+
+class Samples(NamedTuple):
+    """The m samples of a tick.
+
+    Attributes
+    ----------
+    error, variance
+        (m,) their errors and the variances of their noise.
+    seen
+        (m, s) errors' derivatives by the first s numbers of the state.
+    order, many
+        Which there are in any lane, by a number below ``many``: others are skipped.
+    """
+
+    error: Array
+    variance: Array
+    seen: Sparse
+    order: Callable[[Array], Array]
+    many: Array
+
+
+class Innovations(NamedTuple):
+    """What the samples of a tick tell.
+
+    Attributes
+    ----------
+    table
+        (m, m + 2): the triangular root of their covariance, innovations that it whitens, and the
+        variances of noise.
+    gain
+        (m, n) corrections for one standard deviation of each; of samples that were skipped those of
+        a tick before.
+    """
+
+    table: Array
+    gain: Array
+
+    @property
+    def factors(self) -> Array:
+        """The triangular root (m, m)."""
+        return self.table[:, :-2]
+
+    @property
+    def white(self) -> Array:
+        """The whitened innovations (m,)."""
+        return self.table[:, -2]
+
+    def corrections(self, samples: Samples, weights: Array) -> Array:
+        """Return the sum (n,) of the gains of what was sampled, each times its weight (m,)."""
+        wide, size = self.gain.shape
+        # in memory, where a loop reads them by number
+        table = lax.dynamic_update_slice(self.table, weights[:, None], (0, wide + 1))
+
+        def total(first: int, count: int) -> Array:
+            def add(number: Array, so_far: Array) -> Array:
+                i = samples.order(number)
+                return so_far + _entry(table, i, wide + 1) * _part(self.gain, i, first, count)
+
+            found: Array = lax.fori_loop(0, samples.many, add, jnp.zeros(count))
+            return found
+
+        return jnp.concatenate([total(*part) for part in _side_by_side(size)])
+
+
+def innovations_of(covariance: Array, gain: Array, samples: Samples) -> Innovations:
+    """Return what samples tell of a state (n,) of known covariance; ``gain`` is written over."""
+    wide, size = gain.shape
+    most = max(map(len, samples.seen.rows))
+    # how many columns of each row are not zero, which, and of which group
+    known = [
+        [len(row), *row, *[0] * (most - len(row)), *(samples.seen.groups[k] for k in row)]
+        for row in samples.seen.rows
+    ]
+    places = jnp.asarray(np.array([row + [0] * (2 * most + 1 - len(row)) for row in known]))
+
+    def by_state(i: Array, of: Callable[[Array, Array], Array], start: Array) -> Array:
+        """Add up what is made of each derivative of a sample and its place in the state."""
+
+        def add(number: Array, total: Array) -> Array:
+            place, group = _entry(places, i, number + 1), _entry(places, i, number + 1 + most)
+            return total + of(_entry(samples.seen.values, group, i), place)
+
+        total: Array = lax.fori_loop(0, _entry(places, i, 0), add, start)
+        return total
+
+    def take(number: Array, told: Innovations) -> Innovations:
+        table, gain = told
+        i = samples.order(number)
+
+        def factor(earlier: Array, table: Array) -> Array:
+            j = samples.order(earlier)
+            own = by_state(i, lambda along, place: along * _entry(gain, j, place), jnp.zeros(()))
+            table = _with_entry(table, i, j, own)
+            return _with_entry(
+                table, i, wide, _entry(table, i, wide) - own * _entry(table, j, wide)
+            )
+
+        table = lax.fori_loop(0, number, factor, table)
+
+        def unexplained(first: int, count: int) -> Array:
+            def covary(along: Array, place: Array) -> Array:
+                return along * _part(covariance, place, first, count)
+
+            def less(earlier: Array, rest: Array) -> Array:
+                j = samples.order(earlier)
+                return rest - _entry(table, i, j) * _part(gain, j, first, count)
+
+            rest: Array = lax.fori_loop(0, number, less, by_state(i, covary, jnp.zeros(count)))
+            return rest
+
+        own = jnp.concatenate([unexplained(*part) for part in _side_by_side(size)])
+        noise = _entry(table, i, wide + 1)
+        root = jnp.sqrt(by_state(i, lambda along, place: along * at(own, place), noise))
+        table = _with_entry(table, i, i, root)
+        table = _with_entry(table, i, wide, _entry(table, i, wide) / root)
+        return Innovations(table, _with_row(gain, i, own / root))
+
+    unit = jnp.where(jnp.arange(wide)[:, None] == jnp.arange(wide), 1.0, 0.0)
+    table = jnp.concatenate([unit, samples.error[:, None], samples.variance[:, None]], axis=1)
+    told: Innovations = lax.fori_loop(0, samples.many, take, Innovations(table, gain))
+    return told
+
+
+def propagated(
+    matrices: tuple[Array, Array],
+    told: Innovations,
+    samples: Samples,
+    follow: Callable[[Array], Array],
+    unrest: Array,
+) -> tuple[Array, Array]:
+    """Return F (P - W Wᵀ) Fᵀ + Q: a tick later, when samples have told what they do.
 
     Parameters
     ----------
     matrices
-        The covariance (n, n) before them, and the gains (m, n), which are written over.
-    samples
-        Errors (m,), their derivatives (s, m) by the first s numbers of the state, and the variances
-        (m,) of the samples' noise.
-    sampled
-        (m,) of which there are samples in any lane; the others are skipped.
-
-    Returns
-    -------
-    tuple
-        Covariance and gains for one standard deviation of each whitened innovation; the whitened
-        innovations (m,) and the factor L (m, m) of their covariance.
+        P (n, n), and one of the same size which is written over, as P is; both are returned.
+    told, samples
+        Whose gains are W.
+    follow, unrest
+        F, as a function of a column, and the diagonal (n,) of Q.
     """
-    error, seen, variance = samples
-    (size, _), (shown, wide) = matrices[0].shape, seen.shape
+    covariance, scratch = matrices
+    size = len(covariance)
 
-    def taken(carried: _Carried, i: Array) -> tuple[_Carried, Matrices]:
-        covariance, gain, moved = carried
-        along = lax.dynamic_slice(seen, (0, i), (shown, 1))[:, 0]
-        spread = rows_of(lambda r: row(covariance, r, shown) @ along, size)
-        root = jnp.sqrt(spread[:shown] @ along + at(variance, i))
-        white = (at(error, i) + along @ moved[:shown]) / root
-        own = spread / root
+    def known_better(j: Array, first: int, count: int) -> Array:
+        def less(number: Array, rest: Array) -> Array:
+            i = samples.order(number)
+            return rest - _entry(told.gain, i, j) * _part(told.gain, i, first, count)
 
-        def of_others(j: Array) -> Array:
-            return jnp.where(j < i, row(gain, j, shown) @ along, jnp.where(j == i, root, 0.0))
+        rest: Array = lax.fori_loop(0, samples.many, less, _part(covariance, j, first, count))
+        return rest
 
-        def less(r: Array, matrix: Array) -> Array:
-            return _with_row(matrix, r, row(matrix, r, size) - at(own, r) * own)
+    def first(j: Array, into: Array) -> Array:
+        rest = [known_better(j, *part) for part in _side_by_side(size)]
+        return _with_row(into, j, follow(jnp.concatenate(rest)))
 
-        factor = rows_of(of_others, wide)
-        covariance = lax.fori_loop(0, size, less, covariance)
-        return (covariance, _with_row(gain, i, own), moved - own * white), (white, factor)
+    scratch = lax.fori_loop(0, size, first, scratch)
 
-    def missing(carried: _Carried, i: Array) -> tuple[_Carried, Matrices]:
-        covariance, gain, moved = carried
-        unit = jnp.where(jnp.arange(wide) == i, 1.0, 0.0)
-        return (covariance, _with_row(gain, i, jnp.zeros(size)), moved), (jnp.zeros(()), unit)
-
-    def either(carried: _Carried, i: Array) -> tuple[_Carried, Matrices]:
-        found: tuple[_Carried, Matrices] = lax.cond(at(sampled, i), taken, missing, carried, i)
-        return found
-
-    (covariance, gain, _), innovations = lax.scan(
-        either, (*matrices, jnp.zeros(size)), jnp.arange(wide)
-    )
-    return (covariance, gain), innovations
-
-
-def propagated(
-    covariance: Array, scratch: Array, follow: Callable[[Array], Array], unrest: Array
-) -> Matrices:
-    """Return F P Fᵀ + Q, of a linear map F that is given as a function of a column.
-
-    ``unrest`` (n,) is the diagonal of Q; ``scratch`` (n, n) is written over, and returned.
-    """
-    size = len(unrest)
-
-    def turned(matrix: Array, into: Array) -> Array:
-        """Return (F matrix)ᵀ, written over another matrix."""
-
-        def one(i: Array, into: Array) -> Array:
-            column = follow(lax.dynamic_slice(matrix, (0, i), (size, 1))[:, 0])
-            return _with_row(into, i, column)
-
-        written: Array = lax.fori_loop(0, size, one, into)
-        return written
+    def second(i: Array, into: Array) -> Array:
+        column = lax.dynamic_slice(scratch, (0, i), (size, 1))[:, 0]
+        return _with_row(into, i, follow(column))
 
     def added(i: Array, matrix: Array) -> Array:
-        number: Array = lax.dynamic_slice(matrix, (i, i), (1, 1)) + at(unrest, i)
-        return lax.dynamic_update_slice(matrix, number, (i, i))
+        return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(unrest, i))
 
-    scratch = turned(covariance, scratch)
-    covariance = turned(scratch, covariance)
+    covariance = lax.fori_loop(0, size, second, covariance)
     return lax.fori_loop(0, size, added, covariance), scratch
-
-
-def weighted(matrix: Array, weights: Array) -> Array:
-    """Return the sum of a matrix's rows, each times its weight."""
-    rows, columns = matrix.shape
-
-    def add(i: Array, total: Array) -> Array:
-        return total + at(weights, i) * row(matrix, i, columns)
-
-    total: Array = lax.fori_loop(0, rows, add, jnp.zeros(columns))
-    return total
 
 
 def rows_of(function: Callable[[Array], Array], count: int) -> Array:
@@ -122,13 +242,30 @@ def rows_of(function: Callable[[Array], Array], count: int) -> Array:
 
 def row(matrix: Array, number: Array, count: int) -> Array:
     """Return the first numbers of a row."""
-    return lax.dynamic_slice(matrix, (number, 0), (1, count))[0]
+    return _part(matrix, number, 0, count)
 
 
 def at(vector: Array, number: Array) -> Array:
     """Return one number of a vector."""
     one: Array = lax.dynamic_index_in_dim(vector, number, 0, keepdims=False)
     return one
+
+
+def _side_by_side(size: int) -> list[tuple[int, int]]:
+    """Return where the parts of a row begin, and how long they are."""
+    return [(first, min(BESIDE, size - first)) for first in range(0, size, BESIDE)]
+
+
+def _part(matrix: Array, number: Array, first: int, count: int) -> Array:
+    return lax.dynamic_slice(matrix, (number, first), (1, count))[0]
+
+
+def _entry(matrix: Array, i: Array, j: Array | int) -> Array:
+    return lax.dynamic_slice(matrix, (i, j), (1, 1))[0, 0]
+
+
+def _with_entry(matrix: Array, i: Array, j: Array | int, number: Array) -> Array:
+    return lax.dynamic_update_slice(matrix, number[None, None], (i, j))
 
 
 def _with_row(matrix: Array, number: Array, row: Array) -> Array:

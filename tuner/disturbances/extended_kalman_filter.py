@@ -25,10 +25,18 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from lanes import Argument, Program, Run, joined
+from lanes import Argument, Program, Run
 from sim_jax.state import State
 from sim_jax.trees import row_of
-from tuner.disturbances.covariance import at, propagated, row, rows_of, updated, weighted
+from tuner.disturbances.covariance import (
+    Samples,
+    Sparse,
+    at,
+    innovations_of,
+    propagated,
+    row,
+    rows_of,
+)
 from tuner.disturbances.disturbances import COUNT
 from tuner.disturbances.observer import (
     Expected,
@@ -83,13 +91,18 @@ class Gains(eqx.Module):
     Attributes
     ----------
     gain
-        (T, m, n, F) correction for one standard deviation of each whitened innovation.
+        (F, T, m, n) correction for one standard deviation of each whitened innovation; of what was
+        not sampled any number.
     factors
-        (T, m, m, F) L, lower triangular.
+        (F, T, m, m) L, lower triangular.
     """
 
-    gain: Float[Either, "T m n F"]
-    factors: Float[Either, "T m m F"]
+    gain: Float[Either, "F T m n"]
+    factors: Float[Either, "F T m m"]
+
+    def among(self, flights: NDArray[np.intp]) -> Gains:
+        """Return those of some flights."""
+        return Gains(np.asarray(self.gain)[flights], np.asarray(self.factors)[flights])
 
 
 class Filtered(eqx.Module):
@@ -97,24 +110,19 @@ class Filtered(eqx.Module):
 
     Attributes
     ----------
-    white
-        (T, m, F) whitened innovations.
+    white, root
+        (T, m, F) whitened innovations, and the standard deviation of each before it was, the ones
+        before it in its tick known: the diagonal of L.
     loss
         (T, F) negative log-likelihood of each tick's samples, but for a constant.
-    factors, gain
-        See `Gains`; gains are None where they were not asked for.
+    gains
+        See `Gains`; None where they were not asked for.
     """
 
     white: Float[Either, "T m F"]
+    root: Float[Either, "T m F"]
     loss: Float[Either, "T F"]
-    factors: Float[Either, "T m m F"]
-    gain: Float[Either, "T m n F"] | None
-
-    @property
-    def gains(self) -> Gains:
-        """Of the observer that the filter is."""
-        assert self.gain is not None
-        return Gains(self.gain, self.factors)
+    gains: Gains | None
 
 
 def _undelayed(simulator: Simulator) -> Simulator:
@@ -144,11 +152,11 @@ def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) 
     Then so many times as many commands are on their way to the motors.
     """
     in_flight = _shortly_delayed(simulator, expected)[1]
-    size, rotors = gains.gain.shape[2], len(expected.tunable.model.vehicle.rotors)
+    size, rotors = gains.gain.shape[-1], len(expected.tunable.model.vehicle.rotors)
     first = size - COUNT - in_flight * rotors
     commands = np.arange(first, size - COUNT).reshape(in_flight, rotors).repeat(times, axis=0)
     rows = np.concatenate([np.arange(first), commands.ravel(), np.arange(size - COUNT, size)])
-    return replace(gains, gain=gains.gain[:, :, rows])
+    return replace(gains, gain=gains.gain[..., rows])
 
 
 def filtered(
@@ -164,18 +172,16 @@ def filtered(
         Whether gains are kept, which take most of the memory.
     """
     short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
-    given = _given(feed, expected)
-    white, loss, factors, gain = _run(given, _Static("filter", short, in_flight, gains)).values
-    return Filtered(
-        white=np.moveaxis(white, 0, -1),
-        loss=np.moveaxis(loss, 0, -1),
-        factors=np.moveaxis(factors, 0, -1),
-        gain=np.moveaxis(gain, 0, -1) if gains else None,
-    )
+    static = _Static("filter", short, in_flight, moves=False)
+    found = _run(
+        _given(feed, expected), static, wanted=_Told(True, True, True, gains, gains)
+    ).values
+    white, root, loss = (np.moveaxis(rows, 0, -1) for rows in found[:3])
+    return Filtered(white, root, loss, Gains(found.gain, found.factors) if gains else None)
 
 
 def innovations(
-    simulator: Simulator, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike
+    simulator: Simulator, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives (N, T, m, F).
 
@@ -186,15 +192,16 @@ def innovations(
     gains
         Of the observer.
     directions
-        (N, K + offsets): along which is differentiated.
+        (N, K + offsets): along which is differentiated; None for nothing.
     """
-    along = np.asarray(directions, float)
-    still = np.zeros((1, along.shape[1]))  # one program serves innovations alone, too
-    static = _Static("innovations", _undelayed(simulator), 0, False)
-    moved = _tangents(expected, along if len(along) else still)
+    static = _Static("innovations", _undelayed(simulator), 0, moves=directions is not None)
+    moved = None if directions is None else _tangents(expected, np.asarray(directions, float))
     run = _run(_given(feed, expected, gains), static, moved)
-    columns = joined(run.columns, len(along), axis=2)
-    return np.moveaxis(run.values, 0, -1), np.moveaxis(columns, (-1, 0), (0, -1))
+    white = np.moveaxis(run.values, 0, -1)
+    if directions is None:
+        return white, np.zeros((0, *white.shape))
+    by_pass = np.moveaxis(run.columns, (2, -1, 0), (0, 1, -1))
+    return white, by_pass.reshape(-1, *by_pass.shape[2:])
 
 
 class _Given(NamedTuple):
@@ -207,7 +214,7 @@ class _Given(NamedTuple):
     samples: Any
     strengths: Any
     noise: Any
-    sampled: Any
+    order: Any
     gains: Gains | None
 
 
@@ -218,11 +225,11 @@ class _Static:
     kind: Literal["filter", "innovations"]
     simulator: Simulator
     in_flight: int
-    gains: bool
+    moves: bool
 
 
 def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given:
-    """Return the arguments of a program; a row is sampled where any segment has a sample."""
+    """Return the arguments of a program."""
     weights = [np.asarray(feed.samples[name].weight) for name in feed.widths]
     given: _Given = jax.tree.map(
         np.asarray,
@@ -234,11 +241,17 @@ def _given(feed: Feed, expected: Expected, gains: Gains | None = None) -> _Given
             samples=feed.samples,
             strengths=expected.strengths,
             noise=expected.noise,
-            sampled=np.concatenate([(w > 0).any(axis=-1) for w in weights], axis=1),
+            order=_order_of(np.concatenate([(w > 0).any(axis=-1) for w in weights], axis=1)),
             gains=gains,
         ),
     )
     return given
+
+
+def _order_of(sampled: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return at each tick (T, m) which rows are sampled in any segment, and last how many are."""
+    order = np.argsort(~sampled, axis=1, kind="stable")
+    return np.concatenate([order, np.count_nonzero(sampled, axis=1)[:, None]], axis=1)
 
 
 def _tangents(expected: Expected, directions: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -251,12 +264,30 @@ def _tangents(expected: Expected, directions: NDArray[np.float64]) -> list[NDArr
     return [*moved, directions[:, count:]]
 
 
-def _run(given: _Given, static: _Static, tangents: list[NDArray[np.float64]] | None = None) -> Run:
-    moves = tangents is not None
+class _Told(NamedTuple):
+    """What a filter returns of a segment, tick by tick, or whether it is wanted."""
+
+    white: Any
+    root: Any
+    loss: Any
+    factors: Any
+    gain: Any
+
+
+def _run(
+    given: _Given,
+    static: _Static,
+    tangents: list[NDArray[np.float64]] | None = None,
+    wanted: _Told | None = None,
+) -> Run:
 
     def table(leaf: Any) -> Argument:
         shape = np.shape(leaf)[1:-1]
         return Argument(("ticks", *shape), np.result_type(leaf), lanes=True)
+
+    def apart(leaf: Any) -> Argument:
+        shape = ("ticks", *np.shape(leaf)[2:])
+        return Argument(shape, np.result_type(leaf), lanes=True, apart=True)
 
     def single(leaf: Any) -> Argument:
         return Argument(np.shape(leaf)[:-1], np.result_type(leaf), lanes=True)
@@ -267,20 +298,21 @@ def _run(given: _Given, static: _Static, tangents: list[NDArray[np.float64]] | N
     arguments = _Given(
         model=jax.tree.map(shared, given.model),
         coefficients={
-            name: Argument((), float, lanes=False, moves=moves) for name in given.coefficients
+            name: Argument((), float, lanes=False, moves=static.moves)
+            for name in given.coefficients
         },
-        offsets=replace(single(given.offsets), moves=moves),
+        offsets=replace(single(given.offsets), moves=static.moves),
         segments=laid_out(given.segments),
         samples=jax.tree.map(table, given.samples),
         strengths=single(given.strengths),
         noise=single(given.noise),
-        sampled=Argument(("ticks", *given.sampled.shape[1:]), bool, lanes=False),
-        gains=jax.tree.map(table, given.gains),
+        order=Argument(("ticks", *given.order.shape[1:]), int, lanes=False),
+        gains=jax.tree.map(apart, given.gains),
     )
     leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda a: isinstance(a, Argument))
     program = _program(tuple(leaves), structure, static)
-    count, ticks = given.offsets.shape[-1], len(given.sampled)
-    return program(given, tangents, lanes=count, turns=ticks)
+    count, ticks = given.offsets.shape[-1], len(given.order)
+    return program(given, tangents, lanes=count, turns=ticks, wanted=wanted)
 
 
 @lru_cache(maxsize=16)
@@ -299,8 +331,17 @@ def _observer(given: _Given, static: _Static) -> tuple[Observer, State]:
     return Observer.of(static.simulator, feed, model, given.strengths)
 
 
-def _filter(given: _Given, static: _Static, ticks: int) -> Any:
-    """Filter one segment: whitened innovations, losses, triangular factors and gains, by ticks."""
+def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Array]:
+    """Return which rows of a tick are sampled, by a number below their count."""
+
+    def order(number: Array) -> Array:
+        return lax.dynamic_slice(given.order, (tick, number), (1, 1))[0, 0]
+
+    return order, order(jnp.asarray(given.order.shape[1] - 1))
+
+
+def _filter(given: _Given, static: _Static, ticks: int) -> _Told:
+    """Filter one segment."""
     observer, first = _observer(given, static)
     in_flight, processes = static.in_flight, observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
@@ -311,25 +352,25 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
     def tick(carried: Any, number: Array) -> Any:
         state, pushed, matrices, before, beyond = carried
         covariance, gain, scratch = matrices
-        samples = row_of(given.samples, number)
+        read = row_of(given.samples, number)
 
-        def compare(change: Array) -> Array:
+        def compare(change: list[Array]) -> list[Array]:
             now = observer.seen(observer.corrected(state, change, number, 0), number)
             # a sample between two ticks tells of the state, however near the first it was taken
             along = jax.tree.map(lambda at, to: at + to - lax.stop_gradient(to), before, now)
-            return observer.errors(now, along, samples)
+            return observer.errors(now, along, read)
 
-        error, changes = jax.linearize(compare, jnp.zeros(shown))
-        seen = rows_of(lambda i: changes(jnp.where(jnp.arange(shown) == i, 1.0, 0.0)), shown)
-        variance = jnp.where(observer.sampled(samples), given.noise**2, 1.0)
-        sampled = row_of(given.sampled, number)
-        (covariance, gain), (white, factors) = updated(
-            (covariance, gain), (error, seen, variance), sampled
+        error, changes = jax.linearize(compare, [jnp.zeros(())] * shown)
+        variance = jnp.where(observer.sampled(read), given.noise**2, 1.0)
+        samples = Samples(
+            jnp.concatenate(error), variance, Sparse.of(changes, shown), *_sampled(given, number)
         )
-        scatter = sum(jnp.log(factors[i, i]) for i in range(wide))
-        loss = 0.5 * jnp.sum(deviance(white)) + scatter
+        told = innovations_of(covariance, gain, samples)
+        white, factors = told.white, told.factors
+        root = jnp.stack([factors[i, i] for i in range(wide)])
+        loss = 0.5 * jnp.sum(deviance(white)) + jnp.sum(jnp.log(root))
         corrects, beyond = gated(white, beyond)
-        change = -weighted(gain, corrects)
+        change = -told.corrections(samples, corrects)
         state = observer.corrected(state, change[:-COUNT], number, in_flight)
         pushed = pushed + change[-COUNT:]
         before = observer.seen(state, number)
@@ -341,12 +382,11 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
             return jnp.concatenate([numbers, processes.keeps * change[-COUNT:]]), after
 
         _, follow, after = jax.linearize(advance, jnp.zeros(size), has_aux=True)
-        covariance, scratch = propagated(covariance, scratch, follow, unrest)
-        single = None
-        if static.gains:
-            single = rows_of(lambda i: row(gain, i, size).astype(jnp.float32), wide)
-        carried = after, pushed * processes.keeps, (covariance, gain, scratch), before, beyond
-        return carried, (white, loss, factors.astype(jnp.float32), single)
+        covariance, scratch = propagated((covariance, scratch), told, samples, follow, unrest)
+        gains = rows_of(lambda i: row(told.gain, i, size).astype(jnp.float32), wide)
+        matrices = covariance, told.gain, scratch
+        carried = after, pushed * processes.keeps, matrices, before, beyond
+        return carried, _Told(white, root, loss, factors.astype(jnp.float32), gains)
 
     sd = jnp.concatenate([first_sd, processes.sd])
     diagonal = jnp.arange(size)[:, None] == jnp.arange(size)
@@ -357,7 +397,8 @@ def _filter(given: _Given, static: _Static, ticks: int) -> Any:
         observer.seen(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )
-    return lax.scan(tick, begin, jnp.arange(ticks))[1]
+    told: _Told = lax.scan(tick, begin, jnp.arange(ticks))[1]
+    return told
 
 
 def _innovations(given: _Given, static: _Static, ticks: int) -> Array:
@@ -370,33 +411,28 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> Array:
 
     def tick(carried: Any, number: Array) -> tuple[Any, Array]:
         state, pushed, before, beyond = carried
-        error = observer.errors(observer.seen(state, number), before, row_of(given.samples, number))
+        read = row_of(given.samples, number)
+        error = jnp.concatenate(observer.errors(observer.seen(state, number), before, read))
+        order, count = _sampled(given, number)
 
         def row_of_tick(table: Array, i: Array, count: int) -> Array:
             found = lax.dynamic_slice(table, (number, i, 0), (1, 1, count))[0, 0]
             return found.astype(error.dtype)
 
-        def whitened(i: Array, white: Array) -> Array:
+        def whitened(place: Array, white: Array) -> Array:
+            i = order(place)
             factor = row_of_tick(factors, i, wide)
             alone = (at(error, i) - factor @ white) / at(factor, i)
             after: Array = lax.dynamic_update_index_in_dim(white, alone, i, 0)
             return after
 
-        def corrected(i: Array, change: Array) -> Array:
+        def corrected(place: Array, change: Array) -> Array:
+            i = order(place)
             return change - at(corrects, i) * row_of_tick(gains, i, size)
 
-        def of_sampled(step: Callable[[Array, Array], Array], start: Array) -> Array:
-            def turn(i: Array, so_far: Array) -> Array:
-                some = lax.dynamic_slice(given.sampled, (number, i), (1, 1))[0, 0]
-                after: Array = lax.cond(some, step, lambda _, same: same, i, so_far)
-                return after
-
-            total: Array = lax.fori_loop(0, wide, turn, start)
-            return total
-
-        white = of_sampled(whitened, jnp.zeros(wide))
+        white = lax.fori_loop(0, count, whitened, jnp.zeros(wide))
         corrects, beyond = gated(white, beyond)
-        change = of_sampled(corrected, jnp.zeros(size))
+        change = lax.fori_loop(0, count, corrected, jnp.zeros(size))
         state = observer.corrected(state, change[:-COUNT], number, in_flight)
         pushed = pushed + change[-COUNT:]
         before = observer.seen(state, number)

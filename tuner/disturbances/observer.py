@@ -5,6 +5,7 @@ Fed with recorded set-points; what a filter corrects of its state, and what samp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -135,8 +136,10 @@ class Observer(eqx.Module):
         slots = self._slots(len(line), tick, in_flight)
         return jnp.concatenate([rows, *(row_of(line, slot) for slot in slots)])
 
-    def corrected(self, state: State, change: Array, tick: Array, in_flight: int) -> State:
-        """Return a state moved by a change (n, F); its attitude stays a rotation."""
+    def corrected(
+        self, state: State, change: Sequence[Array] | Array, tick: Array, in_flight: int
+    ) -> State:
+        """Return a state moved by a change of its n numbers; its attitude stays a rotation."""
         leaves, structure = jax.tree.flatten(_parts(state))
         moved = [leaf + row for leaf, row in zip(leaves, change[: len(leaves)], strict=True)]
         motion, rotor_speed, integral, gyro = jax.tree.unflatten(structure, moved)
@@ -148,7 +151,7 @@ class Observer(eqx.Module):
             rotors = len(rotor_speed)
             for number, slot in enumerate(self._slots(len(line), tick, in_flight)):
                 first = len(leaves) + number * rotors
-                row = row_of(line, slot) + change[first : first + rotors]
+                row = row_of(line, slot) + jnp.asarray(change[first : first + rotors])
                 line = lax.dynamic_update_index_in_dim(line, row, slot, 0)
         return replaced(
             state,
@@ -211,8 +214,11 @@ class Observer(eqx.Module):
 
     def errors(
         self, now: dict[str, Array], before: dict[str, Array], samples: dict[str, Sampled]
-    ) -> Array:
-        """Return what is seen minus what was sampled (m, F), in standard deviations."""
+    ) -> list[Array]:
+        """Return what is seen minus what was sampled, channel by channel, in standard deviations.
+
+        Their rows are m in all.
+        """
         rows = []
         for name in self.channels:
             sample = samples[name]
@@ -228,7 +234,7 @@ class Observer(eqx.Module):
             else:
                 error = there - sample.values
             rows.append(jnp.where(sample.weight > 0, error * sample.weight, 0.0))
-        return jnp.concatenate(rows)
+        return rows
 
 
 def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory]:

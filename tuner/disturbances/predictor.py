@@ -139,11 +139,11 @@ class Predictor:
         share = np.count_nonzero(whole[:some]) / max(int(np.count_nonzero(whole)), 1)
         steps = steps_from(self.strengths)
         here = likelihood_of(self.found, some)
-        beside = self._beside(objective, point, steps, some)
-        slope, information, moved = slopes_of(here, beside, steps)
+        slope, information, moved = slopes_of(
+            here, self._beside(objective, point, steps, some), steps
+        )
         ticks = np.zeros((len(moved), *whole.shape))
-        on_ticks = moved.reshape(len(moved), some, whole.shape[-1], -1)
-        ticks[:, :some] = np.moveaxis(on_ticks, -1, 2)
+        ticks[:, :some] = moved
         return Slopes(slope / share, information / share, ticks / share)
 
     def _beside(
@@ -238,9 +238,13 @@ class Predictor:
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:
         """Return the predictor of some flights alone."""
+        assert self.found is not None
+        gains = self.found.gains
         feed, found = jax.tree.map(
-            lambda leaf: np.asarray(leaf)[..., flights], (self.feed, self.found)
+            lambda leaf: np.asarray(leaf)[..., flights],
+            (self.feed, replace(self.found, gains=None)),
         )
+        found = replace(found, gains=None if gains is None else gains.among(flights))
         rows = {name: tick[:, flights] for name, tick in self.rows.items()}
         return replace(self, feed=feed, found=found, rows=rows)
 
@@ -279,16 +283,17 @@ class Predictor:
 
     def _stepped(self, other: Objective, point: Point) -> Predictor:
         """Return the predictor whose physics runs in the finer steps of another problem."""
-        assert self.found is not None
-        times = other.schedule.physics_rate // self.simulator.schedule.physics_rate
         segments, found = self.feed.segments, self.found
+        assert found is not None
+        assert found.gains is not None
+        times = other.schedule.physics_rate // self.simulator.schedule.physics_rate
         inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
         gains = stepped(found.gains, self.simulator, self._expected(other, point), times)
         return replace(
             self,
             simulator=other.simulator,
             feed=replace(self.feed, segments=replace(segments, inlet=inlet)),
-            found=replace(found, gain=gains.gain),
+            found=replace(found, gains=gains),
         )
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
@@ -297,6 +302,7 @@ class Predictor:
         The columns of the others are zero.
         """
         assert self.found is not None
+        assert self.found.gains is not None
         count = len(point.coefficients)
         size = count + len(point.offsets)
         feed, expected = self._fed(point), self._expected(objective, point)
@@ -304,8 +310,7 @@ class Predictor:
         residuals: dict[str, Any] = {}
         for first in range(0, max(len(moved), 1), AT_ONCE):
             some = list(moved[first : first + AT_ONCE])
-            directions = np.zeros((AT_ONCE if some else 0, size))
-            directions[np.arange(len(some)), some] = 1.0
+            directions = np.eye(size)[some] if some else None
             errors, derivatives = innovations(
                 self.simulator, feed, self.found.gains, expected, directions
             )
@@ -316,16 +321,11 @@ class Predictor:
 
 
 def likelihood_of(found: Filtered, ticks: int, segments: slice = slice(None)) -> Likelihood:
-    """Return what a filter makes of some segments' first ticks, row by row in each tick."""
-    loss, white, factors = (
-        np.asarray(rows[:ticks, ..., segments]) for rows in (found.loss, found.white, found.factors)
+    """Return what a filter makes of some segments' first ticks."""
+    white, root, loss = (
+        np.asarray(rows[:ticks, ..., segments]) for rows in (found.white, found.root, found.loss)
     )
-    wide = white.shape[1]
-    return Likelihood(
-        float(np.sum(loss)),
-        np.moveaxis(white, -1, 1).reshape(-1, wide),
-        np.moveaxis(factors, -1, 1).reshape(-1, wide, wide),
-    )
+    return Likelihood(float(np.sum(loss)), white, root)
 
 
 def unscaled(criterion: Criterion) -> Criterion:

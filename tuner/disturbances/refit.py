@@ -24,9 +24,10 @@ from tuner.core.numerics import scaled_solve
 from tuner.disturbances.disturbances import LEAST, MOST, within
 from tuner.disturbances.predictor import Predictor, unscaled
 from tuner.disturbances.recorded import gathered
-from tuner.objective.criterion import Criterion, Point, SegmentSums
+from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import gauss_newton, robust
+from tuner.objective.segments import CLOCKS
 from tuner.objective.space import Space
 from tuner.recordings.flight import Flight
 from tuner.search.normal_equations import normal_equations
@@ -40,6 +41,9 @@ DAMPED = (0.0, 0.1, 1.0, 10.0, 100.0)
 """Shares of the Hessian's diagonal that are added to it until a step leads down (Levenberg)."""
 FURTHEST = float(np.log(4.0))
 """That a strength moves at a time: beyond, the likelihood is no parabola."""
+ASIDE = 0.25
+"""Share of a tick by which a clock moves before samples are laid on ticks again: until then they
+are met by the straight line through the two ticks that they were laid between."""
 ENOUGH = 0.1
 """Gain that a step promises, in half a unit of χ², below which it is not worth taking."""
 
@@ -67,15 +71,16 @@ def with_least_innovations(
     objective, point, criterion = problem
     criterion = unscaled(criterion)
     point = Point(point.coefficients, predictor.feed.offsets)
+    laid, rate = point.offsets, float(objective.schedule.log_rate)
     predictor = predictor.at(objective, point)
     for _ in range(steps):
         lower = _lower(predictor, objective, point, criterion, free)
         if lower is None:
             break
         predictor, point = lower
-        settled = predictor.laid(objective, point, flights)
-        if any((settled.rows[name] != predictor.rows[name]).any() for name in predictor.rows):
-            predictor = settled.at(objective, point)
+        if np.abs(point.offsets - laid)[: len(CLOCKS)].max() * OFFSET_UNIT * rate > ASIDE:
+            laid = point.offsets
+            predictor = predictor.laid(objective, point, flights).at(objective, point)
         predictor = predictor.as_noisy(objective, point)
     return predictor, point
 

@@ -21,8 +21,6 @@ from tuner.disturbances.disturbances import MOST
 
 Array = NDArray[np.float64]
 
-AT_ONCE = 2**16
-"""Numbers of a row whose products are summed up at a time."""
 STEP = 0.02
 """Of a logarithm, over which is differentiated."""
 
@@ -34,16 +32,14 @@ class Likelihood(NamedTuple):
     ----------
     loss
         Negative log-likelihood.
-    white
-        (n, m) innovations, whitened.
-    factors
-        (n, m, m) the triangular root of their covariance before. In single precision where memory
-        counts: no more than derivatives are made of it.
+    white, root
+        (T, m, F) innovations, each given those before it in its tick, over their standard
+        deviations, and those.
     """
 
     loss: float
-    white: NDArray[np.floating]
-    factors: NDArray[np.floating]
+    white: Array
+    root: Array
 
 
 class Slopes(NamedTuple):
@@ -56,7 +52,7 @@ class Slopes(NamedTuple):
     information
         (7, 7) Fisher's.
     moved
-        (7, n, m) derivatives of the innovations, whitened by the covariance that they had.
+        (7, T, m, F) derivatives of the innovations over the standard deviations that they had.
     """
 
     slope: Array
@@ -81,26 +77,13 @@ def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> S
     steps
         (7,) see `steps_from`.
     """
-    some = np.flatnonzero(here.white.any(axis=1))  # the others are as they were
-    wide = here.white.shape[1]
-    whitens, one = np.linalg.inv(here.factors[some].astype(float)), np.eye(wide)
-    moves = np.zeros((len(steps), *here.white.shape))
-    below = np.tril_indices(wide)
-    # of a symmetric matrix's squares those off the diagonal count twice, and all by a half
-    counts = np.where(below[0] == below[1], np.sqrt(0.5), 1.0)
-    slope, spreads = np.zeros(len(steps)), []
+    moves, spreads = np.zeros((2, len(steps), *here.white.shape))
+    slope = np.zeros(len(steps))
     for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
-        turn = whitens @ there.factors[some]
-        turned = np.matmul(turn, there.white[some, :, None])[..., 0]
-        moved = moves[number, some] = (turned - here.white[some]) / step
-        spread = counts * ((turn @ np.swapaxes(turn, 1, 2) - one) / step)[:, *below]
-        spreads.append(spread.astype(np.float32).ravel())
-        ahead = (there.loss - here.loss) / step
-        bend = np.sum(moved**2) + np.sum(spread**2)
-        slope[number] = ahead - 0.5 * step * bend  # of a parabola where it begins
-    flat = moves.reshape(len(steps), -1)
-    information = flat @ flat.T
-    for first in range(0, len(spreads[0]), AT_ONCE):
-        part = np.array([spread[first : first + AT_ONCE] for spread in spreads], float)
-        information += part @ part.T
-    return Slopes(slope, information, moves)
+        turn = there.root / here.root
+        moves[number] = (turn * there.white - here.white) / step
+        spreads[number] = np.sqrt(0.5) * (turn**2 - 1.0) / step
+        bend = np.sum(moves[number] ** 2) + np.sum(spreads[number] ** 2)
+        slope[number] = (there.loss - here.loss) / step - 0.5 * step * bend  # where it begins
+    flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
+    return Slopes(slope, sum(part @ part.T for part in flat), moves)

@@ -99,7 +99,7 @@ def test_each_channels_errors_stand_where_its_columns_are_looked_for(begin):
     }
     widths = Feed(None, None, jax.tree.map(lambda leaf: leaf[None], samples)).widths
     errors = jax.jit(lambda taken: observer.errors(seen, seen, taken))(samples)
-    table, rows = np.asarray(errors)[None], {name: np.zeros((1, 1), int) for name in CHANNELS}
+    table, rows = np.concatenate(errors)[None], {name: np.zeros((1, 1), int) for name in CHANNELS}
     for name, part in gathered(table, widths, rows).items():
         np.testing.assert_allclose(part, too_small[name], atol=1e-9)
 

@@ -244,7 +244,6 @@ def test_strengths_that_are_filtered_side_by_side_tell_what_each_does_alone(fitt
     most = information.max()  # of commands, of which none were recorded, there is none
     np.testing.assert_allclose(found.slope, slope, atol=1e-6 * np.sqrt(most))
     np.testing.assert_allclose(found.information, information, atol=1e-6 * most)
-    moved = np.moveaxis(moved.reshape(7, ticks, -1, moved.shape[-1]), -1, 2)
     np.testing.assert_allclose(found.moved, moved, atol=1e-5 * np.abs(moved).max())
 
 
@@ -331,8 +330,8 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
     stepped = predictor._stepped(finer, point)
     here, there = (np.asarray(of.found.gains.gain) for of in (stepped, own))
-    expected = there[:, :, -COUNT - 12 : -COUNT]
-    on_their_way = here[:, :, -COUNT - 16 : -COUNT - 4] - expected
+    expected = there[..., -COUNT - 12 : -COUNT]
+    on_their_way = here[..., -COUNT - 16 : -COUNT - 4] - expected
     assert np.std(on_their_way) < 0.01 * np.std(expected)
     coarse = predictor.jacobian(late, point, []).residuals
     found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))

@@ -44,7 +44,7 @@ def drawn(truth: np.ndarray, seed: int) -> Callable[[np.ndarray], Likelihood]:
         factor = root(strengths)
         white = np.linalg.solve(factor, samples.T).T
         loss = 0.5 * np.sum(white**2) + SAMPLES * np.log(np.diag(factor)).sum()
-        return Likelihood(float(loss), white, np.broadcast_to(factor, (SAMPLES, WIDE, WIDE)))
+        return Likelihood(float(loss), white, np.broadcast_to(np.diag(factor), white.shape))
 
     return filtered
 
