@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.signal import lfilter
 
+from sim_jax.constants import GRAVITY
 from sim_jax.disturbance import Disturbance
-from sim_jax.numeric import GRAVITY
 from sim_jax.vector import Vec3
 
 GUST, GUST_TIME = 0.1, 1.0

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import wandering
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.core.disk import write_text
 from tuner.job.new_vehicle import new_vehicle
 from tuner.vehicle.scaling_laws import INCH, Airframe

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
+from sim_jax.constants import GRAVITY
 from sim_jax.disturbance import Disturbance
 from sim_jax.environment import Environment
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.numeric import GRAVITY
 from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover

@@ -14,9 +14,6 @@ Scalar: TypeAlias = Float[Array, "*#batch"]
 #: One truth value per vehicle of the batch.
 Flag: TypeAlias = Bool[Array, "*#batch"]
 
-GRAVITY = 9.81
-"""m/s², acting on the plant."""
-
 
 def saturate(value: Scalar, lower: Scalar | float, upper: Scalar | float) -> Scalar:
     """Limit a value; at a limit the derivative is the inner one, not the mean of both sides."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jaxtyping import Int, PyTree
 
+from sim_jax.constants import GRAVITY
 from sim_jax.control import mixer
 from sim_jax.control.gains import Controller
 from sim_jax.crash import Limits
@@ -15,7 +16,7 @@ from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
 from sim_jax.markers import estimated
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.numeric import Scalar
 from sim_jax.plant import Plant, Sample
 from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from sim_jax.constants import GRAVITY
 from sim_jax.motor import reference_speed
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule

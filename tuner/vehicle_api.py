@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from tuner.config.trajectory_settings import TrajectoryName
+from tuner.config.job import TrajectoryName
 from tuner.core.disk import exists
 from tuner.core.errors import ExportError
 from tuner.core.runtime import configure

@@ -9,7 +9,7 @@ import pytest
 from benchmarks import lab as laboratory
 from benchmarks.lab import Trial, _rows, _voltages, section
 from benchmarks.lab_flights import METER, drawn
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
 from tuner.objective.battery import VOLTAGE
 from tuner.recordings.flight import Series

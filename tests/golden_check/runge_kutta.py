@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.constants import GRAVITY
+from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion, WrenchAt, acceleration, angular_acceleration
 from sim_jax.vehicle import Body
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.constants import GRAVITY
 from sim_jax.inlet import ActuatorInlet, Inlet, MixedInlet, Stages, Step
-from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import jax
 import pytest
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from sim_jax.rigid_body import Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Body

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.constants import GRAVITY
 from sim_jax.inlet import ActuatorInlet, BodyRateInlet, Inlet, ReferenceInlet, RotorSpeedInlet
-from sim_jax.numeric import GRAVITY
 from sim_jax.rollout import Rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, hover

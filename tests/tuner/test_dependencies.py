@@ -28,13 +28,14 @@ TOOLS = {"dev", "docs"}
 OURS = {"lanes", "sim_jax", "tuner", "tests", "benchmarks", "examples", "docs"}
 
 TARGETS = "tuner/exporters/targets"
+STORE = "tuner/core/content_store.py"
 #: Extra -> the folders and files that need it beside what is always installed.
 USES = {
     None: ("lanes", "sim_jax", "tuner", "examples", "docs"),
     "test": ("tests",),
     "bench": ("benchmarks",),
-    "cluster": ("tuner/engine",),
-    "service": ("tuner/service", "tuner/client"),
+    "cluster": ("tuner/engine", STORE),
+    "service": ("tuner/service", "tuner/client", STORE),
     "postgresql": (),
     "matlab": ("tuner/recordings/matlab.py",),
     "simulators": tuple(f"{TARGETS}/{name}.py" for name in ("mujoco", "drone_models", "rotorpy")),

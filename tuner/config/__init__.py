@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from tuner.config.job import CHANNELS, JobFile, read_job
+from tuner.config.job import CHANNELS, JobFile, TrajectorySettings, read_job
 from tuner.config.settings import Settings, find_job_file, settle
-from tuner.config.trajectory_settings import TrajectorySettings
 from tuner.options import Options
 
 __all__ = [

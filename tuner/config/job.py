@@ -8,7 +8,6 @@ from typing import Annotated, Literal, Self
 from annotated_types import Ge, Interval, Len
 from pydantic import AfterValidator, Field, model_validator
 
-from tuner.config.trajectory_settings import TrajectorySettings
 from tuner.core.errors import ConfigError, did_you_mean
 from tuner.core.shipped import EXPORT_TARGETS, Kind, find_config
 from tuner.core.yaml_section import (
@@ -134,6 +133,41 @@ class Search(Section):
     robust: Literal["huber", "none"] = "huber"
     window: Annotated[Number, Interval(ge=0.1, le=60)] | None = None
     max_iterations: Annotated[Whole, Interval(ge=1, le=100_000)] = 100
+
+
+def _of_a_shape(name: str) -> str:
+    from sim_jax.trajectory import shapes  # noqa: PLC0415 (loads JAX, which most commands spare)
+
+    if name not in shapes():
+        raise refuse(f"there is no trajectory '{name}'", f"name one of {', '.join(shapes())}")
+    return name
+
+
+TrajectoryName = Annotated[str, AfterValidator(_of_a_shape)]
+
+
+class TrajectorySettings(Section):
+    """The trajectory of a recording that holds no reference; keys and units of ``tune simulate``.
+
+    Attributes
+    ----------
+    name
+        Which shape.
+    radius
+        m.
+    omega
+        rad/s.
+    speed_scale
+        The publisher's velocity scaler.
+    yaw_rate
+        rad/s, of a yaw spin.
+    """
+
+    name: TrajectoryName
+    radius: Positive = 2.0
+    omega: Positive = 0.7
+    speed_scale: Positive = 2.1
+    yaw_rate: Number = 2.0
 
 
 class FlightSettings(Section):

@@ -17,8 +17,6 @@ from scipy.special import ndtri  # scipy.stats takes a quarter of a second to im
 
 Array = NDArray[np.float64]
 
-GRAVITY = 9.81
-"""m/s², as in `sim_jax.numeric`, for what imports no jax."""
 Z95 = float(ndtri(0.975))
 """Standard deviations of a normal distribution that a 95 % interval reaches to either side."""
 ROBUST = 1.4826

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.numerics import errors_of

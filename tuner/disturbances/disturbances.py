@@ -21,8 +21,9 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from sim_jax.constants import GRAVITY
 from sim_jax.disturbance import Disturbance
-from sim_jax.numeric import GRAVITY, Scalar
+from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 

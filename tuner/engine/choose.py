@@ -6,11 +6,34 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from tuner.core.errors import ConfigError
+from tuner.core.errors import ConfigError, InputError
 from tuner.core.yaml_section import build
 from tuner.engine.cluster_file import ClusterFile, read_cluster
 from tuner.engine.engine import HERE, Engine, using
-from tuner.engine.extra import extra
+
+PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
+
+
+@contextmanager
+def extra() -> Iterator[None]:
+    """Turn a missing package of ``multirotor-tune[cluster]``, imported inside, into one line.
+
+    Raises
+    ------
+    InputError
+        It is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in PACKAGES:
+            raise
+        raise InputError(
+            "--workers and --cluster",
+            f"need {package}, which is not installed",
+            "pip install 'multirotor-tune[cluster]'",
+        ) from None
 
 
 def cluster_for(workers: int | None, cluster: str | None) -> ClusterFile | None:

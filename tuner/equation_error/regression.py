@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95
+from tuner.core.numerics import Z95, robust_sd
 from tuner.equation_error.measured import Mask, Measured
 from tuner.equation_error.model import Accelerations, Linear
 from tuner.recordings.flight import Array
@@ -250,7 +250,7 @@ def convolved(table: Array, known: Mask, kernel: Array) -> Array:
 
 def spread(values: Array) -> float:
     """Return a robust standard deviation about zero."""
-    return max(1.4826 * float(np.median(np.abs(values))), 1e-9)
+    return max(float(robust_sd(values)), 1e-9)
 
 
 def whitening(one: Linear, part: Measured, memory: float) -> Kernels:

@@ -16,8 +16,8 @@ import numpy as np
 from jax import Array as JaxArray
 
 from lanes import Argument, Program
+from sim_jax.constants import GRAVITY
 from sim_jax.environment import Environment
-from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air

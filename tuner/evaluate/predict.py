@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
-from sim_jax.numeric import GRAVITY
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
 from tuner.objective.battery import with_reference_voltage

@@ -16,9 +16,9 @@ from annotated_types import Interval
 from jax import lax
 
 from lanes import Argument, Program
+from sim_jax.constants import GRAVITY
 from sim_jax.environment import NOTHING_AROUND
 from sim_jax.inlet import Inlet
-from sim_jax.numeric import GRAVITY
 from sim_jax.precision import Precision
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
-from tuner.core.numerics import GRAVITY
 from tuner.exporters.draft import read_file
 from tuner.exporters.sdf.composite import Array, Inertial, together
 from tuner.exporters.sdf.includes import assembled

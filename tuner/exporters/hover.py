@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from tuner.core.numerics import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.vehicle import VehicleFile
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from statistics import fmean
 
-from tuner.core.numerics import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.exporters.hover import (
     full_thrust,
     hover_command,

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import ConfigError, RecordingError
-from tuner.core.numerics import GRAVITY
 from tuner.ground.bifilar import bifilar
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import Array, Measurement

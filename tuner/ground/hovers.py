@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import ConfigError
-from tuner.core.numerics import GRAVITY
 from tuner.ground.laws import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
 from tuner.ground.measurement import Curve, Measurement, Remark
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.numerics import GRAVITY
+from sim_jax.constants import GRAVITY
 
 
 def bifilar_inertia(

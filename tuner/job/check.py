@@ -9,8 +9,8 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.constants import GRAVITY
 from sim_jax.control.mixer import ROTORS
-from sim_jax.numeric import GRAVITY
 from tuner.core.numerics import symmetric_eigen, unit_diagonal
 from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import Source, squared_speed

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import GRAVITY
 from tuner.objective.explained import squared_speed
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.notes import Note, NoteCode

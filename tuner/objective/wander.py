@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc  # scipy.stats takes a quarter of a second to import
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.noise import FLOOR, white_noise
 from tuner.objective.start import rests

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.core.numerics import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.recordings.flight import Array, Series
 from tuner.recordings.interpolation import (
     body_rate_of,

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.core.numerics import GRAVITY
 from tuner.recordings.flight import Array
 from tuner.recordings.interpolation import upward
 from tuner.recordings.notes import Note, NoteCode

@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from tuner.core.numerics import GRAVITY
+from sim_jax.constants import GRAVITY
 
 AIR = 1.225
 """kg/m³."""

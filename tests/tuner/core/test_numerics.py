@@ -7,9 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import sim_jax.numeric
 from tuner.core.numerics import (
-    GRAVITY,
     Inverse,
     errors_of,
     huber_weights,
@@ -114,7 +112,3 @@ def test_hubers_weights_bound_the_pull_of_an_outlier() -> None:
     error = np.array([0.0, -2.0, 3.0, 300.0])
     assert np.abs(huber_weights(error, 3.0) * error) == pytest.approx([0.0, 2.0, 3.0, 3.0])
     assert huber_weights(error, np.inf) == pytest.approx(1.0)
-
-
-def test_gravity_is_the_simulators() -> None:
-    assert GRAVITY == sim_jax.numeric.GRAVITY

@@ -54,7 +54,6 @@ def models() -> list[type[BaseModel]]:
                 "tuner.recordings.topics",
                 "tuner.service.request",
                 "tuner.evaluate.simulate",
-                "tuner.config.trajectory_settings",
             )
         ):
             importlib.import_module(module.name)

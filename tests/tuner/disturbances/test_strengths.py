@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from tests.sim_jax.support import vehicle
 from tuner.disturbances.disturbances import (
     FAST,

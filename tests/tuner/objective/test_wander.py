@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_jax.numeric import GRAVITY
+from sim_jax.constants import GRAVITY
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.wander import wander_of
 from tuner.recordings.flight import Flight, InitialState, Series

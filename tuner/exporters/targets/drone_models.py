@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.constants import GRAVITY
 from tuner.core.disk import file_name
-from tuner.core.numerics import GRAVITY
 from tuner.core.yaml_document import commented
 from tuner.exporters.draft import Draft, Gate, differences, read_file
 from tuner.exporters.flier import flier
