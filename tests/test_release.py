@@ -62,7 +62,9 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 SHIPPED = """
-from tuner.config import configs_folder, find_config, read_job, read_vehicle
+from tuner.config import read_job
+from tuner.core.shipped import configs_folder, find_config
+from tuner.vehicle import read_vehicle
 from tuner.recordings.topics import load_topic_map
 
 print(read_vehicle(find_config("vehicles", "hovergames", configs_folder())).name)
