@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -49,6 +51,20 @@ class Disturbance(eqx.Module):
 
         now: Disturbance = jax.tree.map(between, row_of(self, before), row_of(self, before + 1))
         return now
+
+    def plus(self, other: Disturbance) -> Disturbance:
+        """Return what both are together, in this one's ticks."""
+
+        def both(first: Any, second: Any) -> Any:
+            return first if second is None else second if first is None else first + second
+
+        return Disturbance(
+            gust=both(self.gust, other.gust),
+            force=both(self.force, other.force),
+            thrust=both(self.thrust, other.thrust),
+            moment=both(self.moment, other.moment),
+            rate=self.rate,
+        )
 
     def added_to(self, wrench: Wrench, motion: Motion) -> Wrench:
         """Return what acts about the centre of mass where values (\\*batch) act besides."""

@@ -95,6 +95,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "position and attitude controllers that see that frame, or with controllers that see the "
     "centre of mass and the body's axes, other than the controller file has it; it was simulated "
     "so. Set sensing.sees_markers in the controller file.",
+    Code.LAW_LACKING: "Recorded accelerations hold a force or moment that the model does not; the "
+    "line says along which axis, what it goes with, which coefficients it may have moved, whose "
+    "intervals hold that, and which terms are of that kind.",
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",

@@ -16,6 +16,7 @@ from jax import Array, lax
 from jaxtyping import Float
 
 from sim_jax.crash import AIRBORNE
+from sim_jax.disturbance import Disturbance
 from sim_jax.markers import markers_of
 from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
@@ -175,6 +176,9 @@ class Observer(eqx.Module):
     def next(self, state: State, pushed: Array, tick: Array) -> State:
         """Return the state a tick later, pushed by the processes' values (D, *F)."""
         acting = disturbance_of((self.processes.acts * pushed.T).T)
+        if self.plant.environment.disturbance is not None:
+            known: Disturbance = row_of(self.plant.environment.disturbance, tick)
+            acting = acting.plus(known)
         environment = eqx.tree_at(
             lambda e: (e.disturbance, e.draught),
             self.plant.environment,

@@ -282,7 +282,7 @@ class Predictor:
         )
 
     def _stepped(self, other: Objective, point: Point) -> Predictor:
-        """Return the predictor whose physics runs in the finer steps of another problem."""
+        """Return the predictor of another problem, in finer steps of physics or pushed along."""
         segments, found = self.feed.segments, self.found
         assert found is not None
         assert found.gains is not None
@@ -292,7 +292,10 @@ class Predictor:
         return replace(
             self,
             simulator=other.simulator,
-            feed=replace(self.feed, segments=replace(segments, inlet=inlet)),
+            feed=replace(
+                self.feed,
+                segments=replace(segments, inlet=inlet, disturbance=other.segments.disturbance),
+            ),
             found=replace(found, gains=gains),
         )
 

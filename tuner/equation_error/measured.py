@@ -37,6 +37,8 @@ class Measured:
     ----------
     step
         s.
+    time
+        (N,) s since the flight's start, at mid-step.
     motion
         At mid-step, leaves (N,); of the rotors' speed the mean over the step.
     rotor_speed, rotor_acceleration
@@ -51,6 +53,7 @@ class Measured:
     """
 
     step: float
+    time: Array
     motion: Motion
     rotor_speed: Array
     rotor_acceleration: Array
@@ -108,6 +111,7 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     accelerations[unknown] = np.nan
     return Measured(
         step=1.0 / rate,
+        time=middle,
         motion=Motion(
             Vec3.of(jnp.asarray(state.position.T)),
             Vec3.of(jnp.asarray(state.velocity.T)),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from tuner.core.phrases import as_sentence, listed
+from tuner.core.phrases import as_sentence, listed, percent
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentence, note_in_words
 
 if TYPE_CHECKING:
@@ -25,6 +25,25 @@ PREDICTED: Mapping[str, str] = {
     "body_rate": "rad/s",
 }
 """What predictions are compared by, with its unit."""
+
+GOES_WITH: Mapping[str, str] = {
+    "airspeed": "the airspeed along it",
+    "airspeed_squared": "the square of the airspeed along it",
+    "airspeed_across": "the airspeed across it",
+    "rate": "the body rate about it",
+    "rate_squared": "the square of the body rate about it",
+    "other_rates": "the product of the other two body rates",
+}
+"""What a force or moment may go with, as of `tuner.equation_error.unexplained`."""
+TERMS_LIKE: Mapping[tuple[str, str], tuple[str, ...]] = {
+    ("force", "airspeed"): ("rotor_drag_ratio", "linear_drag", "thrust_inflow"),
+    ("force", "airspeed_squared"): ("fuselage_drag",),
+    ("moment", "airspeed_across"): ("flapping_moment", "center_of_mass"),
+    ("moment", "airspeed"): ("flapping_moment", "center_of_mass"),
+    ("moment", "rate"): ("angular_drag", "thrust_inflow"),
+    ("moment", "other_rates"): ("center_of_mass",),
+}
+"""Kind of push and what it goes with -> groups of terms that have it."""
 
 
 def recording(finding: Finding) -> str:
@@ -149,6 +168,36 @@ def disturbances_followed(finding: Finding) -> str:
         f"{100.0 * numbers['thrust']:.2g} % for {1e3 * numbers['thrust_seconds']:.0f} ms. The "
         "coefficients are those that then predict every sample best from the ones before."
     )
+
+
+def law_lacking(finding: Finding) -> str:
+    """Return which law the model lacks, and whose intervals hold what it may have moved."""
+    axis, feature, *moved = finding.names
+    what, along = axis.split("_")
+    share = finding.numbers["share"]
+    if feature == "rotor_speed":
+        slower = "less" if share < 0.0 else "more"
+        law = f"thrust grows {slower} with rotor speed than its law has it"
+    else:
+        goes = "against" if share < 0.0 else "with"
+        kind = "force along" if what == "force" else "moment about"
+        with_what = GOES_WITH[feature]
+        if feature == "airspeed_across" and axis == "force_z":
+            with_what = "the square of the airspeed across it"
+        law = f"there is a {kind} body {along} that goes {goes} {with_what}"
+    return (
+        f"Recorded accelerations hold what the model does not: {law}, of {percent(abs(share))} of "
+        f"what varies there. It may have moved {listed(moved)}, whose intervals hold that."
+    )
+
+
+def law_remedy(finding: Finding) -> str:
+    """Return which terms there are of that kind."""
+    axis, feature, *_ = finding.names
+    terms = TERMS_LIKE.get((axis[:-2], feature))
+    if terms is None:
+        return "No term has that law: judge the fit by the held-out flights."
+    return f"Of that kind are {listed(terms)}: name what the vehicle has under terms in the job."
 
 
 def rotor_changed(finding: Finding) -> str:

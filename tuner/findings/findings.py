@@ -329,6 +329,11 @@ class Code(Worded):
         composed.disturbances_followed,
         "",
     )
+    LAW_LACKING = (
+        "law_lacking",  # share; names: axis, what it goes with, coefficients it moves
+        composed.law_lacking,
+        composed.law_remedy,
+    )
     ROTOR_CHANGED = (
         "rotor_changed",  # seconds, rotor (from 1), loss (share); names: its place
         composed.rotor_changed,

@@ -60,6 +60,7 @@ from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
+from tuner.uncertainty.lacking import laws_lacking
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
@@ -313,6 +314,7 @@ def _known(
         return {}
     uncertainty, known = examination.uncertainty, examination.known
     explanation.notice(finer_than_steps(uncertainty))
+    explanation.notice(laws_lacking(examination.laws, uncertainty))
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )

@@ -19,6 +19,8 @@ STEP = "step"
 """Half the physics step, controllers and log at their own rates."""
 READINGS = "readings"
 """The battery's voltmeter read again, a few times."""
+LACK = "lack"
+"""With what pushes the flights along and is none of the model."""
 DRAWS = 6
 """How many times: an error that is told by so many is told to a third."""
 

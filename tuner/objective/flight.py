@@ -210,6 +210,7 @@ def environment_of(
         log_voltage=log_voltage,
         battery_decline=decline,
         begin=None if decline is None else segments.begin,
+        disturbance=segments.disturbance,
     )
 
 

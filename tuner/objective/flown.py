@@ -178,10 +178,11 @@ def laid_out(segments: Segments) -> Any:
         return Argument((name, *shape[1:]) if name else shape, np.result_type(leaf), lanes=True)
 
     volts = jax.tree.map(partial(each, name="volts"), segments.log_voltage)
+    pushes = jax.tree.map(partial(each, name="pushes"), segments.disturbance)
     return eqx.tree_at(
-        lambda s: [s.inlet, s.log_voltage],
+        lambda s: [s.inlet, s.log_voltage, s.disturbance],
         jax.tree.map(each, segments),
-        [_tables(segments.inlet), volts],
+        [_tables(segments.inlet), volts, pushes],
         is_leaf=lambda leaf: leaf is None or isinstance(leaf, Argument),
     )
 

@@ -13,6 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
+from sim_jax.disturbance import Disturbance
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
@@ -85,6 +86,8 @@ class Segments(eqx.Module):
     """Which segments start at rest, level; None where none does."""
     log_voltage: Float[Array, "ticks F"] | None = None
     """Logarithm of the battery's voltage in V, one a control tick; NaN where it is unknown."""
+    disturbance: Disturbance | None = None
+    """What pushes them, as far as that is known."""
     wander: Float[Array, "L F"] | None = None
     """How far from rest each hover was at its end (`tuner.objective.wander`); None at rest."""
     freedom: Float[Array, "L F"] | None = None

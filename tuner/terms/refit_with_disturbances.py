@@ -32,6 +32,7 @@ from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.full_problem import full_problem_of
 from tuner.uncertainty.holding import with_undetermined_held
+from tuner.uncertainty.lacking import lack_of
 
 CONTRADICTS = 4.0
 """Standard errors by which no coefficient may move. Those of least squares are known from some ten
@@ -129,7 +130,10 @@ def with_disturbances(
         findings=(*again.findings, _finding(predictor)),
     )
     otherwise = alternatives_of(again.objective, again.point)
-    examination = examine(again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt())
+    lack = lack_of(again, job.fitted)
+    examination = examine(
+        again, otherwise=otherwise, predictor=predictor, in_doubt=seen.in_doubt(), lack=lack
+    )
     if any(is_stand_in(name) and name not in _kept(seen.selected) for name in had):
         # what stood in for other terms made another model of it, which says nothing of this one
         fitted = polished(
@@ -140,7 +144,7 @@ def with_disturbances(
             on_progress=partial(on_progress, job),
         )
     otherwise = alternatives_of(fitted.objective, fitted.point)
-    before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt)
+    before = examine(fitted, otherwise=otherwise, in_doubt=selected.in_doubt, lack=lack)
     if not _agree(examination.uncertainty, before.uncertainty):
         on_message("It contradicts the fit of the simulated flights, which is kept.")
         return None

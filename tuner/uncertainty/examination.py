@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
+from tuner.equation_error.unexplained import Law
+from tuner.objective.alternatives import LACK
 from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
 from tuner.objective.information import FisherInformation, information_from_jacobian
@@ -21,6 +23,7 @@ from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.full_problem import FullProblem, full_problem_of
+from tuner.uncertainty.lacking import Lack
 from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
 from tuner.uncertainty.records import Residual
 from tuner.uncertainty.sensitivity_json import (
@@ -55,6 +58,8 @@ class Examination:
         Of every flight and channel.
     full_problem, information
         The problem in all coefficients, the fitted first, and the information about them.
+    laws
+        That recorded accelerations follow beside the model's.
     """
 
     uncertainty: Uncertainty
@@ -64,6 +69,7 @@ class Examination:
     residuals: tuple[Residual, ...]
     full_problem: FullProblem
     information: FisherInformation
+    laws: tuple[Law, ...] = ()
 
     @property
     def known(self) -> Array:
@@ -78,6 +84,7 @@ def examine(
     names: Sequence[str] | None = None,
     otherwise: Mapping[str, Objective] = MappingProxyType({}),
     in_doubt: Mapping[str, float] = MappingProxyType({}),
+    lack: Lack | None = None,
     predictor: Predictor | None = None,
     at_minimum: bool = True,
 ) -> Examination:
@@ -96,6 +103,8 @@ def examine(
     in_doubt
         Coefficient -> how far it would move, in the scaled coordinate, with terms that were left
         out of the model; empty where none was tried.
+    lack
+        What the model is known to lack.
     predictor
         Whose innovations say how well coefficients are known, rather than residuals.
     at_minimum
@@ -104,6 +113,8 @@ def examine(
     names = tuple(fitted.scales) if names is None else tuple(names)
     full_problem = full_problem_of(fitted.objective, fitted.point)
     objective, point, criterion = full_problem.objective, full_problem.point, fitted.criterion
+    if lack is not None:
+        otherwise = {**otherwise, LACK: lack.acting_on(objective)}
     reference = references(objective.space, np.asarray(point.coefficients))
     informations, sensitivities, predicted = [], [], []
     slopes = None
@@ -155,6 +166,7 @@ def examine(
         residuals=tuple(residuals),
         full_problem=full_problem,
         information=information,
+        laws=() if lack is None else lack.laws,
     )
 
 

@@ -30,6 +30,7 @@ from tuner.search.problem import Job
 from tuner.search.progress import Progress
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
+from tuner.uncertainty.lacking import lack_of
 from tuner.uncertainty.verdict import IDENTIFIABLE_ERROR, ReasonCode
 from tuner.vehicle import COEFFICIENTS
 
@@ -57,10 +58,11 @@ def with_undetermined_held(
     says so. All are kept where the flights are met worse by what follows: by anything there, and by
     twice the loss in a closed loop.
     """
+    lack = lack_of(fitted, job.fitted)
 
     def examined(fitted: Fitted) -> Examination:
         otherwise = alternatives_of(fitted.objective, fitted.point, job.fitted)
-        return examine(fitted, otherwise=otherwise, in_doubt=in_doubt)
+        return examine(fitted, otherwise=otherwise, in_doubt=in_doubt, lack=lack)
 
     examination = examined(fitted)
     segments = fitted.objective.segments

@@ -1,4 +1,4 @@
-"""What a standard error is made of: noise, residuals, flights, terms, physics steps, readings."""
+"""What a standard error is made of: noise, residuals, flights, terms, steps, readings, lack."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
 from tuner.core.numerics import Z95, Inverse
-from tuner.objective.alternatives import DRAWS, READINGS, STEP
+from tuner.objective.alternatives import DRAWS, LACK, READINGS, STEP
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.overdispersion import IndependentErrors, parts_of
 from tuner.uncertainty.records import ErrorParts
@@ -41,6 +41,7 @@ class Spread:
     terms: Array | None
     step: Array | None
     readings: Array | None
+    lack: Array | None
     search: Array
 
     @property
@@ -49,13 +50,14 @@ class Spread:
 
         Noise, residuals, left-out flights and left-out terms show the same errors in four ways, of
         which the largest counts; what steps do comes on top, those of the simulation and those that
-        the search did not take, and what inputs do that were read with errors.
+        the search did not take, what inputs do that were read with errors, and what the model is
+        seen to lack.
         """
         error = np.maximum(self.noise, self.residuals)
         for part in (self.left_out, self.terms):
             if part is not None:
                 error = np.maximum(error, part)
-        for part in (self.search, self.step, self.readings):
+        for part in (self.search, self.step, self.readings, self.lack):
             if part is not None:
                 error = np.hypot(error, part)
         return np.asarray(error)
@@ -96,6 +98,7 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
         terms=information.in_doubt,
         step=moved.get(STEP),
         readings=WIDER * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
+        lack=moved.get(LACK),
         search=np.abs(inverse.matrix @ information.slope),
     )
 

@@ -33,6 +33,9 @@ class ErrorParts(Part):
     readings
         How it scatters when the battery's voltmeter is read again, with errors like those that it
         made; None where the fit has no battery, or follows what pushed the flights.
+    lack
+        How far it would move with the laws that recorded accelerations follow beside the model's;
+        None where none was found.
     search
         How far one more linear step would move it: a search ends where its steps gain nothing.
     """
@@ -43,6 +46,7 @@ class ErrorParts(Part):
     terms: FiniteOrNone = None
     step: FiniteOrNone = None
     readings: FiniteOrNone = None
+    lack: FiniteOrNone = None
     search: FiniteOrNone = None
 
 

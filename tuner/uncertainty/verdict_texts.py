@@ -73,6 +73,7 @@ def parts_in_words(parts: ErrorParts, unit: str | None, value: float) -> str:
         "left-out terms": parts.terms,
         "step": parts.step,
         "voltmeter": parts.readings,
+        "what the model lacks": parts.lack,
         "rest of the search": parts.search,
     }
     least = NEGLIGIBLE * max(error or 0.0 for error in named.values())

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from sim_jax.crash import Limits
+from sim_jax.disturbance import Disturbance
 from sim_jax.rollout import rollout
+from sim_jax.vector import Vec3
 from tests.tuner.uncertainty import making
 from tuner.disturbances.disturbances import (
     COMMAND_NOISE,
@@ -357,3 +359,25 @@ def test_one_outlier_is_not_believed_and_many_in_a_row_are(fitted) -> None:
     assert min(once[middle], for_good[middle]) > 50.0
     assert (np.delete(once, middle) < GATE).all()
     assert (for_good[-50:] < GATE).all()  # of 150, as long as it takes to unlearn a velocity
+
+
+def test_a_push_that_is_known_moves_innovations_in_proportion(fitted) -> None:
+    problem, predictor, point = fitted
+    ticks, still = problem.samples + 2, jnp.zeros((problem.samples + 2, 2))
+
+    def pushed(newtons: float) -> dict[str, np.ndarray]:
+        along = jnp.full((ticks, 2), newtons)
+        known = Disturbance(
+            force=Vec3(along, still, still),
+            moment=Vec3(still, still, still),
+            rate=float(problem.schedule.log_rate),
+        )
+        other = replace(problem, segments=replace(problem.segments, disturbance=known))
+        residuals = predictor._stepped(other, point).jacobian(other, point, []).residuals
+        return {name: np.asarray(rows) for name, rows in residuals.items()}
+
+    here = predictor.jacobian(problem, point, []).residuals
+    once, twice = pushed(0.01), pushed(0.02)
+    moved = once["position"] - here["position"]
+    assert np.abs(moved[:, 0]).max() > 10.0 * np.abs(moved[:, 1]).max() > 0.0
+    np.testing.assert_allclose(twice["position"] - here["position"], 2.0 * moved, atol=0.05)

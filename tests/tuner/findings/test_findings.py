@@ -165,6 +165,13 @@ MADE = {
     ),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
+    Code.LAW_LACKING: Finding(
+        Code.LAW_LACKING,
+        "warning",
+        "model",
+        {"share": -0.09},
+        ("force_z", "rotor_speed", "motor_constant", "input_scaling"),
+    ),
     Code.ROTOR_CHANGED: Finding(
         Code.ROTOR_CHANGED,
         "warning",

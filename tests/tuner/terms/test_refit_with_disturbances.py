@@ -168,6 +168,7 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     monkeypatch.setattr(disturbances, "free_offsets", lambda _: np.zeros((0, 0), bool))
     monkeypatch.setattr(disturbances, "polished", polish)
     monkeypatch.setattr(disturbances, "alternatives_of", lambda *_: {})
+    monkeypatch.setattr(disturbances, "lack_of", lambda *_: None)
     monkeypatch.setattr(disturbances, "examine", examine)
     monkeypatch.setattr(disturbances, "_agree", lambda *_: True)
     monkeypatch.setattr(disturbances, "_is_sharper", lambda *_: True)

@@ -52,6 +52,7 @@ def test_what_trades_off_is_held_only_where_that_costs_nothing(monkeypatch, afte
     traded = {"motor_constant": "input_scaling", "input_scaling": "input_scaling"}
     alone = {"time_constant_up": "time_constant_up"}  # open by itself: predicting fits keep it
     monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
+    monkeypatch.setattr(holding, "lack_of", lambda *_: None)
     nothing = SimpleNamespace(uncertainty=SimpleNamespace(names=()))
     monkeypatch.setattr(holding, "examine", lambda *_, **__: nothing)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded | alone)
@@ -97,6 +98,7 @@ def test_a_term_that_flights_do_not_identify_goes_from_its_bound(
         uncertainty=SimpleNamespace(names=(name,), estimates={name: estimate})
     )
     monkeypatch.setattr(holding, "alternatives_of", lambda *_: None)
+    monkeypatch.setattr(holding, "lack_of", lambda *_: None)
     monkeypatch.setattr(holding, "examine", lambda *_, **__: examined)
     monkeypatch.setattr(holding, "stand_ins_of", lambda _: traded)
 

@@ -1,0 +1,174 @@
+"""Laws that a fit lacks: told by what they go with, and in the intervals of what they move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.air import air
+from sim_jax.control.position import ReferencePoint
+from sim_jax.crash import AIRBORNE
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.state import hover
+from sim_jax.vector import Vec3
+from tests.tuner.uncertainty import making
+from tuner.config import JobFile
+from tuner.findings.findings import Code
+from tuner.objective.normal import Objective
+from tuner.objective.segments import Measured, Segments
+from tuner.objective.space import space_of
+from tuner.recordings.flight import Flight, InitialState, Series
+from tuner.uncertainty.examination import examine
+from tuner.uncertainty.lacking import lack_of, laws_lacking
+from tuner.vehicle import with_values
+from tuner.vehicle.model import model_of, schedule_of
+
+SECONDS, FLIGHTS, RATE = 14.0, 3, 100
+FREE = (
+    "inertia_xx",
+    "inertia_yy",
+    "inertia_zz",
+    "input_scaling",
+    "motor_constant",
+    "moment_constant",
+    "rotor_drag_coefficient",
+)
+NOISE = {"position": 5e-4, "attitude": 1e-3, "body_rate": 0.01, "rotor_speed": 2.0}
+FUSELAGE = {"fuselage_drag": 0.05}
+
+
+def references() -> ReferenceInlet:
+    """Return swings along three axes that grow, the last with a turn about up."""
+    time = np.arange(round(SECONDS * RATE)) / RATE
+    grow, still = np.minimum(time / 4.0, 1.0), np.zeros((len(time), FLIGHTS))
+    speeds = np.array([(1.9, 2.6, 1.7), (2.4, 1.3, 1.1), (1.5, 2.2, 1.9)])
+    sizes = np.array([(1.6, 1.1, 0.4), (1.0, 1.9, 0.5), (0.7, 0.5, 0.4)])
+    x, y, z = (grow[:, None] * sizes[:, a] * np.sin(time[:, None] * speeds[:, a]) for a in range(3))
+    nothing = Vec3.zeros(jnp.asarray(still))
+    point = ReferencePoint(Vec3(*map(jnp.asarray, (x, y, z + 1.0))), nothing, nothing)
+    turns = jnp.asarray([False, False, True])
+    return ReferenceInlet(
+        point, spins=turns, yaw_rate=jnp.asarray([0.0, 0.0, 2.0]), level_held=turns
+    )
+
+
+def problem(effects: dict[str, float], *, random: np.random.Generator | None = None) -> Objective:
+    """Return the problem of a vehicle with some effects, in gusts where they are drawn."""
+    vehicle, controller = with_values(making.vehicle_file(), effects), making.controller_file()
+    space = space_of(vehicle, controller, JobFile(free=FREE))
+    model = model_of(vehicle, controller)
+    schedule = schedule_of(controller, log_rate=RATE)
+    at_rest = Vec3(jnp.zeros(FLIGHTS), jnp.zeros(FLIGHTS), jnp.ones(FLIGHTS))
+    start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (FLIGHTS,)),
+        hover(model.vehicle, at_rest),
+    )
+    pushing = None
+    if random is not None:
+        rate = float(schedule.physics_rate)
+        pushing = air(
+            random,
+            shape=(round(SECONDS * rate) + 4, FLIGHTS),
+            rate=rate,
+            mass=vehicle.mass,
+            places=[rotor.position for rotor in vehicle.rotors],
+            spins=[1.0 if rotor.spin == "ccw" else -1.0 for rotor in vehicle.rotors],
+            moment_constant=vehicle.aerodynamics.moment_constant,
+        )
+    samples = round(SECONDS * RATE)
+    segments = Segments(references(), start, {}, jnp.arange(FLIGHTS), disturbance=pushing)
+    return Objective(model, segments, space, schedule, samples, AIRBORNE)
+
+
+def flown(truth: Objective, seed: int) -> tuple[dict[str, Measured], list[Flight]]:
+    """Return what is measured of flights of a truth, at every sample, and the recordings."""
+    random, time = np.random.default_rng(seed), np.arange(truth.samples) / RATE
+    channels = {
+        name: Measured(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None) for name in NOISE
+    }
+    segments = replace(truth.segments, measured=channels)
+    trace = making.fly_at(replace(truth, segments=segments), making.truth(truth))
+    measured, recorded = {}, [dict[str, Series]() for _ in range(FLIGHTS)]
+    for name, sigma in NOISE.items():
+        values = np.array(trace[name])
+        compared = 3 if name == "attitude" else values.shape[1]
+        noise = sigma * random.normal(size=(len(values), compared, FLIGHTS))
+        if name == "attitude":
+            for number in range(FLIGHTS):
+                there = Rotation.from_quat(values[..., number], scalar_first=True)
+                turned = there * Rotation.from_rotvec(noise[..., number])
+                values[..., number] = turned.as_quat(scalar_first=True)
+        else:
+            values = values + noise
+        stamps = jnp.asarray(np.repeat(time[:, None], FLIGHTS, axis=1))
+        weight = jnp.full((len(values), compared, FLIGHTS), 1.0 / sigma)
+        measured[name] = Measured(stamps, jnp.asarray(values), weight)
+        for number, series in enumerate(recorded):
+            series[name] = Series(time, values[..., number])
+    nothing = InitialState(*[np.zeros(3)] * 6)
+    flights = [
+        Flight(f"swing {n}", "", "", RATE, time, {}, series, nothing)
+        for n, series in enumerate(recorded)
+    ]
+    return measured, flights
+
+
+def fit_of(effects: dict[str, float], seed: int, *, gusts: bool):
+    """Return the fit of a vehicle without effects to flights of one that has them; the flights."""
+    air_of = np.random.default_rng([seed, 1]) if gusts else None
+    measured, flights = flown(problem(effects, random=air_of), seed)
+    objective = problem({})
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    fitted = making.fitted_of(objective, making.truth(objective))
+    names = [flight.name for flight in flights]
+    criterion = replace(fitted.criterion, scale={name: jnp.ones(FLIGHTS) for name in NOISE})
+    scales = {name: dict.fromkeys(NOISE, 1.0) for name in names}
+    return replace(fitted, criterion=criterion, scales=scales), flights
+
+
+@pytest.mark.parametrize("gusts", [False, True], ids=["still", "gusts"])
+def test_drag_of_a_fuselage_is_told_without_its_name(gusts):
+    fitted, flights = fit_of(FUSELAGE, 0, gusts=gusts)
+    lack = lack_of(fitted, flights)
+    axes = {law.axis for law in lack.laws if law.feature == "airspeed_squared" and law.share < 0.0}
+    assert axes >= ({"force_z"} if gusts else {"force_x", "force_y", "force_z"})
+
+
+def test_the_right_model_lacks_nothing():
+    alarms = sum(
+        lack_of(*fit_of({}, seed, gusts=gusts)) is not None
+        for seed in range(3)
+        for gusts in (False, True)
+    )
+    assert alarms <= 1
+
+
+def test_the_intervals_of_what_it_moves_hold_it():
+    fitted, flights = fit_of(FUSELAGE, 0, gusts=False)
+    lack = lack_of(fitted, flights)
+    without, held = examine(fitted), examine(fitted, lack=lack)
+    for name, estimate in held.uncertainty.estimates.items():
+        parts = estimate.parts
+        # the fit stands at the truth: what it lacks is what moves the minimum away from there
+        assert parts.lack == pytest.approx(parts.search, rel=0.25)
+        alone = without.uncertainty.estimates[name].std_error
+        assert estimate.std_error == pytest.approx(np.hypot(alone, parts.lack))
+    findings = laws_lacking(held.laws, held.uncertainty)
+    assert findings
+    assert all(finding.code is Code.LAW_LACKING for finding in findings)
+    assert "rotor_drag_coefficient" in findings[0].names
+    assert laws_lacking(without.laws, without.uncertainty) == ()
+
+
+def test_commands_stand_in_for_tachometers():
+    fitted, flights = fit_of({}, 0, gusts=False)
+    blind = [
+        replace(flight, series={n: s for n, s in flight.series.items() if n != "rotor_speed"})
+        for flight in flights
+    ]
+    assert lack_of(fitted, blind) is None

@@ -1,0 +1,333 @@
+"""What recorded accelerations hold that a fitted model does not explain, told without a name.
+
+The accelerations of a fitted model, along the recorded motion, leave errors. What of them no change
+of the fitted coefficients can explain is regressed on a dictionary of what forces and moments may
+go with (`FEATURES`): airspeed, body rates, the rotors' speed. A feature counts if its efficient
+score, summed over stretches of `STRETCH`, is larger than the largest of all features' would be by
+chance: every stretch's contribution changes its sign at random (the wild bootstrap, clustered),
+which keeps what is correlated within a stretch and among features, and counts how many are tried.
+The likeliest is taken into the model, and the others are judged again.
+
+Features, and what coefficients change, are those of the simulated flight, which follows the
+reference as the recorded one does and knows nothing of its gusts and of its sensors' noise: what
+the loop answers to gusts passes for no law (an instrumental variable; Ljung, 7.6). Errors are
+filtered as in `tuner.equation_error.regression`.
+
+Sources: Cameron, Gelbach and Miller, "Bootstrap-based improvements for inference with clustered
+errors", 2008; Romano and Wolf, "Stepwise multiple testing as formalized data snooping", 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from tuner.equation_error.measured import Measured
+from tuner.equation_error.model import Accelerations, Linear
+from tuner.equation_error.regression import ROBUST, convolved, spread, whitening
+from tuner.recordings.flight import Array
+from tuner.vehicle.coefficient import Parameter
+from tuner.vehicle.model import Model
+
+MEMORY = 0.3
+"""s of errors from which the next one is predicted."""
+STRETCH = 1.0
+"""s whose scores are summed up: what is left of gusts in filtered errors has ended by then."""
+LEVEL = 0.005
+"""Probability of a false alarm among all features."""
+SIGNS = 2000
+"""Draws of the stretches' signs."""
+OWN = 0.05
+"""Share of a feature's information that no other column may have, or it is not told from those."""
+SHIFTS, MOVED = 4, 1e-3
+"""In how many ways a motor's curve and lags move rotor speeds, and by how much they are moved."""
+MOST = 5
+"""Features that are told at most."""
+AXES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z")
+
+
+class Flown(NamedTuple):
+    """The steps of a flight as they were recorded, and as the fit flies them.
+
+    ``driven``: whether the recorded rotor speeds are those that the fit makes of commands; what
+    these may be off by is not told then.
+    """
+
+    recorded: Measured
+    simulated: Measured
+    driven: bool
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law of which the model has nothing.
+
+    Attributes
+    ----------
+    axis, feature
+        Of `AXES`, and of its `FEATURES`.
+    share
+        The size of its part of the accelerations over that of all that is modelled there (root mean
+        squares about the mean), with the sign of its coefficient.
+    deviation
+        Its score in standard deviations.
+    """
+
+    axis: str
+    feature: str
+    share: float
+    deviation: float
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What no coefficient of a fit explains.
+
+    Attributes
+    ----------
+    laws
+        The likeliest first.
+    accelerations
+        Of each flight (N, 6), m/s² and rad/s², body axes, what all of them make.
+    """
+
+    laws: tuple[Law, ...]
+    accelerations: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What features are made of, at N steps: a flight's airspeed, body rates, and loads.
+
+    Attributes
+    ----------
+    v, w
+        (N, 3) m/s and rad/s, body axes.
+    faster
+        (N,) the rotors' mean speed over that of all flights, less one.
+    modelled
+        (N, 6) the model's accelerations.
+    """
+
+    v: Array
+    w: Array
+    faster: Array
+    modelled: Array
+
+
+def _fast(m: _Motion) -> Array:
+    return np.asarray(np.linalg.norm(m.v, axis=1))
+
+
+Feature = Callable[[_Motion], Array]
+
+
+def _force_across(axis: int) -> dict[str, Feature]:
+    return {
+        "airspeed": lambda m: m.v[:, axis],
+        "airspeed_squared": lambda m: m.v[:, axis] * _fast(m),
+        "airspeed_across": lambda m: m.v[:, 1 - axis],
+    }
+
+
+def _moment_across(axis: int) -> dict[str, Feature]:
+    return {
+        "airspeed": lambda m: m.v[:, axis],
+        "airspeed_across": lambda m: m.v[:, 1 - axis],
+        "rate": lambda m: m.w[:, axis],
+        "rate_squared": lambda m: m.w[:, axis] * np.abs(m.w[:, axis]),
+        "other_rates": lambda m: m.w[:, 1 - axis] * m.w[:, 2],
+    }
+
+
+#: Axis -> name -> what a force or moment along it may go with.
+FEATURES: Mapping[str, Mapping[str, Feature]] = {
+    "force_x": _force_across(0),
+    "force_y": _force_across(1),
+    "force_z": {
+        "rotor_speed": lambda m: m.modelled[:, 2] * m.faster,
+        "airspeed": lambda m: m.v[:, 2],
+        "airspeed_squared": lambda m: m.v[:, 2] * _fast(m),
+        "airspeed_across": lambda m: m.v[:, 0] ** 2 + m.v[:, 1] ** 2,
+    },
+    "moment_x": _moment_across(0),
+    "moment_y": _moment_across(1),
+    "moment_z": {
+        "rate": lambda m: m.w[:, 2],
+        "rate_squared": lambda m: m.w[:, 2] * np.abs(m.w[:, 2]),
+        "other_rates": lambda m: m.w[:, 0] * m.w[:, 1],
+    },
+}
+
+
+def unexplained(
+    model: Model,
+    parameters: Sequence[Parameter],
+    point: Array,
+    flights: Sequence[Flown],
+) -> Unexplained:
+    """Return what recorded accelerations hold that no fitted coefficient explains.
+
+    Parameters
+    ----------
+    model, parameters, point
+        Of the fit: what does not move, its K parameters, and their scaled coordinates.
+    """
+    recorded, simulated, driven = zip(*flights, strict=True)
+    along = Accelerations(model, tuple(parameters), tuple(simulated)).at(point, noise=False)
+    moved = [other for part in simulated for other in _moved(part)]
+    made = Accelerations(model, (), (*recorded, *moved)).at(np.zeros(0), noise=False)
+    shifts = [
+        np.stack([(one.left - other.left) / MOVED for other in made[at : at + SHIFTS]], 2)
+        * of_commands
+        for one, at, of_commands in zip(
+            along, range(len(recorded), len(made), SHIFTS), driven, strict=True
+        )
+    ]
+    mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
+    motions = [_motion(part, one, mean) for part, one in zip(simulated, along, strict=True)]
+    names = [(axis, name) for axis, features in FEATURES.items() for name in features]
+    tables = [_features(motion) for motion in motions]
+    columns = [
+        np.concatenate(
+            [one.columns, _nuisances(part, motion, (number, len(motions))), shift, table], axis=2
+        )
+        for number, (part, one, motion, shift, table) in enumerate(
+            zip(simulated, along, motions, shifts, tables, strict=True)
+        )
+    ]
+    first = columns[0].shape[2] - len(names)
+    information, score = _sums(recorded, made[: len(recorded)], columns)
+    model_columns, told = list(range(first)), list[tuple[int, float]]()
+    while len(told) < MOST:
+        rest = [i for i in range(first, first + len(names)) if i not in model_columns]
+        likeliest = _likeliest(information, score, model_columns, rest)
+        if likeliest is None:
+            break
+        told.append(likeliest)
+        model_columns.append(likeliest[0])
+    sizes = np.zeros(len(names))
+    if told:
+        solved = _solved(information.sum(axis=0), model_columns, score.sum(axis=0))
+        sizes[[column - first for column, _ in told]] = solved[first:]
+    modelled = np.concatenate([motion.modelled for motion in motions]).std(axis=0)
+    parts = np.concatenate(tables).std(axis=0)
+    laws = []
+    for column, deviation in told:
+        axis, name = names[column - first]
+        row = AXES.index(axis)
+        size = parts[row, column - first] * sizes[column - first] / modelled[row]
+        laws.append(Law(axis, name, float(size), deviation))
+    return Unexplained(tuple(laws), tuple(table @ sizes for table in tables))
+
+
+def _moved(part: Measured) -> list[Measured]:
+    """Return the steps with rotor speeds as a motor's curve and its lags move them."""
+    speed, change = part.rotor_speed, part.rotor_acceleration
+    ways = (np.ones_like(speed), speed, np.maximum(change, 0.0), np.minimum(change, 0.0))
+    return [replace(part, rotor_speed=speed + MOVED * way) for way in ways]
+
+
+def _motion(part: Measured, one: Linear, mean: float) -> _Motion:
+    through = part.motion.attitude.to_body(part.motion.velocity)
+    return _Motion(
+        v=np.asarray(through.stacked()).T,
+        w=np.asarray(part.motion.body_rate.stacked()).T,
+        faster=part.rotor_speed.mean(axis=1) / mean - 1.0,
+        modelled=part.accelerations - one.left,
+    )
+
+
+def _features(motion: _Motion) -> Array:
+    """Return all features (N, 6, M), each along its own axis."""
+    rows = [
+        (AXES.index(axis), feature(motion))
+        for axis, features in FEATURES.items()
+        for feature in features.values()
+    ]
+    table = np.zeros((len(motion.v), len(AXES), len(rows)))
+    for number, (axis, values) in enumerate(rows):
+        table[:, axis, number] = values
+    return table
+
+
+def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int]) -> Array:
+    """Return (N, 6, n) what else errors may be, and is not told.
+
+    A steady one of each axis in each flight (``place``: which of how many); what a thrust looks
+    like along x and y from an attitude that is tilted or late; and what comes late of each axis.
+    """
+    number, flights = place
+    table = np.zeros((len(motion.v), 6, 6 * flights + 12))
+    every = np.arange(6)
+    table[:, every, 6 * number + every] = 1.0
+    table[:, every, 6 * flights + every] = np.gradient(motion.modelled, part.step, axis=0)
+    tilted = np.column_stack([motion.modelled[:, 2], motion.w[:, :2]])
+    for axis in (0, 1):
+        columns = 6 * flights + 6 + 3 * axis + np.arange(3)
+        table[:, axis, columns] = tilted
+    return table
+
+
+def _sums(
+    flights: Sequence[Measured], linear: Sequence[Linear], columns: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Return information (U, P, P) and score (U, P) of U stretches of filtered errors."""
+    information, score = [], []
+    for part, one, table in zip(flights, linear, columns, strict=True):
+        kernels = whitening(one, part, MEMORY)
+        length, size = max(1, round(STRETCH / part.step)), table.shape[2]
+        units = len(part.rotor_speed) // length
+        bend, slope = np.zeros((units, size, size)), np.zeros((units, size))
+        for axis, kernel in enumerate(kernels):
+            acts = np.any(table[:, axis] != 0.0, axis=0)
+            rows = convolved(
+                np.column_stack([one.left[:, axis], table[:, axis, acts]]), part.known, kernel
+            )
+            if not len(rows):
+                continue
+            sigma = spread(rows[:, 0])
+            rows = rows / sigma
+            for unit, stretch in enumerate(np.array_split(rows, units)):
+                errors, those = stretch[:, 0], stretch[:, 1:]
+                robust = np.minimum(1.0, ROBUST / np.maximum(np.abs(errors), 1e-12))
+                weighed = those * robust[:, None]
+                bend[unit][np.ix_(acts, acts)] += weighed.T @ those
+                slope[unit, acts] += weighed.T @ errors
+        information.append(bend)
+        score.append(slope)
+    return np.concatenate(information), np.concatenate(score)
+
+
+def _solved(total: Array, inside: Sequence[int], right: Array) -> Array:
+    """Return what solves the normal equations of some columns; what they do not tell is zero."""
+    square = total[np.ix_(inside, inside)]
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(square), 1e-300))
+    inverse = np.linalg.pinv(square * np.outer(unit, unit), rcond=1e-9, hermitian=True)
+    by = unit.reshape(-1, *[1] * (right.ndim - 1))
+    return np.asarray(by * (inverse @ (by * right[list(inside)])))
+
+
+def _likeliest(
+    information: Array, score: Array, model: Sequence[int], rest: Sequence[int]
+) -> tuple[int, float] | None:
+    """Return the column whose efficient score is the largest, and its size; None by chance."""
+    total = information.sum(axis=0)
+    estimate = _solved(total, model, score.sum(axis=0))
+    follow = _solved(total, model, total[:, list(rest)])
+    left = score - information[:, :, list(model)] @ estimate
+    efficient = left[:, list(rest)] - left[:, list(model)] @ follow
+    own = np.diag(total)[list(rest)]
+    alone = own - np.einsum("mr,mr->r", total[np.ix_(list(model), list(rest))], follow)
+    tells = alone > OWN * own
+    sd = np.sqrt(np.sum(efficient**2, axis=0))
+    size = np.where(tells, efficient.sum(axis=0) / np.maximum(sd, 1e-300), 0.0)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, len(efficient)))
+    chance = np.abs(signs @ efficient / np.maximum(sd, 1e-300))[:, tells].max(axis=1)
+    best = int(np.argmax(np.abs(size)))
+    if abs(size[best]) <= np.quantile(chance, 1.0 - LEVEL):
+        return None
+    return rest[best], float(size[best])

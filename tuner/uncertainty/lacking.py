@@ -1,0 +1,258 @@
+"""What a fit's flights hold that its model does not, as a disturbance that may be simulated.
+
+The laws that `tuner.equation_error.unexplained` finds push the simulated flights, each along its
+recording: by how much coefficients then have to move is how far the model's lack may have moved
+them, and a part of their standard errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sim_jax.disturbance import Disturbance
+from sim_jax.environment import Environment
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.markers import markers_of
+from sim_jax.motor import Lag, reference_speed
+from sim_jax.rigid_body import Motion
+from sim_jax.rotation import Quaternion
+from sim_jax.schedule import Schedule
+from sim_jax.vector import Vec3
+from tuner.equation_error.measured import Measured, measured
+from tuner.equation_error.unexplained import Flown, Law, unexplained
+from tuner.findings.findings import Code, Finding
+from tuner.objective.criterion import units_of
+from tuner.objective.flight import MOTION, TURNED, environment_of
+from tuner.objective.flown import fly
+from tuner.objective.normal import Objective
+from tuner.objective.segments import OFFSETS
+from tuner.recordings.flight import Array, Flight, Series
+from tuner.search.fitted import Fitted
+from tuner.uncertainty.estimates import Uncertainty
+from tuner.vehicle.model import Model
+
+MATTERS = 0.5
+"""Standard errors without it, from which the move of a coefficient is said."""
+SMALLEST = 0.03
+"""Share of what varies along an axis below which a law is none to speak of."""
+
+
+@dataclass(frozen=True)
+class Lack:
+    """What the model of a fit lacks.
+
+    Attributes
+    ----------
+    laws
+        The likeliest first.
+    disturbance
+        What all of them make, in every segment.
+    """
+
+    laws: tuple[Law, ...]
+    disturbance: Disturbance
+
+    def acting_on(self, objective: Objective) -> Objective:
+        """Return a problem whose simulated flights it pushes."""
+        return replace(
+            objective, segments=replace(objective.segments, disturbance=self.disturbance)
+        )
+
+
+def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
+    """Return what the model of a fit lacks; None if that is nothing, or cannot be told.
+
+    Parameters
+    ----------
+    fitted
+        Of whole flights in the closed loop.
+    flights
+        The F fitted ones, in the order of the segments.
+    """
+    objective, point = fitted.objective, fitted.point
+    segments, schedule = objective.segments, objective.schedule
+    if segments.windowed or not isinstance(segments.inlet, ReferenceInlet):
+        return None
+    vector = np.asarray(point.coefficients)
+    model = objective.tunable.at(jnp.asarray(vector))
+    units = units_of(objective.conditions)
+    conditions = {
+        name: np.asarray(point.offsets)[len(OFFSETS) + row] * units[row]
+        for row, name in enumerate(objective.conditions)
+    }
+    environment = environment_of(model, segments, conditions)
+    driven = [not _tells_speeds(flight) for flight in flights]
+    read = []
+    for number, flight in enumerate(flights):
+        series = dict(flight.series)
+        if driven[number] and "command" in series:
+            series["rotor_speed"] = _driven(series["command"], model, environment, schedule, number)
+        read.append(_recorded(replace(flight, series=series), model, conditions, number))
+    flown = fly(
+        objective.model,
+        segments,
+        schedule,
+        samples=objective.samples,
+        limits=objective.limits,
+        coefficients=objective.tunable.values(vector),
+        conditions=conditions,
+        channels=("position", "attitude", "rotor_speed", MOTION, TURNED),
+    )
+    rate = float(schedule.log_rate)
+    pairs = {
+        number: Flown(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
+        for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
+        if one is not None and not np.isfinite(flown.crash_time[number])
+    }
+    if not pairs:
+        return None
+    scaled = np.asarray(objective.space.scaled(point.coefficients))
+    parameters = objective.space.parameters
+    found = unexplained(model, parameters, scaled, tuple(pairs.values()))
+    if not found.laws:
+        return None
+    body = model.vehicle.body
+    by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
+    ticks = np.arange(objective.samples + 2) / rate
+    pushes = np.zeros((6, len(ticks), segments.count))
+    for (number, pair), made in zip(pairs.items(), found.accelerations, strict=True):
+        one, acting = pair.recorded, made * by
+        acting[:, :3] = Rotation.from_quat(
+            np.asarray(one.motion.attitude.stacked()).T, scalar_first=True
+        ).apply(acting[:, :3])
+        for axis, column in enumerate(acting.T):
+            pushes[axis, :, number] = np.interp(ticks, one.time, column)
+    force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
+    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate))
+
+
+def laws_lacking(laws: Sequence[Law], uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Return the laws that the model lacks, where they may have moved coefficients."""
+    moved = [
+        name
+        for name, estimate in uncertainty.estimates.items()
+        if (move := estimate.parts.lack)
+        and move**2 > MATTERS**2 * (estimate.std_error**2 - move**2)
+    ]
+    return tuple(
+        Finding(
+            Code.LAW_LACKING,
+            "warning",
+            "model",
+            {"share": law.share},
+            (law.axis, law.feature, *moved),
+        )
+        for law in laws
+        if moved and abs(law.share) > SMALLEST
+    )
+
+
+def _recorded(
+    flight: Flight, model: Model, conditions: Mapping[str, Array], number: int
+) -> Measured | None:
+    """Return the steps of a recording, of the centre of mass in body axes through the air."""
+    known = {"position", "attitude", "body_rate", "rotor_speed"} <= set(flight.series)
+    if known and markers_of(model.vehicle) is not None:
+        flight = replace(flight, series={**flight.series, **_of_body(flight.series, model)})
+    steps = measured(flight)
+    return None if steps is None else _through_air(steps, conditions, number)
+
+
+def _tells_speeds(flight: Flight) -> bool:
+    """Return whether every rotor has a tachometer."""
+    speeds = flight.series.get("rotor_speed")
+    return speeds is not None and bool(np.isfinite(speeds.values).any(axis=0).all())
+
+
+def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
+    """Return pose and velocity of the centre of mass, in body axes, from those of markers."""
+    markers = markers_of(model.vehicle)
+    assert markers is not None
+    attitude, position = series["attitude"], series["position"]
+    turned = Rotation.from_quat(attitude.values, scalar_first=True)
+    if markers.turn is not None:
+        tilt = Rotation.from_quat(np.asarray(markers.turn.stacked()), scalar_first=True)
+        turned = turned * tilt.inv()
+    moved = {"attitude": Series(attitude.time, turned.as_quat(scalar_first=True))}
+    if markers.offset is not None:
+        offset = np.asarray(markers.offset.stacked())
+        arm = Series(attitude.time, turned.apply(offset))
+        moved["position"] = _less(position, arm)
+        if "velocity" in series and float(model.controller.sees_markers) > 0.5:
+            rates = _at(series["body_rate"], attitude.time)
+            swing = Series(attitude.time, turned.apply(np.cross(rates, offset)))
+            moved["velocity"] = _less(series["velocity"], swing)
+    return moved
+
+
+def _at(series: Series, times: Array) -> Array:
+    return np.column_stack([np.interp(times, series.time, column) for column in series.values.T])
+
+
+def _less(series: Series, other: Series) -> Series:
+    return Series(series.time, series.values - _at(other, series.time))
+
+
+def _driven(
+    commands: Series, model: Model, environment: Environment, schedule: Schedule, number: int
+) -> Series:
+    """Return the rotor speeds that a flight's commands ask for, late as the motors are."""
+    motor, time = model.vehicle.motor, commands.time
+    asked = np.array(reference_speed(motor, jnp.asarray(commands.values)))
+    if environment.log_voltage is not None:
+        volts = np.asarray(environment.log_voltage)[:, number]
+        tick = np.clip((time * schedule.position_control_rate).astype(int), 0, len(volts) - 1)
+        exponent = float(model.vehicle.effects["battery_exponent"])
+        asked *= np.exp(exponent * volts[tick])[:, None]
+    if environment.battery_decline is not None:
+        asked *= 1.0 - float(environment.battery_decline[number]) * np.maximum(time, 0.0)[:, None]
+    lag = Lag.over(motor, jnp.asarray(np.diff(time, prepend=time[0])))
+    up, down = np.asarray(lag.decay_up), np.asarray(lag.decay_down)
+    speeds = asked.copy()
+    for row in range(1, len(asked)):
+        before, now = asked[row - 1], speeds[row - 1]
+        speeds[row] = before + np.where(before > now, up[row], down[row]) * (now - before)
+    return Series(time + float(model.vehicle.setup.actuator_latency), speeds)
+
+
+def _through_air(part: Measured, conditions: Mapping[str, Array], number: int) -> Measured:
+    x, y = (conditions.get(name, np.zeros(number + 1))[number] for name in ("wind_x", "wind_y"))
+    wind = Vec3(jnp.asarray(x), jnp.asarray(y), jnp.zeros(()))
+    motion = part.motion
+    moved = Motion(motion.position, motion.velocity - wind, motion.attitude, motion.body_rate)
+    return replace(part, motion=moved)
+
+
+def _simulated(
+    part: Measured,
+    channels: Mapping[str, Array],
+    conditions: Mapping[str, Array],
+    number: int,
+    rate: float,
+) -> Measured:
+    """Return the same steps as the fit flies them; nothing of them is unknown."""
+    clock = np.arange(channels[MOTION].shape[1]) / rate
+
+    def at(name: str) -> Array:
+        return _at(Series(clock, channels[name][number]), part.time)
+
+    rows, attitude, speeds = at(MOTION), at(TURNED), at("rotor_speed")
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    position, velocity, turning = (Vec3.of(jnp.asarray(rows[:, at].T)) for at in _PARTS)
+    motion = Motion(position, velocity, Quaternion.of(jnp.asarray(attitude.T)), turning)
+    flown = replace(
+        part,
+        motion=motion,
+        rotor_speed=speeds,
+        rotor_acceleration=np.gradient(speeds, part.step, axis=0),
+        accelerations=np.zeros_like(part.accelerations),
+    )
+    return _through_air(flown, conditions, number)
+
+
+_PARTS = (slice(0, 3), slice(3, 6), slice(6, 9))
