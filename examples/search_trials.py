@@ -74,7 +74,7 @@ def solved(
 
 def worst(job: Job, fitted: Fitted) -> str:
     """Return how far the coefficients are from the truth."""
-    true, values = truth(), job.space.values(fitted.point.coefficients)
+    true, values = truth(), job.space.numbers(fitted.point.coefficients)
     off = {name: abs(float(value) / true[name] - 1.0) for name, value in values.items()}
     mechanical = max((name for name in off if name not in TIMES), key=lambda name: off[name])
     lag = max(TIMES[:2], key=lambda name: off[name])

@@ -73,17 +73,22 @@ def _compiled(text: str) -> bytes:
     return code
 
 
+def kept(key: str, made: Callable[[], bytes]) -> bytes:
+    """Return what a key stands for on this machine: as it is kept, or made now and kept."""
+    if not _folder:
+        return made()
+    digest = hashlib.sha256(f"{_machine_name()}\n{key}".encode()).hexdigest()
+    path = _folder[0] / f"{digest}.o"
+    content = _read(path)
+    if content is None:
+        content = made()
+        _write(path, content)
+    return content
+
+
 def object_code(text: str) -> bytes:
     """Return the object code of a module's text, compiled or as it is kept."""
-    if not _folder:
-        return _compiled(text)
-    key = hashlib.sha256(f"{_machine_name()}\n{text}".encode()).hexdigest()
-    path = _folder[0] / f"{key}.o"
-    code = _read(path)
-    if code is None:
-        code = _compiled(text)
-        _write(path, code)
-    return code
+    return kept(text, lambda: _compiled(text))
 
 
 def _read(path: Path) -> bytes | None:
@@ -140,8 +145,7 @@ def _linker() -> Any:
 class Code:
     """A function in memory, there as long as this is."""
 
-    def __init__(self, text: str, function: str) -> None:
-        code = object_code(text)
+    def __init__(self, code: bytes, function: str) -> None:
         with _lock:
             number = hashlib.sha256(code).hexdigest() + f"-{id(self):x}"
             self._library = (

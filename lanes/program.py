@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import logging
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -17,12 +19,14 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import PyTreeDef, default_registry
 from numpy.typing import NDArray
 
 import lanes.control  # noqa: F401 (fills in the rules of loops)
 from lanes.dependence import dependent
+from lanes.digest import UnknownError, digest_of
 from lanes.layout import Argument, Layout, Lengths, is_laid_by_loop
-from lanes.machine import Code, keep_code_in, register_bytes
+from lanes.machine import Code, keep_code_in, kept, object_code, register_bytes
 from lanes.values import UnsupportedError
 
 __all__ = ["Argument", "Program", "Run", "joined", "keep_code_in"]
@@ -92,10 +96,22 @@ class Program:
         Columns computed in one pass over a block of lanes; with more, passes take turns.
     name
         For messages.
+    made_of
+        All that the function is made of besides its arguments' layout and the code of
+        ``packages``: a program that is kept is then not traced again. None traces it.
+    packages
+        Whose code it runs.
     """
 
     def __init__(
-        self, function: Function, arguments: Any, *, at_once: int = 2, name: str = ""
+        self,
+        function: Function,
+        arguments: Any,
+        *,
+        at_once: int = 2,
+        name: str = "",
+        made_of: Any = None,
+        packages: tuple[str, ...] = (),
     ) -> None:
         self.function, self.name = function, name or getattr(function, "__name__", "function")
         leaves, structure = jax.tree.flatten(
@@ -110,6 +126,10 @@ class Program:
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
         self.columns = at_once if self.moving else 0
+        self.key: str | None = None
+        if made_of is not None:
+            with suppress(UnknownError):
+                self.key = digest_of((made_of, arguments, self.columns), packages)
 
     # what is computed
 
@@ -144,15 +164,16 @@ class Program:
     @cached_property
     def _traced(self) -> tuple[Any, Any, dict[str, int]]:
         """The jaxpr, the structure of its outputs, and the stand-ins of lengths."""
-        lengths = dict(zip((*self.names, *self._own_lengths()), _STAND_INS, strict=False))
+        lengths = self.stand_ins
         given = [self._shaped(a, lengths) for a in self.arguments]
         tangents = [given[number] for number in self.moving]
         closed, shapes = jax.make_jaxpr(self._pushed(lengths), return_shape=True)(given, tangents)
         return closed, shapes, lengths
 
-    def _own_lengths(self) -> tuple[str, ...]:
-        """Names of lengths that no argument has: those of loops."""
-        return ("turns",)
+    @property
+    def stand_ins(self) -> dict[str, int]:
+        """Name -> the number that stands for each length while it is traced."""
+        return dict(zip((*self.names, "turns"), _STAND_INS, strict=False))
 
     @cached_property
     def _compiled(self) -> _Compiled | None:
@@ -261,27 +282,43 @@ class _Compiled:
     """The kernel of a program."""
 
     def __init__(self, program: Program) -> None:
-        self.program = program
-        closed, shapes, lengths = program._traced
-        self.lengths = lengths
-        self.outputs, structure = jax.tree.flatten(shapes)
-        self.structure: Any = structure
+        self.program, self.lengths = program, program.stand_ins
         widest = max(
             (np.dtype(a.dtype).itemsize for a in program.arguments if _is_real(a.dtype)), default=8
         )
         self.width = max(register_bytes() // widest, 1)
-        count, moving = len(program.arguments), len(program.moving)
-        flags = [False] * count + [True] * moving
-        self.moved = dependent(closed.jaxpr, flags)
-        layout = Layout(
-            program.arguments, program.moving, program.columns, lengths, self.outputs, self.moved
+        made = self._made() if program.key is None else kept(program.key, self._made)
+        head, _, code = made.partition(b"\n")
+        known = json.loads(head)
+        self.structure: Any = PyTreeDef.deserialize_using_proto(
+            default_registry, bytes.fromhex(known["structure"])
         )
-        began = time.perf_counter()
-        self.code = Code(layout.written(closed, self.width), "run")
-        spent = time.perf_counter() - began
-        jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
+        self.outputs = [
+            jax.ShapeDtypeStruct(tuple(shape), dtype) for shape, dtype in known["outputs"]
+        ]
+        self.moved: list[bool] = known["moved"]
+        self.code = Code(code, "run")
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 5)(self.code.address)
+
+    def _made(self) -> bytes:
+        """Return the object code behind a line on what it returns: traced, lowered, compiled."""
+        program = self.program
+        closed, shapes, lengths = program._traced
+        outputs, structure = jax.tree.flatten(shapes)
+        flags = [False] * len(program.arguments) + [True] * len(program.moving)
+        moved = list(dependent(closed.jaxpr, flags))
+        layout = Layout(program.arguments, program.moving, program.columns, lengths, outputs, moved)
+        began = time.perf_counter()
+        code = object_code(layout.written(closed, self.width))
+        spent = time.perf_counter() - began
+        jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
+        head = {
+            "structure": structure.serialize_using_proto().hex(),  # type: ignore[attr-defined]
+            "outputs": [(shape.shape, str(shape.dtype)) for shape in outputs],
+            "moved": moved,
+        }
+        return json.dumps(head).encode() + b"\n" + code
 
     def run(
         self,

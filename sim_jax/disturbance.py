@@ -7,9 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float, Int
 
+from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.schedule import Schedule
 from sim_jax.trees import row_of

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float, Int
 
 from sim_jax.disturbance import Disturbance
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.schedule import Schedule
 from sim_jax.trees import row_of
 from sim_jax.vector import Vec3
@@ -59,7 +58,7 @@ class Environment(eqx.Module):
         (V/V_ref)^battery_exponent where the voltage is known (thesis 10.4), 1 - battery_decline·t
         where a flight's decline is.
         """
-        factor = None
+        factor: Scalar | None = None
         if battery_exponent is not None and self.log_voltage is not None:
             factor = jnp.exp(
                 battery_exponent * row_of(self.log_voltage, schedule.control_tick(step))

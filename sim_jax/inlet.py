@@ -14,11 +14,10 @@ from typing import Protocol, TypeVar, runtime_checkable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from sim_jax.control.position import ReferencePoint
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Setpoints, State

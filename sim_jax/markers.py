@@ -16,11 +16,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Bool
 
 from sim_jax.control.gains import Controller
-from sim_jax.numeric import Scalar, safe_sqrt
+from sim_jax.numeric import Array, Scalar, safe_sqrt
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start

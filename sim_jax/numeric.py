@@ -6,8 +6,11 @@ from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+import numpy as np
 from jaxtyping import Bool, Float
+
+Array: TypeAlias = jax.Array | np.ndarray
+"""Of jax, or of NumPy: what is laid out on the host compiles nothing."""
 
 #: One number per vehicle of the batch; shape () for a single vehicle or one that all share.
 Scalar: TypeAlias = Float[Array, "*#batch"]

@@ -7,7 +7,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jaxtyping import Int, PyTree
 
 from sim_jax.control import attitude, mixer, rate
@@ -23,6 +23,7 @@ from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet, ReferenceInlet
 from sim_jax.markers import estimated
 from sim_jax.motor import Lag, SwitchedLag, reference_speed
+from sim_jax.numeric import Array
 from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule

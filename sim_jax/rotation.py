@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float
 
-from sim_jax.numeric import Scalar, safe_divide, safe_sqrt, saturate
+from sim_jax.numeric import Array, Scalar, safe_divide, safe_sqrt, saturate
 from sim_jax.vector import Vec3
 
 

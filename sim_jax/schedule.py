@@ -7,9 +7,10 @@ from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jaxtyping import Bool, Int
 
+from sim_jax.numeric import Array
 from sim_jax.rigid_body import Integrator
 
 

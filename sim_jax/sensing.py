@@ -6,11 +6,11 @@ from math import ceil, pi, sqrt
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jaxtyping import Float, Int
 
 from sim_jax.control.gains import Filters
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3

@@ -14,10 +14,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from sim_jax.control.position import ReferencePoint
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.vector import Vec3
 
 TICK_RATE = 100
@@ -243,5 +243,5 @@ def _published(shape: Shape, pace: Scalar, ticks: int, start_tick: int) -> Publi
 
     rest = jnp.zeros(batch, pace.dtype)
     first = (rest, rest, jnp.zeros(batch, int))
-    publication: Publication = jax.lax.scan(tick, first, jnp.arange(ticks))[1]
+    publication: Publication = jax.lax.scan(tick, first, jnp.arange(ticks))[1]  # type: ignore[arg-type]
     return publication

@@ -8,9 +8,10 @@ from typing import ParamSpec, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import Array, lax
+from jax import lax
 from jaxtyping import Int, PyTree
 
+from sim_jax.numeric import Array
 from sim_jax.state import State
 
 P = ParamSpec("P")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float
 
-from sim_jax.numeric import Scalar, safe_sqrt
+from sim_jax.numeric import Array, Scalar, safe_sqrt
 
 
 class Vec3(eqx.Module):

@@ -6,7 +6,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 PROGRAM = "multirotor-tune"
-LIBRARIES = ("jax", "jaxlib", "equinox", "optimistix", "numpy", "rosbags")
+LIBRARIES = ("jax", "jaxlib", "equinox", "numpy", "rosbags")
 
 
 def installed(distribution: str = PROGRAM) -> str:

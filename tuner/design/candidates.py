@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -138,7 +137,7 @@ def candidate_problem(
         )
         for flight in flights
     ]
-    starts: Vec3 = jax.tree.map(lambda *places: jnp.stack(places), *(r.start for r in references))
+    starts: Vec3 = jax.tree.map(lambda *places: np.stack(places), *(r.start for r in references))
     spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
     count = len(flights)
     segments = Segments(
@@ -153,8 +152,8 @@ def candidate_problem(
             )
             for name, measured in recorded.measured.items()
         },
-        flight=jnp.arange(count),
-        resting=None if recorded.resting is None else jnp.ones(count, bool),
+        flight=np.arange(count),
+        resting=None if recorded.resting is None else np.ones(count, bool),
         log_voltage=_filled(recorded.log_voltage, count, np.nan),
         wander=_filled(recorded.wander, count, 0.0),
     )
@@ -172,34 +171,34 @@ def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet
     inlets = [reference.inlet for reference in references]
     length = max(len(reference.lap) - 1 for reference in references)  # none acts at the end
 
-    def beside(*rows: jax.Array) -> jax.Array:
+    def beside(*rows: Array) -> Array:
         edges = [
             np.pad(np.asarray(row)[:length], (0, max(length - len(row), 0)), mode="edge")
             for row in rows
         ]
-        return jnp.asarray(np.stack(edges, axis=-1))
+        return np.stack(edges, axis=-1)
 
     points: ReferencePoint = jax.tree.map(beside, *(inlet.points for inlet in inlets))
     held = recorded.inlet.level_held
     return ReferenceInlet(
         points,
-        spins=jnp.stack([inlet.spins for inlet in inlets]),
-        yaw_rate=jnp.stack([inlet.yaw_rate for inlet in inlets]),
-        level_held=None if held is None else jnp.zeros(len(inlets), bool),
+        spins=np.stack([inlet.spins for inlet in inlets]),
+        yaw_rate=np.stack([inlet.yaw_rate for inlet in inlets]),
+        level_held=None if held is None else np.zeros(len(inlets), bool),
     )
 
 
 def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
     start = hover(objective.model.vehicle, places)
     wide: Start = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (count,)), start
+        lambda leaf: np.broadcast_to(np.asarray(leaf, float), (count,)), start
     )
     return wide
 
 
-def _filled(recorded: jax.Array | None, count: int, value: float) -> jax.Array | None:
+def _filled(recorded: Array | None, count: int, value: float) -> Array | None:
     """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
-    return None if recorded is None else jnp.full((*recorded.shape[:-1], count), value)
+    return None if recorded is None else np.full((*recorded.shape[:-1], count), value)
 
 
 def _seconds(objective: Objective) -> Array:
@@ -239,7 +238,7 @@ def _sampled(
         values[:, 0] = 1.0  # an attitude
     constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
     weights = np.broadcast_to(constant, (rows, *constant.shape))
-    return Measured(time=jnp.asarray(time), values=jnp.asarray(values), weight=jnp.asarray(weights))
+    return Measured(time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights))
 
 
 def candidate_point(
@@ -250,13 +249,13 @@ def candidate_point(
     offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
     reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
     scale = {
-        name: jnp.full(count, float(np.median(np.asarray(of_segment))))
+        name: np.full(count, float(np.median(np.asarray(of_segment))))
         for name, of_segment in criterion.scale.items()
     }
-    return Point(point.coefficients, jnp.asarray(offsets)), Criterion(
-        horizon=jnp.asarray(round(seconds * objective.schedule.log_rate)),
+    return Point(point.coefficients, np.asarray(offsets)), Criterion(
+        horizon=np.asarray(round(seconds * objective.schedule.log_rate)),
         scale=scale,
-        reference_offset=jnp.asarray(reference_offset),
-        huber=jnp.asarray(np.inf),
+        reference_offset=np.asarray(reference_offset),
+        huber=np.asarray(np.inf),
         prior=criterion.prior,
     )

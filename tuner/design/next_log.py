@@ -13,7 +13,6 @@ from contextlib import suppress
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -125,12 +124,12 @@ def _information(fitted: Fitted, signal: str, noise: float) -> Array:
     width = 3 if signal == "body_rate" else 4
     weight = np.repeat((time <= ends)[:, None] / noise, width, axis=1)
     measured = Measured(
-        time=jnp.asarray(time), values=jnp.zeros(weight.shape), weight=jnp.asarray(weight)
+        time=np.asarray(time), values=np.zeros(weight.shape), weight=np.asarray(weight)
     )
     alone: Objective = eqx.tree_at(lambda o: o.segments.measured, objective, {signal: measured})
-    scale = {signal: jnp.full(objective.flights, beyond_noise(criterion))}
+    scale = {signal: np.full(objective.flights, beyond_noise(criterion))}
     plain: Criterion = eqx.tree_at(
-        lambda c: (c.scale, c.huber), criterion, (scale, jnp.asarray(np.inf))
+        lambda c: (c.scale, c.huber), criterion, (scale, np.asarray(np.inf))
     )
     information = information_at(alone, fitted.point, plain)
     return np.asarray(information.blocks.sum(axis=(0, 1, 2)))

@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.crash import AIRBORNE, Limits
@@ -290,7 +289,7 @@ class _Group:
         motor = vehicle.motor
         lag = 0.5 * (motor.time_constant_up + motor.time_constant_down)
         pieces = [window.flight for windows in self._windows for window in windows]
-        turning = jnp.asarray(np.stack([recent_command(piece, lag) for piece in pieces], axis=-1))
+        turning = np.stack([recent_command(piece, lag) for piece in pieces], axis=-1)
         segments: Segments = eqx.tree_at(lambda s: s.turning, self._segments, turning)
         return segments
 
@@ -315,13 +314,13 @@ class _Group:
             for values, unit in zip(self._conditions.values(), units_of(names), strict=True)
         ]
         none = np.zeros((len(OFFSETS), flights))
-        point = Point(jnp.zeros(0), jnp.asarray(np.stack([*none, *rows])))
+        point = Point(np.zeros(0), np.asarray(np.stack([*none, *rows])))
         loose = {name: np.full(flights, LOOSE) for name in segments.measured}
         criterion = plain_criterion(objective, self._samples, loose)
         trial = best = np.zeros(segments.freedom.shape)
         least = np.full(trial.shape[1], np.inf)
         for _ in range(ROUNDS + 1):  # the last one judges the step before it
-            there = replace(criterion, states=jnp.asarray(trial))
+            there = replace(criterion, states=np.asarray(trial))
             sums = objective.sums(point, there, derivatives=False)
             squares = np.sum([np.asarray(each) for each in sums.squares.values()], axis=0)
             misfit = np.nan_to_num(squares / LOOSE**2 + (trial**2).sum(axis=0), nan=np.inf)

@@ -13,17 +13,19 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array as JaxArray
 
 from lanes import Argument, Program
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import Environment
+from sim_jax.numeric import GRAVITY
+from sim_jax.numeric import Array as JaxArray
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import TERMS, wrench_of_each_term
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
+from tuner.objective.flown import CODE
 from tuner.recordings.flight import Array
 
 COMPONENTS = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -103,7 +105,8 @@ def acting(
 
 @lru_cache(maxsize=16)
 def _program(arguments: tuple[Argument, ...], structure: Any) -> Program:
-    return Program(_acting, jax.tree.unflatten(structure, arguments), name="forces")
+    tree = jax.tree.unflatten(structure, arguments)
+    return Program(_acting, tree, name="forces", made_of=(), packages=CODE)
 
 
 def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:

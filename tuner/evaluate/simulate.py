@@ -31,6 +31,7 @@ from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
 from tuner.evaluate.forces import Forces, forces_of
 from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
+from tuner.objective.flown import CODE
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.recordings.flight import Array, Series
 from tuner.recordings.interpolation import resample
@@ -375,7 +376,13 @@ def _program(
         last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))
         return logged, last.crash_time
 
-    return Program(fly, jax.tree.unflatten(structure, leaves), name="simulated flight")
+    return Program(
+        fly,
+        jax.tree.unflatten(structure, leaves),
+        name="simulated flight",
+        made_of=(schedule, precision),
+        packages=CODE,
+    )
 
 
 def _sent(reference: Published, clock: Array, control_rate: float) -> dict[str, Array]:

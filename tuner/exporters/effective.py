@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -176,7 +175,7 @@ def refitted(
     start = replace(
         fitted,
         objective=replace(fitted.objective, model=model, space=space),
-        point=Point(jnp.asarray(space.initial), _without_conditions(fitted, lost).offsets),
+        point=Point(np.asarray(space.initial), _without_conditions(fitted, lost).offsets),
     )
     movable = np.array([_moves(p) and p.name not in fitted.held for p in parameters], bool)
     end = _polished(job, start, movable, on_progress)

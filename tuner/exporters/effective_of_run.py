@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from tuner.config import JobFile, Settings
@@ -247,7 +246,7 @@ def _fit(
         for row, name in enumerate(objective.conditions):
             place = len(OFFSETS) + row
             offsets[0, place, column] = known[flight.name].get(name, 0.0) / units[row]
-    progress = replace(progress, points=Point(progress.points.coefficients, jnp.asarray(offsets)))
+    progress = replace(progress, points=Point(progress.points.coefficients, np.asarray(offsets)))
     progress = grow(
         objective,
         stages_of(problem, objective)[-STAGES if simulator.start is None else 0 :],

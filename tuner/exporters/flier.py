@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, Protocol
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from sim_jax.crash import Limits
 from sim_jax.markers import estimated
 from sim_jax.motor import SwitchedLag
+from sim_jax.numeric import Array as JaxArray
 from sim_jax.plant import Plant, Sample
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
@@ -96,7 +96,7 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
         for number, body in enumerate(bodies):
             body.begin(moving[:, number], turning[:, number])
         crash_time = np.full(count, np.inf)
-        log: list[dict[str, jax.Array]] = []
+        log: list[dict[str, JaxArray]] = []
         for block in range(blocks):
             if block % schedule.blocks_per_sample == 0:
                 row = Sample(state.motion, state.rotor_speed, state.command, state.setpoints)
@@ -143,7 +143,7 @@ def _commanded(plant: Plant, state: State, step: Any, begins_block: bool) -> tup
     if begins_block:
         state = replaced(state, setpoints=plant.inlet.next_setpoints(plant, state, step))
     state = plant.inlet.next_command(plant, state, step)
-    asked = jnp.stack(state.reference_speed)
+    asked: Any = jnp.stack(state.reference_speed)
     if state.reference_history is not None:
         history = push(state.reference_history, asked, step)
         state = replaced(state, reference_history=history)
@@ -169,7 +169,7 @@ def _moved(plant: Plant, state: State, rows: Any, speeds: Any, step: Any) -> Sta
 @eqx.filter_jit
 def _logged(
     row: Sample, model: Model, environment: Any, conditions: Any, channels: tuple[str, ...]
-) -> dict[str, jax.Array]:
+) -> dict[str, JaxArray]:
     """Return channel -> (F, c)."""
-    logged: dict[str, jax.Array] = recorded_of(row, model, environment, conditions, channels)
+    logged: dict[str, JaxArray] = recorded_of(row, model, environment, conditions, channels)
     return logged

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -154,8 +155,9 @@ def _followed(command: Array, motor: Motor, up: float, down: float, step: float)
     lag = Lag.over(lagging, step)
     asked = jax.vmap(lambda row: reference_speed(motor, row))(jnp.asarray(command))
 
-    def advance(speed: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def advance(speed: Any, reference: Any) -> tuple[Any, Any]:
         after, _ = lag.advance(speed, reference)
         return after, after
 
-    return jax.lax.scan(advance, asked[0], asked)[1]
+    speeds: jax.Array = jax.lax.scan(advance, asked[0], asked)[1]
+    return speeds

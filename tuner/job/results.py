@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from pydantic import JsonValue
 
@@ -27,7 +26,7 @@ from tuner.evaluate.held_out import (
 )
 from tuner.evaluate.records import RMSE_UNITS
 from tuner.objective.criterion import OFFSET_UNIT
-from tuner.objective.initial_conditions import ROWS, whole
+from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.segments import OFFSETS
 from tuner.result import (
@@ -147,7 +146,8 @@ def starts_moved(fitted: Fitted) -> dict[str, JsonValue]:
     freedom, states = fitted.objective.segments.freedom, fitted.criterion.states
     if freedom is None or states is None:
         return {}
-    moved = np.asarray(whole(jnp.asarray(states) * freedom, fitted.objective.segments.freed))
+    moved = np.zeros((ROWS["trim"].stop, freedom.shape[-1]))
+    moved[list(fitted.objective.segments.freed)] = np.asarray(states) * freedom
     return {name: float(np.sqrt(np.mean(moved[rows] ** 2))) for name, rows in ROWS.items()}
 
 

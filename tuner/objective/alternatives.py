@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.inlet import ReferenceInlet
@@ -53,7 +52,7 @@ def _read_again(
 ) -> dict[str, Objective]:
     """Return the problem with other readings of the voltmeters, if they matter to a fit."""
     segments = objective.segments
-    vehicle = objective.tunable.at(jnp.asarray(point.coefficients)).vehicle
+    vehicle = objective.tunable.at(np.asarray(point.coefficients)).vehicle
     matters = bool(float(vehicle.effects.get("battery_exponent", 0.0)))
     if not flights or segments.log_voltage is None or not matters:
         return {}

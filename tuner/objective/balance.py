@@ -24,13 +24,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jax.typing import ArrayLike
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
+from sim_jax.numeric import GRAVITY, Array
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air

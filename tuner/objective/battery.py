@@ -8,11 +8,10 @@ from functools import lru_cache
 
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from scipy.interpolate import BSpline, make_smoothing_spline
 
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.schedule import Schedule
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import robust_sd

@@ -8,7 +8,6 @@ from typing import Any, TypeAlias
 
 import equinox as eqx
 import numpy as np
-from jax import Array
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
@@ -16,7 +15,7 @@ from tuner.objective.segments import OFFSETS, Segments
 from tuner.vehicle import REGISTRY, recording_offsets
 
 Either: TypeAlias = Any
-"""An array of NumPy, or, in a compiled step of the search, of jax."""
+"""An array of NumPy, or of jax."""
 
 OFFSET_UNIT = 0.01
 """s of a clock's offset, or rad/s of a gyro's, per unit of the search's coordinate."""
@@ -43,8 +42,8 @@ class Point(eqx.Module):
         the units of `units_of`.
     """
 
-    coefficients: Float[Array, " K"]
-    offsets: Float[Array, "offsets N"]
+    coefficients: Float[Either, " K"]
+    offsets: Float[Either, "offsets N"]
 
 
 class Criterion(eqx.Module):
@@ -69,12 +68,12 @@ class Criterion(eqx.Module):
         deviations; None where starts are known.
     """
 
-    horizon: Int[Array, ""]
-    scale: dict[str, Float[Array, " N"]]
-    reference_offset: Float[Array, "clocks N"]
-    huber: Float[Array, ""]
-    prior: Float[Array, ""]
-    states: Float[Array, "L F"] | None = None
+    horizon: Int[Either, ""]
+    scale: dict[str, Float[Either, " N"]]
+    reference_offset: Float[Either, "clocks N"]
+    huber: Float[Either, ""]
+    prior: Float[Either, ""]
+    states: Float[Either, "L F"] | None = None
 
 
 class SegmentSums(eqx.Module):

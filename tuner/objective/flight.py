@@ -7,13 +7,13 @@ from types import MappingProxyType
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import Array
 from jaxtyping import Float, Int
 
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet
 from sim_jax.markers import markers_of
+from sim_jax.numeric import Array
 from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import Rollout, rollout

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,10 +48,10 @@ def portion(
     flight = np.asarray(objective.segments.flight)
     segments = np.flatnonzero(np.isin(flight, flights))
     kept = jax.tree.map(
-        lambda leaf: jnp.asarray(np.asarray(leaf)[..., segments]), objective.segments
+        lambda leaf: np.asarray(np.asarray(leaf)[..., segments]), objective.segments
     )
     kept = eqx.tree_at(
-        lambda k: k.flight, kept, jnp.asarray(np.searchsorted(flights, flight[segments]))
+        lambda k: k.flight, kept, np.asarray(np.searchsorted(flights, flight[segments]))
     )
     return (
         eqx.tree_at(lambda o: o.segments, objective, kept),

@@ -38,6 +38,10 @@ AT_ONCE = 2
 instruction cache and takes longer to build."""
 
 
+CODE = ("sim_jax", "tuner")
+"""Packages whose code is run while a program of this one is traced."""
+
+
 class Flown(NamedTuple):
     """What segments are compared by, logged at ``schedule.log_rate``; the pose is the markers'.
 
@@ -234,7 +238,14 @@ def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> P
     def flight(given: _Given, lengths: Mapping[str, int]) -> tuple[dict[str, Any], Any]:
         return _flight(given, static, lengths["turns"])
 
-    return Program(flight, arguments, at_once=AT_ONCE, name="flight of a segment")
+    return Program(
+        flight,
+        arguments,
+        at_once=AT_ONCE,
+        name="flight of a segment",
+        made_of=static,
+        packages=CODE,
+    )
 
 
 def _flight(given: _Given, static: _Static, samples: int) -> tuple[dict[str, Any], Any]:

@@ -9,16 +9,17 @@ segment, and what is left of the normal equations speaks of the coefficients alo
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from sim_jax.inlet import Inlet, MixedInlet
 from sim_jax.motor import reference_speed
+from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start
@@ -123,7 +124,7 @@ def trimmed(inlet: Inlet, vehicle: Vehicle, change: Float[Array, "L F"]) -> Inle
         changed: Inlet = eqx.tree_at(lambda i: i.parts, inlet, tuple(parts))
         return changed
     roll, pitch, yaw = change[ROWS["trim"]]
-    arms = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
+    arms: list[tuple[Any, Any]] = [(rotor.position.x, rotor.position.y) for rotor in vehicle.rotors]
     width = sum(abs(y) for _, y in arms) / len(arms)
     length = sum(abs(x) for x, _ in arms) / len(arms)
     trim = [

@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import ClassVar
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.control.mixer import ROTORS
@@ -26,6 +24,7 @@ from sim_jax.inlet import (
     ReferenceInlet,
     RotorSpeedInlet,
 )
+from sim_jax.numeric import Array
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
@@ -100,15 +99,15 @@ class RecordedReference(RecordedInlet):
         length = max(len(flight.time) for flight in flights)
         columns = [reference_points(flight, length) for flight in flights]
         position, velocity, acceleration = (
-            Vec3.of(jnp.asarray(np.stack([c[part] for c in columns], axis=-1))) for part in range(3)
+            Vec3.of(np.stack([c[part] for c in columns], axis=-1)) for part in range(3)
         )
         spins = [flight.yaw_rate_setpoint for flight in flights]
         level_held = [flight.level_held for flight in flights]
         return ReferenceInlet(
             ReferencePoint(position, velocity, acceleration),
-            spins=jnp.asarray([spin is not None for spin in spins]),
-            yaw_rate=jnp.asarray([spin or 0.0 for spin in spins]),
-            level_held=jnp.asarray(level_held) if any(level_held) else None,
+            spins=np.asarray([spin is not None for spin in spins]),
+            yaw_rate=np.asarray([spin or 0.0 for spin in spins]),
+            level_held=np.asarray(level_held) if any(level_held) else None,
         )
 
 
@@ -154,7 +153,7 @@ class RecordedCommand(RecordedInlet):
         """Lay the commands out step by step."""
         return ActuatorInlet(tuple(self._resampled("command", flights, schedule)))
 
-    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
+    def trimmed(self, inlet: Inlet, trim: Sequence[Array]) -> Inlet:
         """Add the trim to the commands."""
         assert isinstance(inlet, ActuatorInlet)
         pairs = zip(inlet.command, trim, strict=True)
@@ -177,7 +176,7 @@ class RecordedRotorSpeed(RecordedInlet):
         """Lay the speeds out step by step."""
         return RotorSpeedInlet(tuple(self._resampled("rotor_speed", flights, schedule)))
 
-    def trimmed(self, inlet: Inlet, trim: Sequence[jax.Array]) -> Inlet:
+    def trimmed(self, inlet: Inlet, trim: Sequence[Array]) -> Inlet:
         """Change the speeds by the trim's share."""
         assert isinstance(inlet, RotorSpeedInlet)
         pairs = zip(inlet.speed, trim, strict=True)
@@ -245,7 +244,7 @@ class RecordedAttitude(RecordedInlet):
     def lay(self, flights: Sequence[Flight], schedule: Schedule) -> AttitudeInlet:
         """Lay attitudes and body rates out step by step, beside what turns the rotors."""
         with_rate = [with_body_rate(flight) for flight in flights]
-        attitude = jnp.stack(self._resampled("attitude", flights, schedule))
+        attitude = np.stack(self._resampled("attitude", flights, schedule))
         return AttitudeInlet(
             Quaternion.of(attitude).normalized(),
             Vec3(*self._resampled("body_rate", with_rate, schedule)),
@@ -326,7 +325,7 @@ def _laid(
             for own, flight in zip(recorded, flights, strict=True)
         ]
         parts.append(inlet.lay(feeding, schedule))
-    return MixedInlet(tuple(parts), jnp.asarray([used.index(inlet) for inlet in recorded]))
+    return MixedInlet(tuple(parts), np.asarray([used.index(inlet) for inlet in recorded]))
 
 
 def recorded_inlet_of(inlet: Inlet) -> RecordedInlet:

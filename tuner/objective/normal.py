@@ -8,13 +8,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Float
 from numpy.typing import NDArray
 
 from sim_jax.crash import Limits
+from sim_jax.numeric import Array
 from sim_jax.schedule import Schedule
 from tuner.objective.criterion import (
     Criterion,
@@ -70,7 +69,7 @@ class Objective(eqx.Module):
 
     def start(self, vector: np.ndarray[Any, Any]) -> Point:
         """Return a point with a search vector and no offset."""
-        return Point(jnp.asarray(vector), jnp.zeros((len(self.of_flight), self.flights)))
+        return Point(np.asarray(vector), np.zeros((len(self.of_flight), self.flights)))
 
     @property
     def simulator(self) -> Simulator:
@@ -162,5 +161,5 @@ def with_conditions(
     """
     added = tuple(name for name in names if name not in objective.conditions)
     wider = replace(objective, conditions=(*objective.conditions, *added))
-    nothing = jnp.zeros((len(added), objective.flights))
-    return wider, Point(point.coefficients, jnp.concatenate([point.offsets, nothing]))
+    nothing = np.zeros((len(added), objective.flights))
+    return wider, Point(point.coefficients, np.concatenate([point.offsets, nothing]))

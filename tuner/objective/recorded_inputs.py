@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import ClassVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from sim_jax.inlet import Inlet
@@ -167,4 +166,4 @@ class RecordedInlet(ABC):
         table = np.stack(
             [read(without_gaps(flight.series[signal]), clock) for flight in flights], axis=-1
         )
-        return [jnp.asarray(table[:, column]) for column in range(table.shape[1])]
+        return [np.asarray(table[:, column]) for column in range(table.shape[1])]

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from lanes import Argument, Program, joined
+from sim_jax.numeric import Array
 from sim_jax.rotation import Quaternion
 from tuner.core.numerics import huber_weights
-from tuner.objective.flown import Flown
+from tuner.objective.flown import CODE, Flown
 from tuner.objective.segments import CLOCK_OF, CLOCKS, Segments
 
 RAMP = 0.25
@@ -253,15 +253,20 @@ def _attitude_error(
 
 @cache
 def _rotation_program() -> Program:
-    def error(given: tuple[jax.Array, jax.Array], _: Mapping[str, int]) -> jax.Array:
+    def error(given: tuple[Array, Array], _: Mapping[str, int]) -> Array:
         recorded, flown = map(Quaternion.of, given)
         return recorded.rotation_vector_to(flown).stacked()
 
     either = Argument((4,), float, lanes=True)
-    return Program(error, (either, replace(either, moves=True)), at_once=4, name="attitude error")
+    return Program(
+        error,
+        (either, replace(either, moves=True)),
+        at_once=4,
+        name="attitude error",
+        made_of=(),
+        packages=CODE,
+    )
 
-
-Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 1024
 """Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that

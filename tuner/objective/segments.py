@@ -7,14 +7,13 @@ from dataclasses import replace
 from types import MappingProxyType
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from sim_jax.disturbance import Disturbance
 from sim_jax.inlet import Inlet, ReferenceInlet
+from sim_jax.numeric import Array
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from tuner.config.job import InletName
@@ -153,8 +152,8 @@ def segments_of(
     inlet = INLETS["reference"].lay(flights, schedule)
     assert isinstance(inlet, ReferenceInlet)
     freed = {}
-    if free_starts and bool(jnp.any(inlet.spins)):
-        rate = jnp.where(inlet.spins, inlet.yaw_rate, 0.0)
+    if free_starts and bool(np.any(inlet.spins)):
+        rate = np.where(inlet.spins, inlet.yaw_rate, 0.0)
         known = noise.get("position", 0.0)  # where no position is compared, none is corrected
         begun = [position_error(flight.series, known) for flight in flights]
         freed = freedom_of_spin(np.asarray(rate), schedule.rate_control_rate, np.array(begun))
@@ -162,11 +161,11 @@ def segments_of(
         inlet=inlet,
         start=start_of([flight.initial for flight in flights]),
         measured=_all_measured(flights, noise, weights),
-        flight=jnp.arange(len(flights)),
-        resting=jnp.asarray([rests(flight.initial) for flight in flights]),
-        wander=None if wander is None else jnp.asarray(wander),
+        flight=np.arange(len(flights)),
+        resting=np.asarray([rests(flight.initial) for flight in flights]),
+        wander=None if wander is None else np.asarray(wander),
         log_voltage=log_voltage_of(flights, [Window(flight, 0.0) for flight in flights], schedule),
-        freedom=jnp.asarray(np.stack(list(freed.values()))) if freed else None,
+        freedom=np.asarray(np.stack(list(freed.values()))) if freed else None,
         freed=tuple(freed),
     )
 
@@ -232,7 +231,7 @@ def window_segments(
     if free_starts:
         of_all = np.stack([freedom_of(INLETS[name].ignores) for name in names], axis=-1)
         freed = np.flatnonzero(of_all.any(axis=1))
-        freedom = jnp.asarray(of_all[freed])
+        freedom = np.asarray(of_all[freed])
     compared = {
         channel: sigma
         for channel, sigma in noise.items()
@@ -247,9 +246,9 @@ def window_segments(
         inlet=inlet_of(names, pieces, schedule),
         start=start,
         measured=_all_measured(pieces, compared, weights),
-        flight=jnp.asarray([number for number, _ in cut]),
-        turning=jnp.asarray(np.stack([recent_command(piece, lag) for piece in pieces], axis=-1)),
-        begin=jnp.asarray([window.begin for _, window in cut]),
+        flight=np.asarray([number for number, _ in cut]),
+        turning=np.stack([recent_command(piece, lag) for piece in pieces], axis=-1),
+        begin=np.asarray([window.begin for _, window in cut]),
         log_voltage=log_voltage_of(
             [flights[number] for number, _ in cut], [window for _, window in cut], schedule
         ),
@@ -312,9 +311,9 @@ def _measured(
         tables.append(filled)
         scales.append(np.pad(scale, ((0, padding), (0, 0))))
     return Measured(
-        time=jnp.asarray(np.stack(times, axis=-1)),
-        values=jnp.asarray(np.stack(tables, axis=-1)),
-        weight=jnp.asarray(np.stack(scales, axis=-1)),
+        time=np.stack(times, axis=-1),
+        values=np.stack(tables, axis=-1),
+        weight=np.stack(scales, axis=-1),
     )
 
 

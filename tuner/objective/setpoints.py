@@ -25,9 +25,11 @@ from sim_jax.control.position import (
     heading_of,
     wanted_acceleration,
 )
+from sim_jax.numeric import Array as JaxArray
 from sim_jax.rotation import Quaternion
 from sim_jax.vector import Vec3
 from tuner.findings.findings import Code, Finding
+from tuner.objective.flown import CODE
 from tuner.objective.recorded_inputs import linear_interpolation, zero_order_hold
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.vehicle import ControllerFile
@@ -203,10 +205,16 @@ def _computed(flight: Flight, controller: ControllerFile, time: Array) -> Array:
 @lru_cache(maxsize=8)
 def _program(leaves: tuple[Argument, ...], structure: Any) -> Program:
     arguments = jax.tree.unflatten(structure, leaves)
-    return Program(_rates, arguments, name="rate set-points of a controller file")
+    return Program(
+        _rates,
+        arguments,
+        name="rate set-points of a controller file",
+        made_of=(),
+        packages=CODE,
+    )
 
 
-def _rates(given: tuple[Mapping[str, jax.Array], Controller], _: Mapping[str, int]) -> jax.Array:
+def _rates(given: tuple[Mapping[str, JaxArray], Controller], _: Mapping[str, int]) -> JaxArray:
     """Return the rate set-point (3,) of one state."""
     state, controller = given
     position, velocity = Vec3.of(state["position"]), Vec3.of(state["velocity"])

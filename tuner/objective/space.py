@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax import Array, nn
-from jax.typing import ArrayLike
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import expit
 
 from tuner.config import JobFile
 from tuner.core.errors import ConfigError
@@ -23,49 +19,6 @@ from tuner.vehicle.vehicle import Size, size_of, sized
 AS_TABLED = Size()
 OFF_BOUND = 0.05
 """A start on a bound is moved inside by this share of the range."""
-
-
-class Coordinates(eqx.Module):
-    """The map from the search's z to numbers, itself in numbers: one program serves every space.
-
-    The scaled coordinate x (logarithm or number) of each parameter lies between its bounds by a
-    logistic map of z, so that no step can leave them.
-
-    Attributes
-    ----------
-    lower, width
-        (K,) lower bound and the bounds' distance, scaled.
-    stretch
-        (K,) of the logistic map.
-    is_log
-        (K,) whose scaled coordinate is the logarithm.
-    prior_mean, prior_sd
-        (K,) scaled.
-    joint_rows, joint_offset
-        (N, K) and (N,) of ground measurements, see `tuner.vehicle.joint_prior`; None without.
-    """
-
-    lower: Float[Array, " K"]
-    width: Float[Array, " K"]
-    stretch: Float[Array, " K"]
-    is_log: Bool[Array, " K"]
-    prior_mean: Float[Array, " K"]
-    prior_sd: Float[Array, " K"]
-    joint_rows: Float[Array, "N K"] | None = None
-    joint_offset: Float[Array, " N"] | None = None
-
-    def __len__(self) -> int:
-        return int(self.lower.shape[0])
-
-    def scaled(self, vector: Array) -> Array:
-        """Return the scaled coordinates (K,) of a search vector; traceable."""
-        scaled: Array = self.lower + self.width * nn.sigmoid(vector / self.stretch)
-        return scaled
-
-    def numbers(self, vector: Array) -> Array:
-        """Return the parameters' values (K,); traceable."""
-        scaled = self.scaled(vector)
-        return jnp.where(self.is_log, jnp.exp(jnp.where(self.is_log, scaled, 0.0)), scaled)
 
 
 class Space:
@@ -94,20 +47,6 @@ class Space:
         if joint_prior is not None:
             self.joint_rows, self.joint_offset = joint_prior.rows(self.parameters, self.fixed)
 
-    @property
-    def coordinates(self) -> Coordinates:
-        """What compiled functions need of it."""
-        return Coordinates(
-            lower=jnp.asarray(self.lower),
-            width=jnp.asarray(self.width),
-            stretch=jnp.asarray(self.stretch),
-            is_log=jnp.asarray(self.is_log),
-            prior_mean=jnp.asarray(self.prior_mean),
-            prior_sd=jnp.asarray(self.prior_sd),
-            joint_rows=None if self.joint_rows is None else jnp.asarray(self.joint_rows),
-            joint_offset=None if self.joint_offset is None else jnp.asarray(self.joint_offset),
-        )
-
     def __len__(self) -> int:
         return len(self.parameters)
 
@@ -126,26 +65,27 @@ class Space:
         scaled = np.array([p.scaled(values[p.name]) for p in self.parameters])
         return self.at_share((scaled - self.lower) / self.width)
 
-    def scaled(self, vector: Array) -> Array:
-        """Return the scaled coordinates (K,) of a search vector; traceable."""
-        return self.coordinates.scaled(vector)
+    def scaled(self, vector: ArrayLike) -> NDArray[np.float64]:
+        """Return the scaled coordinates of search vectors (*S, K)."""
+        return np.asarray(self.lower + self.width * self.share(vector))
 
-    def values(self, vector: Array) -> dict[str, Array]:
-        """Return every free coefficient's value, tied ones too; traceable."""
-        numbers = self.coordinates.numbers(vector)
+    def at(self, vector: ArrayLike) -> NDArray[np.float64]:
+        """Return the parameters' values at search vectors (*S, K)."""
+        scaled = self.scaled(vector)
+        return np.where(self.is_log, np.exp(np.where(self.is_log, scaled, 0.0)), scaled)
+
+    def numbers(self, vector: ArrayLike) -> dict[str, float]:
+        """Return every free coefficient's value, tied ones too."""
+        values = self.at(vector)
         return {
-            name: numbers[index] * ratio
-            for index, parameter in enumerate(self.parameters)
+            name: float(value * ratio)
+            for value, parameter in zip(values, self.parameters, strict=True)
             for name, ratio in parameter.ratios.items()
         }
 
-    def numbers(self, vector: ArrayLike) -> dict[str, float]:
-        """Return what `values` does, as plain numbers."""
-        return {name: float(value) for name, value in self.values(jnp.asarray(vector)).items()}
-
-    def share(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    def share(self, vector: ArrayLike) -> NDArray[np.float64]:
         """Return where between its bounds each scaled coordinate of a search vector lies, 0..1."""
-        return np.asarray(1.0 / (1.0 + np.exp(-vector / self.stretch)))
+        return np.asarray(expit(np.asarray(vector) / self.stretch))
 
     def at_share(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the search vector (K,) that lies so far between the bounds, just inside them."""

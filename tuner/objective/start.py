@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,7 +33,7 @@ def start_of(initial: Sequence[InitialState], *, resting: bool = True) -> Start:
         recorded. A slow moment in the middle of a flight is no hover.
     """
     rows = [_start(state, resting=resting and rests(state)) for state in initial]
-    stacked = {key: jnp.asarray(np.stack([row[key] for row in rows], axis=-1)) for key in rows[0]}
+    stacked = {key: np.stack([row[key] for row in rows], axis=-1) for key in rows[0]}
     speed, command = stacked["rotor_speed"], stacked["command"]
     return Start(
         motion=Motion(

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,7 +64,7 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
         Hz of the position controller, which sees the last of the publisher's 100 Hz ticks.
     """
     shape = shapes()[settings.name](
-        radius=jnp.asarray(settings.radius), omega=jnp.asarray(settings.omega)
+        radius=np.asarray(settings.radius), omega=np.asarray(settings.omega)
     )
     ticks = math.ceil(duration * TICK_RATE) + 1
     sent = publish(shape, ticks=ticks, velocity_scaler=settings.speed_scale)
@@ -73,13 +72,13 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
     seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
     rows = seen.astype(int)
     points: ReferencePoint = jax.tree.map(  # numpy's indexing, for jax's takes a program each
-        lambda leaf: jnp.asarray(np.asarray(leaf)[rows]), sent.points
+        lambda leaf: np.asarray(np.asarray(leaf)[rows]), sent.points
     )
     return Published(
         ReferenceInlet(
             points,
-            spins=jnp.asarray(shape.spins),
-            yaw_rate=jnp.asarray(settings.yaw_rate if shape.spins else 0.0),
+            spins=np.asarray(shape.spins),
+            yaw_rate=np.asarray(settings.yaw_rate if shape.spins else 0.0),
         ),
         np.asarray(sent.lap)[rows],
     )

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 
-from tuner.objective.space import Coordinates, Space
+from tuner.objective.space import Space
 from tuner.vehicle.model import Model, coefficients_in, with_coefficients
+
+Array = NDArray[np.float64]
 
 
 class Tunable(eqx.Module):
@@ -27,8 +28,8 @@ class Tunable(eqx.Module):
     ----------
     model
         Holds the coefficients that do not move.
-    coordinates
-        Of the K parameters.
+    lower, width, stretch, is_log
+        (K,) the map from the search's coordinates to numbers, as of a `Space`.
     ratios
         (C, K) value of each coefficient over that of each parameter; a column of zeros moves none.
     moves
@@ -38,14 +39,18 @@ class Tunable(eqx.Module):
     """
 
     model: Model
-    coordinates: Coordinates
+    lower: Float[Array, " K"]
+    width: Float[Array, " K"]
+    stretch: Float[Array, " K"]
+    is_log: Bool[NDArray[np.bool_], " K"]
     ratios: Float[Array, "C K"]
-    moves: Bool[Array, " C"]
+    moves: Bool[NDArray[np.bool_], " C"]
     names: tuple[str, ...] = eqx.field(static=True)
 
-    def values(self, vector: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def values(self, vector: ArrayLike) -> dict[str, Array]:
         """Return coefficient -> value at search vectors (*S, K), on the host."""
-        moved = self._numbers(vector) @ np.asarray(self.ratios).T
+        vector = np.asarray(vector)
+        moved = self._numbers(vector, np, expit) @ self.ratios.T
         given = coefficients_in(self.model)
         return {
             name: moved[..., i]
@@ -54,25 +59,20 @@ class Tunable(eqx.Module):
             for i, name in enumerate(self.names)
         }
 
-    def slopes(self, vector: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    def slopes(self, vector: ArrayLike) -> dict[str, Array]:
         """Return moved coefficient -> its derivatives (K,) at a search vector, on the host."""
-        c = self.coordinates
-        share = expit(vector / np.asarray(c.stretch))
-        slope = np.asarray(c.width) * share * (1.0 - share) / np.asarray(c.stretch)
-        slope = np.where(np.asarray(c.is_log), self._numbers(vector), 1.0) * slope
-        rows = np.asarray(self.ratios) * slope
+        vector = np.asarray(vector)
+        share = expit(vector / self.stretch)
+        slope = self.width * share * (1.0 - share) / self.stretch
+        slope = np.where(self.is_log, self._numbers(vector, np, expit), 1.0) * slope
+        rows = self.ratios * slope
         return {name: rows[i] for i, name in enumerate(self.names) if self.moves[i]}
 
-    def _numbers(self, vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what `Coordinates.numbers` does."""
-        c = self.coordinates
-        is_log = np.asarray(c.is_log)
-        scaled = np.asarray(c.lower) + np.asarray(c.width) * expit(vector / np.asarray(c.stretch))
-        return np.where(is_log, np.exp(np.where(is_log, scaled, 0.0)), scaled)
-
-    def at(self, vector: Float[Array, " K"]) -> Model:
-        """Return the model with the coefficients of a search vector."""
-        moved = jnp.sum(self.ratios * self.coordinates.numbers(vector), axis=-1)
+    def at(self, vector: ArrayLike) -> Model:
+        """Return the model with the coefficients of a search vector (K,), which may be traced."""
+        if not isinstance(vector, jax.core.Tracer):
+            return with_coefficients(self.model, self.values(vector))
+        moved = jnp.sum(self.ratios * self._numbers(vector, jnp, jax.nn.sigmoid), axis=-1)
         given = coefficients_in(self.model)
         values = {
             name: jnp.where(self.moves[i], moved[i], given.get(name, 0.0))
@@ -80,26 +80,29 @@ class Tunable(eqx.Module):
         }
         return with_coefficients(self.model, values)
 
+    def _numbers(self, vector: Any, numpy: Any, logistic: Any) -> Any:
+        """Return the parameters' values, by NumPy or by jax."""
+        scaled = self.lower + self.width * logistic(vector / self.stretch)
+        return numpy.where(self.is_log, numpy.exp(numpy.where(self.is_log, scaled, 0.0)), scaled)
 
-def tunable_of(model: Model, space: Space, *, count: int | None = None) -> Tunable:
-    """Return the model moved by a space, with parameters that move nothing up to a count."""
-    spare = 0 if count is None else count - len(space)
+
+def tunable_of(model: Model, space: Space) -> Tunable:
+    """Return the model moved by a space."""
     free = {name for parameter in space.parameters for name in parameter.ratios}
     given = coefficients_in(model)
     names = (*given, *sorted(free - set(given)))
-    ratios = np.zeros((len(names), len(space) + spare))
+    ratios = np.zeros((len(names), len(space)))
     for column, parameter in enumerate(space.parameters):
         for name, ratio in parameter.ratios.items():
             ratios[names.index(name), column] = ratio
     return Tunable(
         # on the host, so that no number is of a weak type: it would count as another program
         model=jax.tree.map(np.asarray, model),
-        coordinates=jax.tree.map(
-            # as well any number that no bound or root stumbles over
-            lambda leaf: jnp.pad(leaf, (0, spare), constant_values=1),
-            replace(space.coordinates, joint_rows=None, joint_offset=None),
-        ),
-        ratios=jnp.asarray(ratios),
-        moves=jnp.asarray([name in free for name in names]),
+        lower=space.lower,
+        width=space.width,
+        stretch=space.stretch,
+        is_log=space.is_log,
+        ratios=ratios,
+        moves=np.array([name in free for name in names]),
         names=names,
     )

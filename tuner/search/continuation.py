@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -148,7 +147,7 @@ def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
         return problem
     stay = clocks_that_differ(problem.objective, points, best, problem.criterion, free)
     points = Point(points.coefficients, points.offsets * stay)
-    clocks = jnp.asarray(points.offsets[best])[: len(CLOCKS)] * OFFSET_UNIT
+    clocks = np.asarray(points.offsets[best])[: len(CLOCKS)] * OFFSET_UNIT
     return replace(
         problem,
         points=points,

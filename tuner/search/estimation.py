@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -90,7 +89,7 @@ def load(path: Path, key: str, fresh: Progress) -> tuple[Progress, float]:
         progress = replace(
             fresh,
             stage=head["stage"],
-            points=Point(jnp.asarray(data["coefficients"]), jnp.asarray(data["offsets"])),
+            points=Point(np.asarray(data["coefficients"]), np.asarray(data["offsets"])),
             scales=dict(zip(head["channels"], data["scales"], strict=True)),
             losses=data["losses"],
             damping=data["damping"],

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -95,7 +94,7 @@ class CmaEs(Optimiser):
         kept = np.array(problem.losses)
         kept[start] = state.least
         iterate = Iterate(
-            points=Point(jnp.asarray(coefficients), problem.points.offsets),
+            points=Point(np.asarray(coefficients), problem.points.offsets),
             losses=kept,
             accepted=np.ones(len(kept), bool),
             position_rmse=float(position_rmse[best]),
@@ -126,7 +125,7 @@ def _loss(
 
     def loss(vectors: Array) -> tuple[Array, Array]:
         batch = evaluate(objective, vectors, point, criterion)
-        scaled = np.stack([np.asarray(space.scaled(jnp.asarray(vector))) for vector in vectors])
+        scaled = np.stack([space.scaled(vector) for vector in vectors])
         pull = (scaled - space.prior_mean) / space.prior_sd * float(criterion.prior)
         total = np.asarray(batch.loss).sum(axis=-1) + 0.5 * (pull**2).sum(axis=-1)
         if space.joint_rows is not None and space.joint_offset is not None:

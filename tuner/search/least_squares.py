@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import Step, advance, begin, on_host, proposed
+from tuner.search.levenberg_marquardt import Step, advance, begin
 from tuner.search.optimiser import Iterate, Onward, Optimiser, StageProblem
 from tuner.search.weights import NEAR, worst_channels
 
@@ -85,7 +84,7 @@ class Descent:
 
 
 class LeastSquares(Optimiser):
-    """Levenberg-Marquardt by optimistix; coefficients and flights' offsets move together."""
+    """Levenberg-Marquardt; coefficients and flights' offsets move together."""
 
     name = "gradient"
 
@@ -93,7 +92,7 @@ class LeastSquares(Optimiser):
         """Return the solver before its first step from the stage's points."""
         given = problem.criterion.states
         states = None if given is None else np.asarray(given)
-        return Descent(begin(on_host(problem.points), problem.damping), states, states)
+        return Descent(begin(problem.points, problem.damping), states, states)
 
     def step(self, problem: StageProblem, state: Descent) -> tuple[Descent, Iterate]:
         """Fly every start's next point with derivatives; keep those that are better.
@@ -126,10 +125,10 @@ class LeastSquares(Optimiser):
     def terminate(self, problem: StageProblem, state: Descent) -> bool:
         """Return whether every start is good enough for the next stage, or gains no more.
 
-        optimistix's own rule, `Step.still`, ends a start whose nine leading digits no longer
-        change. No recording has so many, so that a stage's tolerance ends it sooner: as soon as the
-        loss gains less than that, by the last accepted step or by the last three tries; or before
-        that step is tried, where the normal equations promise no gain that matters.
+        `Step.still` ends a start whose nine leading digits no longer change. No recording has so
+        many, so that a stage's tolerance ends it sooner: as soon as the loss gains less than that,
+        by the last accepted step or by the last three tries; or before that step is tried, where
+        the normal equations promise no gain that matters.
         """
         if not state.losses:
             return False
@@ -177,7 +176,7 @@ def _onward(problem: StageProblem, step: Step) -> Onward:
     untried = np.asarray(near & (step.promise <= HANDED_ON))
     points: Point = jax.tree.map(
         lambda new, old: np.where(untried.reshape(-1, *[1] * (old.ndim - 1)), new, old),
-        proposed(step),
+        step.tried,
         step.point,
     )
     damping = np.where(near, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
@@ -190,6 +189,6 @@ def _position_rmse(objective: Objective, step: Step, start: int) -> float:
         return float("nan")
     weight = np.asarray(objective.segments.measured["position"].weight)
     sigma = 1.0 / weight.max(initial=1e-30)
-    counts = float(jnp.sum(step.sums.counts["position"][start]))
-    squares = float(jnp.sum(step.sums.squares["position"][start]))
+    counts = float(np.sum(step.sums.counts["position"][start]))
+    squares = float(np.sum(step.sums.squares["position"][start]))
     return float(sigma * np.sqrt(3.0 * squares / (counts or np.nan)))

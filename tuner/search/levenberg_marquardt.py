@@ -1,169 +1,82 @@
-"""optimistix's Levenberg-Marquardt, stepped by hand for several starts at once.
+"""Levenberg-Marquardt for several starts at once, one step at a time.
 
-The solver is put together as optimistix documents it: an `AbstractGaussNewton` made of a descent
-(`DampedNewtonDescent`, which solves (JᵀJ + λ I) Δy = -Jᵀr by QR) and a search
-(`ClassicalTrustRegion`, which accepts or rejects the point and sets λ = 1/step size). Its `init`,
-`step` and `terminate` are called here rather than by `optimistix.least_squares`, because the
-residuals of a step come from a kernel, outside the compiled step, and
-because a user sees each iteration. What `fn` is and why it is linear: `tuner.search
-.normal_equations`.
+About the best point so far the loss is the quadratic of its normal equations, c + gᵀd + ½ dᵀHd. The
+next point to be tried lies at d = -(H + λI)⁻¹ g. It is accepted if the loss falls by more than a
+twentieth of what the quadratic says; λ is then kept, or divided by five where it falls by more than
+0.7 of that; a point that is rejected multiplies λ by five (Madsen, Nielsen and Tingleff, "Methods
+for non-linear least squares problems", 2004, section 3.2).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, cast
+from dataclasses import dataclass, replace
+from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix
-from jax import Array
-from jax.typing import ArrayLike
-from jaxtyping import Bool, Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import linalg
 
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
-from tuner.objective.space import Coordinates
-from tuner.search.normal_equations import (
-    LinearResiduals,
-    linear_residuals,
-    normal_equations,
-    residuals_at,
-)
+from tuner.search.normal_equations import NormalEquations, normal_equations
+
+Array = NDArray[np.float64]
+
+ACCEPTED, WELL_PREDICTED = 0.05, 0.7
+"""Share of the predicted fall of the loss from which a point is accepted, and λ made smaller."""
+FACTOR = 5.0
+"""By which λ changes."""
+STILL = 1e-9
+"""Change of a coordinate, and of the loss, below which nothing moves any more; relative to one, and
+to the coordinate or the loss where that is larger."""
+RIDGE = 1e-13
+"""Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""
 
 
-class _LevenbergMarquardt(optimistix.AbstractGaussNewton[Any, Any, Any]):  # type: ignore[misc]
-    """Levenberg-Marquardt that takes longer steps as soon as the model predicts well."""
-
-    rtol: float = 1e-9
-    atol: float = 1e-9
-    norm: Any = optimistix.max_norm
-    descent: Any = optimistix.DampedNewtonDescent()
-    search: Any = optimistix.ClassicalTrustRegion(
-        high_cutoff=0.7, low_cutoff=0.05, high_constant=5.0, low_constant=0.2
-    )
-    verbose: Any = eqx.field(static=True, default=lambda **_: None)
-
-
-_SOLVER = _LevenbergMarquardt()
-_NO_OPTIONS: dict[str, Any] = {}
-_NO_TAGS: frozenset[object] = frozenset()
-
-
-class Step(eqx.Module):
+@dataclass(frozen=True)
+class Step:
     """Where the solver stands after a step; with S starts, every array has S first.
 
     Attributes
     ----------
     point
         The best point so far.
-    solver
-        optimistix's state; its ``y_eval`` is the point to be tried next.
+    tried
+        The point to be tried next.
     sums
         The segments' sums at the point that was tried, gradient and Hessian included; None before.
     best
         Those at the best point.
     loss
-        Scalar: the loss at the best point, per compared value.
+        (S,) at the best point, per compared value.
     accepted
-        Whether the tried point was better.
+        (S,) whether the tried point was better.
     damping
-        λ of the next step, relative to the Hessian per compared value.
+        (S,) λ of the next step, relative to the Hessian per compared value.
     still
-        Whether optimistix's own `terminate` holds: the accepted point and its residuals differ
-        from those before by less than 1e-9.
+        (S,) whether the accepted point and its loss differ from those before by next to nothing.
     promise
-        Share of the loss at the best point by which its minimum would be lower, were the residuals
-        linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
+        (S,) share of the loss at the best point by which its minimum would be lower, were the
+        residuals linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
+    quadratics
+        Of each start at its best point; empty before.
     """
 
     point: Point
-    solver: Any
+    tried: Point
     sums: SegmentSums | None
     best: SegmentSums | None
-    loss: Float[Array, ""]
-    accepted: Bool[Array, ""]
-    damping: Float[Array, ""]
-    still: Bool[Array, ""]
-    promise: Float[Array, ""]
+    loss: Array
+    accepted: NDArray[np.bool_]
+    damping: Array
+    still: NDArray[np.bool_]
+    promise: Array
+    quadratics: tuple[NormalEquations, ...] = ()
 
 
-def _pack(point: Point) -> Array:
-    return jnp.concatenate([point.coefficients, point.offsets.reshape(-1)])
-
-
-def _unpack(packed: Array, like: Point) -> Point:
-    count = len(like.coefficients)
-    return Point(packed[:count], packed[count:].reshape(like.offsets.shape))
-
-
-@eqx.filter_jit
-def _init(parameters: Array, damping: Array) -> Any:
-    """Return the solver's state before the first step, for S starts (S, P) and their λ (S,)."""
-
-    def init(parameters: Array, damping: Array) -> Any:
-        count = len(parameters)
-        shapes = LinearResiduals(jnp.eye(count), jnp.zeros(count + 1), parameters)
-        residual, _ = jax.eval_shape(residuals_at, parameters, shapes)
-        state = _SOLVER.init(
-            residuals_at, parameters, shapes, _NO_OPTIONS, residual, None, _NO_TAGS
-        )
-        return eqx.tree_at(lambda s: s.search_state.step_size, state, 1.0 / damping)
-
-    return eqx.filter_vmap(init)(parameters, damping)
-
-
-@eqx.filter_jit
-def _step(
-    space: Coordinates,
-    flight: ArrayLike,
-    step: Step,
-    criterion: Criterion,
-    free: ArrayLike,
-) -> Step:
-    """Take a step for S starts, whose sums are those at the points that are to be tried."""
-
-    def advanced(before: Step) -> Step:
-        assert before.sums is not None
-        tried = _unpack(before.solver.y_eval, before.point)
-        equations = normal_equations(space, flight, tried, criterion, before.sums)
-        linear = linear_residuals(before.solver.y_eval, *equations, free)
-        parameters, solver, _ = _SOLVER.step(
-            residuals_at, _pack(before.point), linear, _NO_OPTIONS, before.solver, _NO_TAGS
-        )
-        still, _ = _SOLVER.terminate(
-            residuals_at, parameters, linear, _NO_OPTIONS, solver, _NO_TAGS
-        )
-        accepted = solver.num_steps_since_acceptance == 0
-        return Step(
-            point=_unpack(parameters, before.point),
-            solver=solver,
-            sums=before.sums,
-            best=jax.tree.map(
-                lambda new, old: jnp.where(accepted, new, old), before.sums, before.best
-            ),
-            loss=solver.f_info.as_min(),
-            accepted=accepted,
-            damping=1.0 / solver.search_state.step_size,
-            still=still,
-            promise=_promise(solver.f_info),
-        )
-
-    after: Step = eqx.filter_vmap(advanced)(step)
-    return after
-
-
-def _promise(info: Any) -> Array:
-    """Return the share of a loss that `linear_residuals` say can be gained: r is (L⁻¹g, rest)."""
-    gain = 0.5 * jnp.sum(info.residual[:-1] ** 2)
-    return gain / jnp.maximum(info.as_min(), 1e-300)
-
-
-def begin(points: Point, damping: NDArray[np.float64] | None = None) -> Step:
+def begin(points: Point, damping: Array | None = None) -> Step:
     """Return where the solver stands before its first step from S points.
 
     Parameters
@@ -173,31 +86,25 @@ def begin(points: Point, damping: NDArray[np.float64] | None = None) -> Step:
     damping
         (S,) λ of the first step, relative to the Hessian per compared value; 1 by default.
     """
+    points = Point(np.asarray(points.coefficients), np.asarray(points.offsets))
     starts = len(points.coefficients)
-    first = jnp.ones(starts) if damping is None else jnp.asarray(damping)
-    return cast(
-        Step,
-        on_host(
-            Step(
-                point=points,
-                solver=_init(jax.vmap(_pack)(points), first),
-                sums=None,
-                best=None,
-                loss=jnp.full(starts, jnp.inf),
-                accepted=jnp.ones(starts, bool),
-                damping=first,
-                still=jnp.zeros(starts, bool),
-                promise=jnp.full(starts, jnp.inf),
-            )
-        ),
+    return Step(
+        point=points,
+        tried=points,
+        sums=None,
+        best=None,
+        loss=np.full(starts, np.inf),
+        accepted=np.ones(starts, bool),
+        damping=np.ones(starts) if damping is None else np.asarray(damping, float),
+        still=np.zeros(starts, bool),
+        promise=np.full(starts, np.inf),
     )
 
 
 def advance(objective: Objective, before: Step, criterion: Criterion, free: ArrayLike) -> Step:
     """Try one point for every start: keep those that are better, and propose the next.
 
-    The points are flown here, or wherever the engine in force computes; the step itself,
-    a small affair, is taken on one.
+    The points are flown here, or wherever the engine in force computes.
 
     Parameters
     ----------
@@ -206,26 +113,107 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     before
         What `begin` or the last call returned.
     criterion
-        Horizon, scales, robust limit: may change without compiling again, but only at `begin`.
+        Horizon, scales, robust limit: change only at `begin`.
     free
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
-    sums = sums_at(objective, proposed(before), criterion)
-    after = _step(
-        objective.space.coordinates,
-        np.asarray(objective.segments.flight),
-        replace(before, sums=sums, best=sums if before.best is None else before.best),
-        criterion,
-        np.asarray(free),
+    sums = sums_at(objective, before.tried, criterion)
+    moves = np.flatnonzero(free)
+    flight, starts = np.asarray(objective.segments.flight), range(len(before.loss))
+    tried = [
+        normal_equations(
+            objective.space, flight, _of(before.tried, start), criterion, _of(sums, start)
+        )
+        for start in starts
+    ]
+    steps = [_stepped(before, start, tried[start], moves) for start in starts]
+    accepted = np.array([step.accepted for step in steps])
+    best = before.best
+
+    def kept(new: Any, old: Any) -> Any:
+        return np.where(accepted.reshape(-1, *[1] * (np.ndim(new) - 1)), new, old)
+
+    return Step(
+        point=jax.tree.map(kept, before.tried, before.point),
+        tried=jax.tree.map(lambda *leaves: np.stack(leaves), *[step.tried for step in steps]),
+        sums=sums,
+        best=sums if best is None else jax.tree.map(kept, sums, best),
+        loss=np.array([step.quadratic.loss for step in steps]),
+        accepted=accepted,
+        damping=np.array([step.damping for step in steps]),
+        still=np.array([step.still for step in steps]),
+        promise=np.array([step.promise for step in steps]),
+        quadratics=tuple(step.quadratic for step in steps),
     )
-    return cast(Step, on_host(after))
 
 
-def proposed(step: Step) -> Point:
-    """Return the points (S) that are to be tried next."""
-    return cast(Point, on_host(jax.vmap(_unpack)(jnp.asarray(step.solver.y_eval), step.point)))
+@dataclass(frozen=True)
+class _Stepped:
+    """What becomes of one start."""
+
+    accepted: bool
+    still: bool
+    damping: float
+    quadratic: NormalEquations
+    tried: Point
+    promise: float
 
 
-def on_host(tree: Any) -> Any:
-    """Return a pytree with numpy arrays: the same compiled step then serves every iteration."""
-    return jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, tree)
+def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.intp]) -> _Stepped:
+    """Return what becomes of a start, given the quadratic at the point that was to be tried."""
+    point, tried = _of(before.point, start), _of(before.tried, start)
+    damping, still, accepted = float(before.damping[start]), False, True
+    if before.quadratics:
+        last = before.quadratics[start]
+        change = (_packed(tried) - _packed(point))[moves]
+        predicted = last.gradient[moves] @ change
+        predicted += 0.5 * change @ last.hessian[np.ix_(moves, moves)] @ change
+        rise = here.loss - last.loss
+        accepted = bool(rise <= ACCEPTED * predicted)
+        if not accepted:
+            damping *= FACTOR
+        elif predicted < 0.0 and rise < WELL_PREDICTED * predicted:
+            damping /= FACTOR
+        at_rest = np.abs(change) < STILL * (1.0 + np.abs(_packed(tried)[moves]))
+        still = accepted and bool(at_rest.all()) and abs(rise) < STILL * (1.0 + here.loss)
+        here = here if accepted else last
+    base = tried if accepted else point
+    gradient, hessian = here.gradient[moves], here.hessian[np.ix_(moves, moves)]
+    following = _packed(base)
+    following[moves] -= _solved(hessian, gradient, damping)
+    gain = 0.5 * gradient @ _solved(hessian, gradient, 0.0)
+    return _Stepped(
+        accepted,
+        still,
+        damping,
+        here,
+        _unpacked(following, base),
+        float(gain) / max(here.loss, 1e-300),
+    )
+
+
+def _solved(hessian: Array, gradient: Array, damping: float) -> Array:
+    """Return (H + λI)⁻¹ g; NaN where something in it is none."""
+    if not len(gradient):
+        return gradient
+    ridge = RIDGE * hessian.diagonal().max()
+    damped = hessian + (ridge + damping) * np.eye(len(gradient))
+    try:
+        return np.asarray(linalg.cho_solve(linalg.cho_factor(damped, lower=True), gradient))
+    except (linalg.LinAlgError, ValueError):  # not positive, or not finite
+        return np.full(len(gradient), np.nan)
+
+
+def _of(tree: Any, start: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[start], tree)
+
+
+def _packed(point: Point) -> Array:
+    return np.concatenate([point.coefficients, np.ravel(point.offsets)])
+
+
+def _unpacked(packed: Array, like: Point) -> Point:
+    count = len(like.coefficients)
+    return replace(
+        like, coefficients=packed[:count], offsets=packed[count:].reshape(like.offsets.shape)
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
+import numpy as np
 
 from sim_jax.control.gains import Controller
 from sim_jax.numeric import Scalar
@@ -48,7 +48,7 @@ def loop_of(objective: Objective) -> Loop:
 def with_loop(objective: Objective, loop: Loop) -> Objective:
     """Return the objective whose loop flies so."""
     changed: Objective = eqx.tree_at(
-        lambda o: _leaves(o.model.controller), objective, [jnp.asarray(choice) for choice in loop]
+        lambda o: _leaves(o.model.controller), objective, [np.asarray(choice) for choice in loop]
     )
     return changed
 

@@ -1,4 +1,4 @@
-"""What an optimiser is: three methods, named after those of optimistix's solvers.
+"""What an optimiser is: three methods, `init`, `step` and `terminate`.
 
 An optimiser runs one stage of the search. To add one, write a subclass of `Optimiser` with a
 ``name``: a stage names its optimiser, and so may a job's search method.

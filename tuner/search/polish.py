@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,7 +49,7 @@ def polished(
     progress = Progress(
         stage=0,
         points=Point(
-            jnp.asarray(fitted.point.coefficients)[None], jnp.asarray(fitted.point.offsets)[None]
+            np.asarray(fitted.point.coefficients)[None], np.asarray(fitted.point.offsets)[None]
         ),
         scales={
             channel: np.array([fitted.scales[name][channel] for name in names])

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +12,6 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.search.iteration import Iteration
-from tuner.search.levenberg_marquardt import on_host
 from tuner.search.loop import USUAL, Loop, loop_of
 from tuner.search.optimiser import Iterate
 from tuner.search.stages import Stage
@@ -83,7 +80,7 @@ def beginning(objective: Objective, vectors: NDArray[np.float64]) -> Progress:
     freedom = objective.segments.freedom
     return Progress(
         stage=0,
-        points=Point(jnp.asarray(vectors), jnp.asarray(offsets)),
+        points=Point(np.asarray(vectors), np.asarray(offsets)),
         scales={name: np.ones(objective.flights) for name in objective.segments.measured},
         states=None if freedom is None else np.zeros(freedom.shape),
         losses=np.full(len(vectors), np.inf),
@@ -111,15 +108,14 @@ def criterion_of(
     states
         (L, F) starts around which is linearised.
     """
-    criterion = Criterion(
-        horizon=jnp.asarray(stage.horizon),
-        scale={name: jnp.asarray(stage.noise_inflation * scale) for name, scale in scales.items()},
-        reference_offset=jnp.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
-        huber=jnp.asarray(HUBER if stage.robust else np.inf),
-        prior=jnp.asarray(1.0),
-        states=None if states is None else jnp.asarray(states),
+    return Criterion(
+        horizon=np.asarray(stage.horizon),
+        scale={name: np.asarray(stage.noise_inflation * scale) for name, scale in scales.items()},
+        reference_offset=np.asarray(offsets[: len(CLOCKS)] * OFFSET_UNIT),
+        huber=np.asarray(HUBER if stage.robust else np.inf),
+        prior=np.asarray(1.0),
+        states=None if states is None else np.asarray(states),
     )
-    return cast(Criterion, on_host(criterion))
 
 
 def plain_criterion(

@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -112,18 +111,18 @@ class _Settling:
         gradient[:-kinds] = np.einsum("asfk,asf->kf", slopes, robust * error)
         hessian[:-kinds, :-kinds] = np.einsum("asfk,asf,asfl->klf", slopes, robust, slopes)
         sums = SegmentSums(
-            loss=jnp.asarray(0.5 * (robust * error**2).sum(axis=(0, 1))),
-            gradient=jnp.asarray(gradient),
-            hessian=jnp.asarray(hessian),
+            loss=np.asarray(0.5 * (robust * error**2).sum(axis=(0, 1))),
+            gradient=np.asarray(gradient),
+            hessian=np.asarray(hessian),
             squares={},
             counts={},
-            crash_time=jnp.full(windows, jnp.inf),
+            crash_time=np.full(windows, np.inf),
             states=None,
         )
         _, down, curved = normal_equations(
             objective.space,
             objective.segments.flight,
-            Point(jnp.asarray(vector), point.offsets),
+            Point(np.asarray(vector), point.offsets),
             self.fitted.criterion,
             sums,
         )
@@ -168,7 +167,7 @@ def with_inputs_balanced(
     """
     objective = fitted.objective
     segments = objective.segments
-    model = objective.tunable.at(jnp.asarray(fitted.point.coefficients))
+    model = objective.tunable.at(np.asarray(fitted.point.coefficients))
     moved = bool(objective.conditions) or markers_of(model.vehicle) is not None
     if (
         moved
@@ -183,13 +182,13 @@ def with_inputs_balanced(
     balanced = settling.at(np.ones(segments.count, bool), begin)
     vector = settling.refitted(np.ones(segments.count, bool), balanced)
     as_fitted, as_balanced = _losses_left_out(settling, balanced)
-    point = Point(jnp.asarray(vector), fitted.point.offsets)
+    point = Point(np.asarray(vector), fitted.point.offsets)
     taken = as_balanced <= (1.0 + TOLERATED) * as_fitted
     findings = _findings(fitted, point, as_balanced / as_fitted, taken=taken)
     otherwise = alternatives_of(objective, fitted.point)
     if not taken:
         space = objective.space
-        here, there = (np.asarray(space.scaled(jnp.asarray(v))) for v in (begin, balanced))
+        here, there = (space.scaled(v) for v in (begin, balanced))
         moves = dict(zip(space.names, np.abs(there - here).tolist(), strict=True))
         doubt = {n: max(moves[n], in_doubt.get(n, 0.0)) for n in moves if n in TURNS}
         kept = examine(fitted, otherwise=otherwise, in_doubt={**in_doubt, **doubt})
@@ -222,7 +221,7 @@ def _losses_left_out(settling: _Settling, balanced: Vector) -> tuple[float, floa
         ]
     )
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
-    points = Point(jnp.asarray(vectors), jnp.asarray(offsets))
+    points = Point(np.asarray(vectors), np.asarray(offsets))
     flown = sums_at(fitted.objective, points, fitted.criterion, derivatives=False)
     losses = np.asarray(flown.loss)
     out = np.array([losses[row, fold == n].sum() for row, n in enumerate([*numbers, *numbers])])
@@ -243,16 +242,14 @@ def _fitted_to(
     """
     objective = fitted.objective
     weights = {
-        name: eqx.tree_at(
-            lambda m: m.weight, measured, measured.weight * jnp.asarray(inside, float)
-        )
+        name: eqx.tree_at(lambda m: m.weight, measured, measured.weight * np.asarray(inside, float))
         for name, measured in objective.segments.measured.items()
     }
     some = eqx.tree_at(lambda o: o.segments.measured, objective, weights)
     held = np.isin(objective.space.names, list(set(fitted.held.values())))
     if settled is not None:
         held |= settled
-    start = fitted.point.coefficients if begin is None else jnp.asarray(begin)
+    start = fitted.point.coefficients if begin is None else np.asarray(begin)
     problem = StageProblem(
         objective=some,
         criterion=fitted.criterion,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from tuner.config import JobFile
@@ -136,9 +135,7 @@ def with_terms(
         return objective, point
     space = extended(objective.space, names, job, start_of(names))
     return replace(objective, space=space), Point(
-        jnp.concatenate(
-            [jnp.asarray(point.coefficients), jnp.asarray(space.initial[-len(names) :])]
-        ),
+        np.concatenate([np.asarray(point.coefficients), np.asarray(space.initial[-len(names) :])]),
         point.offsets,
     )
 
@@ -200,7 +197,7 @@ def with_groups(
         objective=with_loop(grown.objective, loop_of(fitted.objective)),
         outcomes=grown.outcomes,
         point=Point(
-            jnp.asarray([vector[name] for name in job.space.names]),
+            np.asarray([vector[name] for name in job.space.names]),
             offsets_of(fitted, grown.objective),
         ),
     )

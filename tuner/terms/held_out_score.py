@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ def predicted_losses(
             change = linear.step(model, inside=linear.flight != number)[own]
         vectors.append(vector_after(space, fitted.point.coefficients, change))
     offsets = np.repeat(np.asarray(fitted.point.offsets)[None], len(vectors), axis=0)
-    points = Point(jnp.asarray(np.stack(vectors)), jnp.asarray(offsets))
+    points = Point(np.stack(vectors), np.asarray(offsets))
     of_each = sums_at(objective, points, criterion, derivatives=bool(movable.any()))
     losses = []
     for number in range(objective.flights):
@@ -75,7 +74,7 @@ def lost_by_sections(linear: Linear, model: Columns) -> float:
 def vector_after(space: Space, vector: Array, change: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the search vector (K,) after a change of the scaled coordinates, inside the bounds."""
     far = LONGEST_STEP * space.prior_sd
-    scaled = np.asarray(space.scaled(jnp.asarray(vector))) + np.clip(change, -far, far)
+    scaled = space.scaled(vector) + np.clip(change, -far, far)
     return np.asarray(space.at_share((scaled - space.lower) / space.width))
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,7 +76,7 @@ class Innovations:
         beside = replace(predictor, simulator=wide.objective.simulator)
         information = beside.information(wide.objective, wide.point, fitted.criterion)
         space, vector = wide.objective.space, np.asarray(wide.point.coefficients)
-        scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+        scaled = space.scaled(vector)
         linear = linear_of(information, scaled, space.prior_mean, predictor.loss)
         return Innovations(selected, fitted, space, vector, linear)
 
@@ -152,7 +151,7 @@ class Innovations:
         ]
         rows.sort(key=lambda row: not row.kept)
         groups = {row.group: row.names for row in rows if row.kept and row.reason in EARNING}
-        moved = vector_after(self.space, jnp.asarray(self.vector), change)
+        moved = vector_after(self.space, np.asarray(self.vector), change)
         vector = dict(zip(self.space.names, moved.tolist(), strict=True))
         said = findings_at(self.selected.job, self.selected.fitted)
         job, fitted = with_groups(base, groups, self.fitted, vector, said=said)

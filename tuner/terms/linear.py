@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -206,7 +205,7 @@ def linear_at(
     rows = np.asarray(point.offsets)[len(point.offsets) - len(around) :]
     scaled = np.concatenate(
         [
-            np.asarray(objective.space.scaled(jnp.asarray(point.coefficients))),
+            objective.space.scaled(point.coefficients),
             (rows * units_of(around)[:, None]).ravel(),
         ]
     )
@@ -243,7 +242,7 @@ def _with_coefficients_around(
     return (
         replace(objective, space=space, conditions=objective.conditions[: -len(around)]),
         Point(
-            jnp.concatenate([jnp.asarray(point.coefficients), jnp.zeros(len(around))]),
+            np.concatenate([np.asarray(point.coefficients), np.zeros(len(around))]),
             point.offsets[:left],
         ),
         criterion,

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from numpy.typing import NDArray
@@ -206,7 +205,7 @@ class Selection:
         moved = vector_after(
             space, state.fitted.point.coefficients, change[self._columns(space.names)]
         )
-        point = Point(jnp.asarray(moved), jnp.asarray(offsets))
+        point = Point(np.asarray(moved), np.asarray(offsets))
         return replace(state, fitted=replace(state.fitted, point=point))
 
     def _refitted(self, state: Standing, groups: Groups, *, anew: bool = False) -> Standing:
@@ -229,7 +228,7 @@ class Selection:
         from_here = replace(
             state.fitted,
             objective=objective,
-            point=Point(jnp.asarray(vector), offsets_of(state.fitted, objective, gone=idle)),
+            point=Point(np.asarray(vector), offsets_of(state.fitted, objective, gone=idle)),
         )
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
@@ -268,7 +267,7 @@ class Selection:
         )
         start = np.asarray(point.coefficients)
         vector = [own.get(name, start[i]) for i, name in enumerate(objective.space.names)]
-        at = Point(jnp.asarray(vector), offsets_of(fitted, objective))
+        at = Point(np.asarray(vector), offsets_of(fitted, objective))
         linear = linear_at(
             objective,
             at,
@@ -282,7 +281,7 @@ class Selection:
         """Return a fit's base problem with all candidates in the model, at their neutral values."""
         objective = with_loop(self.fitted.objective, loop_of(fitted.objective))
         neutral = start_of(coefficients_in(self.candidates))
-        values = {name: jnp.asarray(value) for name, value in neutral.items()}
+        values = {name: np.asarray(value) for name, value in neutral.items()}
         return replace(objective, model=with_coefficients(objective.model, values))
 
     @property

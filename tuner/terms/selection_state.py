@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
+from sim_jax.numeric import Array
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.search.problem import Job
@@ -114,4 +113,4 @@ def offsets_of(fitted: Fitted, objective: Objective, *, gone: Collection[str] = 
     known = dict(zip(fitted.objective.of_flight, rows, strict=True))
     known = {name: row for name, row in known.items() if name not in gone}
     nothing = np.zeros(rows.shape[1])
-    return jnp.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))
+    return np.asarray(np.stack([known.get(name, nothing) for name in objective.of_flight]))

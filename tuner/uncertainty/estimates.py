@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,7 +134,7 @@ def uncertainty_at(
     space: Space, vector: Array, information: FisherInformation, flights: Sequence[str]
 ) -> Uncertainty:
     """Return how well the coefficients are known, from the information at a search vector (K,)."""
-    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    scaled = space.scaled(vector)
     reference = references(space, vector)
     of_residuals = covariance_of(information)
     spread = spread_of(information, of_residuals.error, _lags(space, scaled))
@@ -224,7 +223,7 @@ def _lags(space: Space, scaled: Array) -> Array:
 
 def references(space: Space, vector: Array) -> Array:
     """Return the change (K,) of each scaled coordinate that counts as one hundred percent."""
-    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    scaled = space.scaled(vector)
     return np.array([_reference(p, x) for p, x in zip(space.parameters, scaled, strict=True)])
 
 

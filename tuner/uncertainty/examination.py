@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -220,7 +219,7 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
 
 def _units(space: Space, point: Point) -> Array:
     """Return (K,) the change of each parameter, in its unit, for one of its scaled coordinate."""
-    scaled = np.asarray(space.scaled(jnp.asarray(point.coefficients)))
+    scaled = space.scaled(point.coefficients)
     return np.array(
         [
             space.from_scaled(i, x) if parameter.scale == "log" else 1.0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -66,7 +65,7 @@ def full_problem_of(objective: Objective, point: Point) -> FullProblem:
     vector[: len(space)] = np.asarray(point.coefficients)
     return FullProblem(
         objective=replace(objective, space=full_space),
-        point=Point(jnp.asarray(vector), point.offsets),
+        point=Point(np.asarray(vector), point.offsets),
         fitted=space.names,
         fixed=tuple(fixed),
         fit_space=space,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,7 +38,7 @@ def sources_of(fitted: Fitted, uncertainty: Uncertainty, total: Array) -> dict[s
     prior, rows, offset = space.joint_prior, space.joint_rows, space.joint_offset
     if prior is None or rows is None or offset is None:
         return {}
-    end = np.asarray(space.scaled(jnp.asarray(fitted.point.coefficients)))
+    end = space.scaled(fitted.point.coefficients)
     flights_only = total - rows.T @ rows
     held = set(fitted.held.values())
     moves = np.array([name not in held for name in space.names])

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 
 from tuner.core.phrases import listed
@@ -205,7 +204,7 @@ def hold(
     clock = time.perf_counter()
     vector = np.where(is_held, space.initial, np.asarray(fitted.point.coefficients))
     free = Free(~is_held, free_offsets(job))
-    point = Point(jnp.asarray(vector), fitted.point.offsets)
+    point = Point(np.asarray(vector), fitted.point.offsets)
     end = polished(
         job,
         replace(fitted, point=point),

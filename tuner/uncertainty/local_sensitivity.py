@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -188,7 +187,7 @@ def _steps(
 ) -> tuple[tuple[Array, Array], Array]:
     """Return the vectors (K, K) for +10 % and −10 %, and the size (K,) of one hundred percent."""
     space = objective.space
-    scaled = np.asarray(space.scaled(jnp.asarray(vector)))
+    scaled = space.scaled(vector)
     centre = [space.from_scaled(i, x) for i, x in enumerate(scaled)]
     full = np.array(
         [

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import advance, begin, on_host
+from tuner.search.levenberg_marquardt import advance, begin
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.full_problem import FullProblem
@@ -57,7 +56,7 @@ def profile_likelihood(
     objective = replace(full_problem.objective, space=space)
     index = space.names.index(name)
     vector = np.asarray(full_problem.point.coefficients)[indices]
-    centre = np.asarray(space.scaled(jnp.asarray(vector)))
+    centre = space.scaled(vector)
     error = float(uncertainty.covariance.data_error[index])
     reach = min(REACH * error, MAX_REACH * uncertainty.reference[index])
     parameter = space.parameters[index]
@@ -101,11 +100,11 @@ def _refitted(
     count = len(objective.space)
     free = np.concatenate([np.ones(count), (offsets != 0.0).astype(float).ravel()])
     free[index] = 0.0
-    weak_priors = replace(criterion, prior=jnp.asarray(1.0 / WIDE))
-    points = Point(jnp.asarray(starts), jnp.asarray(np.repeat(offsets[None], len(starts), axis=0)))
-    step, previous = begin(on_host(points)), np.full(len(starts), np.inf)
+    weak_priors = replace(criterion, prior=np.asarray(1.0 / WIDE))
+    points = Point(starts, np.repeat(offsets[None], len(starts), axis=0))
+    step, previous = begin(points), np.full(len(starts), np.inf)
     for _ in range(MAX_ITERATIONS):
-        step = advance(objective, step, on_host(weak_priors), free)
+        step = advance(objective, step, weak_priors, free)
         assert step.sums is not None
         compared = sum(np.asarray(n)[0].sum() for n in step.sums.counts.values())
         chi = 2.0 * np.asarray(step.loss) * compared

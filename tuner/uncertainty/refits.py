@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -81,7 +80,7 @@ def refitted(whole: Whole, counts: ArrayLike, title: str, report: Report) -> Fit
 
 def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
     """Return an objective to which each flight contributes so many times."""
-    others = jnp.asarray(counts > 0.0)[jnp.asarray(objective.segments.flight)]
+    others = np.asarray(counts > 0.0)[np.asarray(objective.segments.flight)]
     changed: Objective = eqx.tree_at(
         lambda o: [measured.weight for measured in o.segments.measured.values()],
         objective,
@@ -89,7 +88,7 @@ def _counted(objective: Objective, counts: NDArray[np.float64]) -> Objective:
     )
     if counts.max() <= 1.0:
         return changed
-    return replace(changed, multiplicity=jnp.asarray(counts))
+    return replace(changed, multiplicity=np.asarray(counts))
 
 
 def in_engine(

@@ -46,7 +46,7 @@ def test_the_truth_comes_back_through_every_inlet(inlet, full_flight, full_bag, 
     job = job_through(inlet, full_flight, full_bag, updated)
     fitted = fitted_through(job, tmp_path)
     assert fitted.objective.segments.count > 15
-    values = job.space.values(fitted.point.coefficients)
+    values = job.space.numbers(fitted.point.coefficients)
     truth = values_of(updated)
     for name in ("inertia_xx", "inertia_yy", "motor_constant"):
         assert float(values[name]) == pytest.approx(truth[name], rel=0.03), name
@@ -135,7 +135,7 @@ def test_one_of_what_trades_off_is_held_and_the_rest_follows(
     )
     assert fitted.held["motor_constant"] == "mass"
     assert "mass" in messages[0]
-    values = job.space.values(fitted.point.coefficients)
+    values = job.space.numbers(fitted.point.coefficients)
     assert float(values["mass"]) == pytest.approx(updated.mass, rel=1e-9)
     truth = values_of(updated)["motor_constant"]
     assert float(values["motor_constant"]) == pytest.approx(truth, rel=0.02)

@@ -35,14 +35,14 @@ def searched(fit, vectors, *, offsets=False):
 
 def test_truth_is_recovered_from_every_start(fit):
     wrong = {"inertia_xx": 1.5, "inertia_zz": 0.7, "time_constant_up": 1.6, "motor_constant": 0.8}
-    values = fit.space.values(jnp.asarray(fit.space.initial))
+    values = fit.space.numbers(fit.space.initial)
     starts = [
         fit.space.vector_of({n: float(v) * wrong.get(n, 1.0) ** sign for n, v in values.items()})
         for sign in (1, -1)
     ]
     progress, reports = searched(fit, starts)
     for start in range(2):
-        fitted = fit.space.values(progress.points.coefficients[start])
+        fitted = fit.space.numbers(progress.points.coefficients[start])
         for name, value in values.items():
             assert float(fitted[name]) == pytest.approx(float(value), rel=0.02), (start, name)
     assert progress.converged
@@ -62,8 +62,8 @@ def test_a_flight_of_noise_is_weighed_down_and_the_others_are_fitted(fit):
     poisoned = eqx.tree_at(lambda o: o.segments.measured, fit, spoilt)
     progress, _ = searched(poisoned, [np.asarray(fit.space.initial) + 0.1])
     assert min(float(scale[1]) for scale in progress.scales.values()) > 10
-    fitted = fit.space.values(progress.points.coefficients[0])
-    true = fit.space.values(jnp.asarray(fit.space.initial))
+    fitted = fit.space.numbers(progress.points.coefficients[0])
+    true = fit.space.numbers(fit.space.initial)
     assert float(fitted["inertia_xx"]) == pytest.approx(float(true["inertia_xx"]), rel=0.05)
     assert float(fitted["motor_constant"]) == pytest.approx(float(true["motor_constant"]), rel=0.01)
 

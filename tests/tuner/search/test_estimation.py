@@ -44,7 +44,7 @@ def test_random_starts_lie_in_the_box_and_the_first_is_the_vehicles(updated):
     vectors = starting_vectors(job)
     assert vectors.shape == (50, 3)
     np.testing.assert_allclose(vectors[0], job.space.initial)
-    values = [job.space.values(vector) for vector in vectors]
+    values = [job.space.numbers(vector) for vector in vectors]
     drawn = np.array([float(drawn_values["motor_constant"]) for drawn_values in values])
     initial = job.space.parameters[job.space.names.index("motor_constant")].initial
     ratio = drawn / initial

@@ -34,6 +34,6 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
     )
     assert progress.loop == Loop(sees_markers=flown)
     assert loop_of(with_loop(fit, progress.loop)).sees_markers == flown
-    found = fit.space.values(progress.points.coefficients[0])
+    found = fit.space.numbers(progress.points.coefficients[0])
     for name, value in FRAME.items():
         assert float(found[name]) == pytest.approx(value, rel=0.05)

@@ -3,28 +3,22 @@
 import importlib
 import sys
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem, truth, with_data
 from tuner.objective.segments import OFFSETS
-from tuner.search import levenberg_marquardt
 from tuner.search.continuation import grow
-from tuner.search.normal_equations import linear_residuals, normal_equations, residuals_at
 from tuner.search.optimiser import OPTIMISERS, Free
 from tuner.search.progress import beginning
 from tuner.search.stages import WHOLE, plan
 
 FREE = ("inertia_zz", "motor_constant", "moment_constant")
 MODULE = '''
-import jax.numpy as jnp
 import numpy as np
 
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Point
-from tuner.search.normal_equations import linear_residuals, residuals_at
 from tuner.search.optimiser import Iterate, Optimiser
 from tuner.search.progress import point_of
 
@@ -46,7 +40,7 @@ class CoordinateSearch(Optimiser):
         best = int(np.argmin(losses.sum(axis=-1)))
         state = width if best else 0.5 * width, float(losses[best].sum()), tried[best]
         iterate = Iterate(
-            points=Point(jnp.asarray(tried[best])[None], problem.points.offsets),
+            points=Point(tried[best][None], problem.points.offsets),
             losses=np.array([state[1]]),
             accepted=np.array([best > 0]),
             position_rmse=float("nan"),
@@ -89,21 +83,13 @@ def test_an_added_optimiser_runs_the_stages_and_recovers_the_truth(added):
     assert all(iteration.damping is None for iteration in progress.iterations)
 
 
-def test_least_squares_reports_its_damping_and_traces_a_step_once(monkeypatch):
+def test_least_squares_reports_its_damping():
     fit = with_data(problem(FREE), truth(problem(FREE)))
     stage = plan("gradient", fit.samples, 200.0, windows=False, robust=False, steps=3)[3]
-    start = beginning(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]])
-    traced = []
-
-    def traced_equations(*arguments):
-        traced.append(arguments)
-        return normal_equations(*arguments)
-
-    monkeypatch.setattr(levenberg_marquardt, "normal_equations", traced_equations)
     progress = grow(
         fit,
         (stage,),
-        start,
+        beginning(fit, np.asarray(fit.space.initial)[None] + [[0.05], [0.06]]),
         free=Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool)),
         undecided=(),
         on_progress=lambda _: None,
@@ -111,16 +97,3 @@ def test_least_squares_reports_its_damping_and_traces_a_step_once(monkeypatch):
     first, second, *_ = (iteration.damping for iteration in progress.iterations)
     assert first == 1.0
     assert second == pytest.approx(0.2)  # the model predicted well: five times longer a step
-    assert len(traced) == 1
-
-
-def test_the_linear_residuals_have_the_normal_equations():
-    random = np.random.default_rng(0)
-    root, origin = random.normal(size=(4, 9)), random.normal(size=4)
-    gradient, hessian, loss = root @ random.normal(size=9), root @ root.T, 40.0
-    linear = linear_residuals(*map(jnp.asarray, (origin, loss, gradient, hessian, np.ones(4))))
-    residual = residuals_at(jnp.asarray(origin), linear)[0]
-    jacobian = jax.jacfwd(lambda y: residuals_at(y, linear)[0])(jnp.asarray(origin))
-    assert 0.5 * float(residual @ residual) == pytest.approx(loss)
-    np.testing.assert_allclose(jacobian.T @ residual, gradient, rtol=1e-9)
-    np.testing.assert_allclose(jacobian.T @ jacobian, hessian, rtol=1e-9)

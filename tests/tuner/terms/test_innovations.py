@@ -136,7 +136,7 @@ def test_a_term_that_least_squares_missed_is_called_for(chosen) -> None:
     assert [r.kept for r in selected.rows] == [True, False, False]
     assert selected.rows[0].reason is SelectionCode.PREDICTS_SAMPLES
     assert selected.left_out == (INFLOW.names, FLAPPING.names)
-    numbers = innovation.space.values(
+    numbers = innovation.space.numbers(
         np.array([found["vector"][name] for name in innovation.space.names])
     )
     assert float(numbers["fuselage_drag"]) == pytest.approx(0.5 * USUAL["fuselage_drag"], rel=0.05)

@@ -84,7 +84,7 @@ def test_what_a_term_that_was_missed_would_change_widens_the_intervals_that_hold
     assert (row.kept, row.reason) == (False, SelectionCode.NOT_SIGNIFICANT)
     assert set(result.in_doubt) == set(BASE_IN_ORDER)
     examination = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt)
-    truth = result.job.space.values(result.job.space.initial)
+    truth = result.job.space.numbers(result.job.space.initial)
     for name in BASE_IN_ORDER:
         low, high = examination.uncertainty.estimates[name].ci95
         assert low < float(truth[name]) < high, name

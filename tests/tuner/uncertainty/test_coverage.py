@@ -29,7 +29,7 @@ REPEATS = 20
 @pytest.mark.slow
 def test_intervals_cover_the_truth():
     exact = problem(FREE)
-    right = exact.space.values(exact.space.initial)
+    right = exact.space.numbers(exact.space.initial)
     stages = plan("gradient", exact.samples, 200.0, windows=False, robust=True, steps=20)[-3:]
     free = Free(np.ones(len(FREE), bool), np.zeros((len(OFFSETS), 2), bool))
     covered = np.zeros((REPEATS, len(FREE)), bool)

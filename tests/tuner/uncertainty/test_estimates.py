@@ -149,7 +149,7 @@ def test_tied_coefficients_share_their_estimate() -> None:
 
 def test_a_rotor_and_what_delays_its_command_are_lags_the_estimate_of_the_state_is_none() -> None:
     fit = making.problem(("inertia_xx", "time_constant_up", "estimate_latency", "actuator_latency"))
-    moved = fit.space.values(jnp.asarray(fit.space.initial))
+    moved = fit.space.numbers(fit.space.initial)
     lags = _lags(fit.space, np.asarray(fit.space.scaled(jnp.asarray(fit.space.initial))))
     by_name = dict(zip(fit.space.names, lags, strict=True))
     assert by_name["time_constant_up"] == pytest.approx(1.0 / float(moved["time_constant_up"]))

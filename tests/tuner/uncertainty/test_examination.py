@@ -7,7 +7,6 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -64,7 +63,7 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
 def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:
     """Return channel -> (n, k, F) residuals in its unit with one coefficient changed."""
     space = objective.space
-    values = {n: float(v) for n, v in space.values(jnp.asarray(space.initial)).items()}
+    values = {n: float(v) for n, v in space.numbers(space.initial).items()}
     values[name] *= factor
     point = objective.start(space.vector_of(values))
     jacobian = objective.jacobian(point, making.criterion_of(objective))

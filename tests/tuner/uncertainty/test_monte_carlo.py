@@ -9,7 +9,7 @@ import pytest
 from tests.tuner.uncertainty import making
 from tuner.objective.criterion import Point
 from tuner.objective.normal import Objective
-from tuner.search.levenberg_marquardt import advance, begin, on_host
+from tuner.search.levenberg_marquardt import advance, begin
 from tuner.uncertainty.estimates import uncertainty_of
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant")
@@ -19,7 +19,7 @@ ITERATIONS = 3
 
 
 def refit(objective: Objective, start: Point) -> Point:
-    criterion = on_host(making.criterion_of(objective, prior=0.01))
+    criterion = making.criterion_of(objective, prior=0.01)
     offsets = np.asarray(start.offsets)
     free = np.concatenate([np.ones(len(objective.space)), np.zeros(offsets.size)])
     points = Point(np.asarray(start.coefficients)[None], offsets[None])

@@ -1,6 +1,5 @@
 from pathlib import Path
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -48,7 +47,7 @@ def test_values_come_back_from_the_search_vector(vehicle):
         JobFile(free=("inertia_xx", "motor_constant", "estimate_latency")),
     )
     values = {"inertia_xx": 0.03, "motor_constant": 1.2e-5, "estimate_latency": 0.02}
-    returned = space.values(jnp.asarray(space.vector_of(values)))
+    returned = space.numbers(space.vector_of(values))
     for name, value in values.items():
         assert float(returned[name]) == pytest.approx(value, rel=1e-9)
 
@@ -58,7 +57,7 @@ def test_no_step_leaves_the_bounds(steps):
     space = space_of(
         read_vehicle(find_config("vehicles", "hovergames", Path())), ControllerFile(), JobFile()
     )
-    values = space.values(jnp.asarray(steps))
+    values = space.numbers(steps)
     for parameter in space.parameters:
         value = float(values[parameter.name])
         assert parameter.lower * (1 - 1e-9) <= value <= parameter.upper * (1 + 1e-9)
@@ -67,8 +66,8 @@ def test_no_step_leaves_the_bounds(steps):
 def test_slope_is_the_derivative_of_the_scaled_coordinate(vehicle):
     space = space_of(vehicle, ControllerFile(), JobFile())
     vector = space.initial + 0.3
-    slope = np.diag(np.asarray(jax.jacfwd(space.scaled)(jnp.asarray(vector))))
-    np.testing.assert_allclose(slope, space.slope(vector), rtol=1e-9)
+    slope = (space.scaled(vector + 1e-6) - space.scaled(vector - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope, space.slope(vector), rtol=1e-7)
 
 
 def test_a_start_on_its_bound_is_moved_inside_and_remembered(vehicle):
@@ -82,7 +81,7 @@ def test_tied_coefficients_keep_their_ratio(vehicle):
     job = JobFile(free=("inertia_xx", "inertia_zz"), ties=(("inertia_xx", "inertia_zz"),))
     space = space_of(vehicle, ControllerFile(), job)
     assert space.names == ("inertia_xx",)
-    values = space.values(jnp.asarray(space.initial + 1.0))
+    values = space.numbers(space.initial + 1.0)
     ratio = vehicle.inertia.zz / vehicle.inertia.xx
     assert float(values["inertia_zz"] / values["inertia_xx"]) == pytest.approx(ratio)
 
@@ -101,7 +100,7 @@ def test_bounds_of_the_job_file_hold(vehicle):
     space = space_of(
         vehicle, ControllerFile(), JobFile(free=("motor_constant",), coefficients=settings)
     )
-    assert float(space.values(jnp.asarray([99.0]))["motor_constant"]) == pytest.approx(1e-5)
+    assert float(space.numbers([99.0])["motor_constant"]) == pytest.approx(1e-5)
 
 
 def test_every_coefficient_has_a_place_in_the_model(vehicle):
@@ -136,10 +135,10 @@ def test_a_freed_effect_starts_at_its_neutral_value_and_appears_in_the_model(veh
     space = space_of(vehicle, ControllerFile(), JobFile(free=("fuselage_drag",)))
     (parameter,) = space.parameters
     assert parameter.moved is None
-    assert float(space.values(jnp.asarray(space.initial))["fuselage_drag"]) == 0.0
+    assert float(space.numbers(space.initial)["fuselage_drag"]) == 0.0
     model = model_of(vehicle, ControllerFile())
     assert "fuselage_drag" not in coefficients_in(model)
-    moved = tunable_of(model, space).at(jnp.asarray(space.initial + 1.0))
+    moved = tunable_of(model, space).at(space.initial + 1.0)
     assert float(coefficients_in(moved)["fuselage_drag"]) == pytest.approx(0.02, rel=0.01)
 
 

@@ -1,0 +1,117 @@
+"""A program's digest is of all that it is made of, or there is none; what is kept is not traced."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lanes import Argument, Program, keep_code_in
+from lanes.digest import UnknownError, digest_of
+
+
+class _Module(eqx.Module):
+    leaf: Any
+    static: Any = eqx.field(static=True, default=None)
+
+
+@dataclass(frozen=True)
+class _Other:
+    leaf: Any
+    static: Any = None
+
+
+DIFFERENT = [
+    None,
+    0,
+    0.0,
+    -0.0,
+    False,
+    "",
+    "0",
+    (),
+    [],
+    {},
+    (1, 2),
+    ((1,), 2),
+    {"a": 1, "b": 2},
+    {"a": {"b": 2}},
+    np.zeros(2),
+    np.zeros(2, np.float32),
+    np.zeros((2, 1)),
+    np.ones(2),
+    np.dtype(float),
+    _Module(1.0),
+    _Module(2.0),
+    _Module(1.0, "static"),
+    _Module(np.ones(2)),
+    _Module(np.zeros(2)),
+    _Other(1.0),
+    _Module,
+    _Other,
+    Argument((), float, lanes=True),
+    Argument((), float, lanes=False),
+    Argument((), float, lanes=True, moves=True),
+    Argument(("rows",), float, lanes=True),
+]
+
+
+def test_what_differs_has_another_digest():
+    assert len({digest_of(value, ()) for value in DIFFERENT}) == len(DIFFERENT)
+    assert digest_of(_Module(np.ones(2)), ()) == digest_of(_Module(np.ones(2)), ())
+
+
+def test_what_cannot_be_told_has_none():
+    def made(by: float) -> Callable[[float], float]:
+        return lambda x: x * by
+
+    for value in (made(2.0), object(), (1, {"a": lambda x: x})):
+        with pytest.raises(UnknownError):
+            digest_of(value, ())
+
+
+def test_the_digest_follows_the_source(tmp_path, monkeypatch):
+    package = tmp_path / "digested"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    digests = set()
+    for text in ("a = 1\n", "a = 2\n"):
+        (package / "inside.py").write_text(text)
+        lanes_digest = __import__("lanes.digest", fromlist=["_sources"])
+        lanes_digest._sources.cache_clear()
+        digests.add(digest_of((), ("digested",)))
+    assert len(digests) == 2
+
+
+def test_a_kept_program_is_not_traced_again(tmp_path):
+    traced = []
+
+    def program(factor: float, shape: tuple[int, ...] = (3,)) -> Program:
+        def function(x: Any, _: Any) -> Any:
+            traced.append(factor)
+            return {"times": factor * x, "count": jnp.asarray(7)}
+
+        argument = Argument(shape, float, lanes=True, moves=True)
+        return Program(function, argument, name="times", made_of=("times", factor))
+
+    x = np.arange(6.0).reshape(3, 2)
+    keep_code_in(tmp_path)
+    try:
+        first = program(2.0)(x, [np.eye(3)], lanes=2)
+        assert traced == [2.0]
+        again = program(2.0)(x, [np.eye(3)], lanes=2)
+        assert traced == [2.0]
+        for run in (first, again):
+            np.testing.assert_array_equal(run.values["times"], 2.0 * x.T)
+            np.testing.assert_array_equal(run.values["count"], [7, 7])
+            np.testing.assert_array_equal(run.columns["times"][0], 2.0 * np.eye(3))
+            assert run.columns["count"] is None
+        program(3.0)(x, [np.eye(3)], lanes=2)
+        program(2.0, (2, 3))(np.ones((2, 3, 2)), [np.ones((1, 2, 3))], lanes=2)
+        assert traced == [2.0, 3.0, 2.0]
+    finally:
+        keep_code_in(None)

@@ -1,0 +1,80 @@
+"""Levenberg-Marquardt on a valley of its own, flown by nobody."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from tuner.objective.criterion import Point
+from tuner.search import levenberg_marquardt
+from tuner.search.levenberg_marquardt import advance, begin
+from tuner.search.normal_equations import NormalEquations
+
+END = np.array([1.0, 1.0])
+START = np.array([-1.2, 1.0])
+
+
+def valley(vector):
+    """Rosenbrock's: residuals 10 (y - x²) and 1 - x."""
+    x, y = vector
+    residual = np.array([10.0 * (y - x * x), 1.0 - x])
+    slope = np.array([[-20.0 * x, 10.0], [-1.0, 0.0]])
+    return NormalEquations(0.5 * residual @ residual, slope.T @ residual, slope.T @ slope)
+
+
+@pytest.fixture
+def advanced(monkeypatch):
+    """Steps in the valley, of several starts."""
+    monkeypatch.setattr(levenberg_marquardt, "sums_at", lambda _, points, __: points)
+    monkeypatch.setattr(
+        levenberg_marquardt,
+        "normal_equations",
+        lambda _, __, tried, ___, ____: valley(tried.coefficients),
+    )
+    objective = SimpleNamespace(space=None, segments=SimpleNamespace(flight=np.zeros(1, int)))
+
+    def steps(points, count, free=(1.0, 1.0), damping=None):
+        found = [begin(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
+        for _ in range(count):
+            found.append(advance(objective, found[-1], None, np.array(free)))
+        return found
+
+    return steps
+
+
+def test_every_start_reaches_the_minimum_and_stands_still(advanced):
+    *_, last = advanced([START, [3.0, -2.0]], 60)
+    np.testing.assert_allclose(last.point.coefficients, [END, END], atol=1e-7)
+    assert last.still.all()
+    assert last.promise.max() < 1e-9
+
+
+def test_a_loss_that_rises_is_rejected_and_damps_more(advanced):
+    steps = advanced([START], 12, damping=np.array([1e-9]))
+    for before, after in pairwise(steps[1:]):
+        assert after.loss <= before.loss
+        if not after.accepted[0]:
+            assert after.damping == 5.0 * before.damping
+            np.testing.assert_array_equal(after.point.coefficients, before.point.coefficients)
+    assert not all(step.accepted[0] for step in steps)
+
+
+def test_the_first_step_is_the_damped_one(advanced):
+    _, first = advanced([START], 1, damping=np.array([2.0]))
+    _, gradient, hessian = valley(START)
+    expected = START - np.linalg.solve(hessian + 2.0 * np.eye(2), gradient)
+    np.testing.assert_allclose(first.tried.coefficients[0], expected, rtol=1e-9)
+    gain = 0.5 * gradient @ np.linalg.solve(hessian, gradient)
+    assert first.promise[0] == pytest.approx(gain / valley(START).loss)
+
+
+def test_what_is_held_stays(advanced):
+    *_, last = advanced([START], 30, free=(0.0, 1.0))
+    np.testing.assert_allclose(last.point.coefficients[0], [-1.2, 1.44], atol=1e-9)
+
+
+def test_what_is_no_number_is_never_better(advanced):
+    *_, last = advanced([START, [np.nan, 0.0]], 3)
+    assert np.isfinite(last.loss[0])
+    assert not last.accepted[1]
