@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg
 from scipy.special import ndtri  # scipy.stats takes a quarter of a second to import
 
 Array = NDArray[np.float64]
@@ -66,6 +65,8 @@ def symmetric_eigen(matrix: Array) -> tuple[Array, Array]:
         if symmetric.ndim > 2:
             pairs = [symmetric_eigen(each) for each in symmetric]
             return np.stack([pair[0] for pair in pairs]), np.stack([pair[1] for pair in pairs])
+        from scipy import linalg  # noqa: PLC0415 (slow to import, seldom needed)
+
         values, vectors = linalg.eigh(symmetric, driver="ev")
     return np.asarray(values), np.asarray(vectors)
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sim_jax.constants import GRAVITY
 from sim_jax.rigid_body import Motion
@@ -99,6 +98,8 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
     fine = edges[:-1, None] + np.arange(inside + 1) / inside / rate
     speeds = _read(rotors, fine.ravel()).reshape(count, inside + 1, 4)
     mean = np.einsum("nir,i->nr", speeds, weights)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
+
     state = states_at(series, middle)
     velocity, turned = (
         _velocity(series, edges),

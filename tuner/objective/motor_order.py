@@ -7,12 +7,12 @@ angular acceleration; of the two senses of spin, one makes the yaw.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
 import numpy as np
-from scipy import signal
 
 from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import (
@@ -35,6 +35,8 @@ SLOW = 2.0
 """Hz below which turns are left out."""
 ENOUGH = 0.4
 """Correlation about roll and pitch from which an order is believed."""
+SETTLED = 40.0
+"""Lags after which a rotor has followed, to the last digit."""
 CLEARER = 0.3
 """By how much the next best order must be less alike."""
 
@@ -173,13 +175,24 @@ def _correlations(turning: Array, squares: Array, arms: Array) -> Array:
 
 
 def _without_slow(values: Array, step: float) -> Array:
-    """Return (n, k) values without the turns in which drag has a part: those of laps."""
-    sections = signal.butter(2, SLOW, "highpass", fs=1.0 / step, output="sos")
-    return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
+    """Return (n, k) values without the turns in which drag has a part: those of laps.
+
+    By Butterworth's high pass of second order, forwards and backwards, and so without delay.
+    """
+    edge = min(round(1.0 / SLOW / step), len(values) - 1)
+    before = 2.0 * values[0] - values[edge:0:-1]
+    behind = 2.0 * values[-1] - values[-2 : -edge - 2 : -1]
+    spectrum = np.fft.rfft(np.concatenate([before, values, behind]), axis=0)
+    share = (np.fft.rfftfreq(len(values) + 2 * edge, step) / SLOW) ** 4
+    filtered = np.fft.irfft(
+        spectrum * (share / (1.0 + share))[:, None], len(values) + 2 * edge, axis=0
+    )
+    return np.asarray(filtered[edge : edge + len(values)])
 
 
 def _lagged(squares: Array, step: float, lag: float) -> Array:
-    decay = float(np.exp(-step / lag))
-    first = squares[0] * decay
-    filtered, _ = signal.lfilter([1.0 - decay], [1.0, -decay], squares, axis=0, zi=first[None])
-    return smoothed(np.asarray(filtered))
+    """Return squared speeds (n, 4) as rotors of a lag in s follow them, settled at the first."""
+    decay = np.exp(-step / lag)
+    response = (1.0 - decay) * decay ** np.arange(math.ceil(SETTLED * lag / step))
+    late = [np.convolve(column - column[0], response)[: len(squares)] for column in squares.T]
+    return smoothed(squares[0] + np.stack(late, axis=-1))

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from tuner.recordings.flight import SIGNALS, Array, Series
 
@@ -67,6 +66,8 @@ def without_gaps(series: Series) -> Series:
             for gap, count in zip(gaps, counts, strict=True)
         ]
     )
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 (slow to import, seldom needed)
+
     steady = np.sort(np.concatenate([time, missing]))
     between = PchipInterpolator(time, values)(steady)
     between[np.searchsorted(steady, time)] = values

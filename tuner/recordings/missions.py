@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from tuner.recordings.flight import Array, Series
 
@@ -174,6 +173,8 @@ def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
     """Return at which of n times the (n, 3) positions of a second around stay where they are."""
+    from scipy import ndimage  # noqa: PLC0415 (slow to import, seldom needed)
+
     bins = ((time - time[0]) / BIN).astype(np.int64)
     held, place = np.unique(bins, return_inverse=True)
     counts = np.bincount(place)
@@ -181,7 +182,8 @@ def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
     window = round(1.0 / BIN)
     for column in positions.T:
         means = np.bincount(place, column) / counts
-        reach = maximum_filter1d(means, window) - minimum_filter1d(means, window)
+        reach = ndimage.maximum_filter1d(means, window)
+        reach -= ndimage.minimum_filter1d(means, window)
         spread = np.maximum(spread, reach)
     return np.asarray((spread < RESTS)[place], dtype=np.bool_)
 

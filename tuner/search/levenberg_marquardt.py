@@ -15,7 +15,6 @@ from typing import Any
 import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg
 
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
@@ -199,8 +198,9 @@ def _solved(hessian: Array, gradient: Array, damping: float) -> Array:
     ridge = RIDGE * hessian.diagonal().max()
     damped = hessian + (ridge + damping) * np.eye(len(gradient))
     try:
-        return np.asarray(linalg.cho_solve(linalg.cho_factor(damped, lower=True), gradient))
-    except (linalg.LinAlgError, ValueError):  # not positive, or not finite
+        factor = np.linalg.cholesky(damped)
+        return np.asarray(np.linalg.solve(factor.T, np.linalg.solve(factor, gradient)))
+    except np.linalg.LinAlgError:  # not positive, or not finite
         return np.full(len(gradient), np.nan)
 
 
