@@ -45,11 +45,13 @@ def tune(
             configure()
             from tuner.config import settle
             from tuner.job.run import run
-            from tuner.job.without_pose import fit_without_pose, without_pose
+            from tuner.search.job_flights import without_pose
 
         with span("reading"):
             bare, left_out = without_pose(settle(options))
         if bare:
+            from tuner.job.without_pose import fit_without_pose
+
             with listening(quiet=quiet, verbose=verbose) as listener:
                 measured = fit_without_pose(
                     settle(options),

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
@@ -297,6 +296,8 @@ def input_lag(flight: Flight, signal: str, vehicle: VehicleFile) -> Lag | None:
     if len(clock) < 200 or not np.isfinite(rows.values).any(axis=0).all():
         return None
     state = states_at(flight.series, clock)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
+
     body = Rotation.from_quat(state.attitude, scalar_first=True).inv()
     moving = body.apply(state.velocity)
     faster = np.gradient(state.velocity, clock, axis=0)

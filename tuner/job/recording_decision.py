@@ -9,9 +9,8 @@ from tuner.config import Settings
 from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding, sentence
 from tuner.job.recording_verdict import Verdict
-from tuner.job.without_pose import without_pose
 from tuner.objective.inlets import bypassed_by
-from tuner.search.job_flights import as_logged, read_usable
+from tuner.search.job_flights import as_logged, read_usable, without_pose
 from tuner.vehicle import COEFFICIENTS
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from tuner.config import Settings
-from tuner.core.disk import exists
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, Finding
 from tuner.ground.combination import Combination, combine
@@ -21,45 +20,12 @@ from tuner.inertial.signals import stretches_of
 from tuner.job.folder import folder_for
 from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
-from tuner.objective.motor_order import columns_of_rotors, in_rotor_order
-from tuner.recordings.inertial import InertialFlight, read_inertial
+from tuner.recordings.inertial import InertialFlight
 from tuner.search.job_flights import left_out_of
 from tuner.vehicle import VehicleFile, values_of, with_values
 
 BY_MASS = ("motor_constant", "inertia_xx", "inertia_yy")
 """What a flight without a pose gives over the mass."""
-
-
-def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
-    """Return the flights of a job, if none of its recordings holds a pose, and what is left out.
-
-    Where one does there are none: the others take no part (`tuner.recordings` names them).
-
-    Raises
-    ------
-    RecordingError
-        No recording can be used.
-    """
-    job = settings.job
-    flights: list[InertialFlight] = []
-    left_out: list[tuple[Path, RecordingError]] = []
-    for path in settings.flights:
-        try:
-            flight = read_inertial(path, topics=job.topics, namespace=job.namespace)
-        except RecordingError as error:
-            if not exists(path):
-                raise
-            left_out.append((path, error))
-            continue
-        if flight is None:
-            return (), ()
-        columns = columns_of_rotors(settings.vehicle, flight.notes)
-        if columns is not None:
-            flight = replace(flight, series=in_rotor_order(flight.series, columns))
-        flights.append(flight)
-    if left_out and not flights:
-        raise left_out[0][1]
-    return tuple(flights), tuple(left_out_of(path.stem, error) for path, error in left_out)
 
 
 def fit_without_pose(

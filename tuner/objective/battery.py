@@ -9,7 +9,6 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import BSpline, make_smoothing_spline
 
 from sim_jax.numeric import Array, Scalar
 from sim_jax.schedule import Schedule
@@ -214,9 +213,14 @@ def _spline(time: Numbers, values: Numbers) -> Callable[[Numbers], Numbers]:
 
 
 @lru_cache(maxsize=256)
-def _spline_of(time: bytes, values: bytes) -> BSpline:
+def _spline_of(time: bytes, values: bytes) -> Callable[[Numbers], Numbers]:
     """Return the spline of float64 samples; a fit, its check and its exports ask for the same."""
-    return make_smoothing_spline(np.frombuffer(time), np.frombuffer(values))
+    from scipy.interpolate import make_smoothing_spline  # noqa: PLC0415 (slow to import, seldom needed)
+
+    spline: Callable[[Numbers], Numbers] = make_smoothing_spline(
+        np.frombuffer(time), np.frombuffer(values)
+    )
+    return spline
 
 
 def _averaged(series: Series) -> Series:

@@ -154,9 +154,7 @@ class RecordedInlet(ABC):
         del trim
         return inlet
 
-    def _resampled(
-        self, signal: str, flights: Sequence[Flight], schedule: Schedule
-    ) -> list[jax.Array]:
+    def _resampled(self, signal: str, flights: Sequence[Flight], schedule: Schedule) -> list[Array]:
         """Return a signal's columns, each (steps, F), at the physics rate."""
         longest = max(flight.duration for flight in flights)
         steps = int(np.ceil(longest * schedule.physics_rate)) + 2

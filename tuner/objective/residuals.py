@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lanes import Argument, Program, joined
-from sim_jax.numeric import Array
+from sim_jax.numeric import Array as JaxArray
 from sim_jax.rotation import Quaternion
 from tuner.core.numerics import huber_weights
 from tuner.objective.flown import CODE, Flown
@@ -253,7 +253,7 @@ def _attitude_error(
 
 @cache
 def _rotation_program() -> Program:
-    def error(given: tuple[Array, Array], _: Mapping[str, int]) -> Array:
+    def error(given: tuple[JaxArray, JaxArray], _: Mapping[str, int]) -> JaxArray:
         recorded, flown = map(Quaternion.of, given)
         return recorded.rotation_vector_to(flown).stacked()
 
@@ -267,6 +267,8 @@ def _rotation_program() -> Program:
         packages=CODE,
     )
 
+
+Array = NDArray[np.float64]
 
 ROWS_AT_ONCE = 1024
 """Residuals whose products are summed up by one call of BLAS: few enough for one thread, so that

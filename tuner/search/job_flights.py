@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal
 
 from tuner.config import Settings, TrajectorySettings
@@ -18,13 +19,14 @@ from tuner.core.yaml_section import build
 from tuner.findings.findings import Code, Finding
 from tuner.objective.allocation import with_commands
 from tuner.objective.inlets import INLETS, window_seconds
-from tuner.objective.motor_order import flight_in_rotor_order
+from tuner.objective.motor_order import columns_of_rotors, flight_in_rotor_order, in_rotor_order
 from tuner.objective.speed_unit import with_speeds_in_si
 from tuner.objective.trajectory import with_named_reference
 from tuner.objective.windows import require_windows
 from tuner.recordings.defects import is_stale
 from tuner.recordings.flight import Flight
 from tuner.recordings.frames import noted_contradiction
+from tuner.recordings.inertial import InertialFlight, read_inertial
 from tuner.recordings.loader import load_flights
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
@@ -309,3 +311,35 @@ def _with_reference(flight: Flight, settings: Settings) -> Flight:
         named = build(TrajectorySettings, flight.trajectory, f"side-car of {flight.path}")
         return with_named_reference(flight, named)
     return flight
+
+
+def without_pose(settings: Settings) -> tuple[tuple[InertialFlight, ...], tuple[Finding, ...]]:
+    """Return the flights of a job, if none of its recordings holds a pose, and what is left out.
+
+    Where one does there are none: the others take no part (`tuner.recordings` names them).
+
+    Raises
+    ------
+    RecordingError
+        No recording can be used.
+    """
+    job = settings.job
+    flights: list[InertialFlight] = []
+    left_out: list[tuple[Path, RecordingError]] = []
+    for path in settings.flights:
+        try:
+            flight = read_inertial(path, topics=job.topics, namespace=job.namespace)
+        except RecordingError as error:
+            if not exists(path):
+                raise
+            left_out.append((path, error))
+            continue
+        if flight is None:
+            return (), ()
+        columns = columns_of_rotors(settings.vehicle, flight.notes)
+        if columns is not None:
+            flight = replace(flight, series=in_rotor_order(flight.series, columns))
+        flights.append(flight)
+    if left_out and not flights:
+        raise left_out[0][1]
+    return tuple(flights), tuple(left_out_of(path.stem, error) for path, error in left_out)

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import Source, squared_speed
@@ -134,6 +133,8 @@ def _motion(flight: Flight, edges: Array) -> Array:
     middle = 0.5 * (edges[1:] + edges[:-1])
     rates = filtered(flight.series["body_rate"], edges)
     state = states_at(flight.series, middle)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import, seldom needed)
+
     turned = Rotation.from_quat(np.nan_to_num(state.attitude, nan=0.5), scalar_first=True)
     through = turned.inv().apply(state.velocity)
     fast = np.linalg.norm(through, axis=1, keepdims=True)

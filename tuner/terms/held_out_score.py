@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 
+from sim_jax.numeric import Array
 from tuner.core.numerics import scaled_solve
 from tuner.objective.batch import sums_at
 from tuner.objective.criterion import OFFSET_SD, Point, SegmentSums

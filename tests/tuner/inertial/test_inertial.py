@@ -14,12 +14,12 @@ from tuner.findings.findings import Code, one_line
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed
-from tuner.job.without_pose import fit_without_pose, without_pose
+from tuner.job.without_pose import fit_without_pose
 from tuner.recordings import inspect_recordings
 from tuner.recordings.inertial import read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE
-from tuner.search.job_flights import read_usable
+from tuner.search.job_flights import read_usable, without_pose
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, with_values
 
 FLIGHTS = Path(__file__).parents[3] / "reference_flights"
