@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import numpy as np
@@ -196,7 +197,7 @@ def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
     return wide
 
 
-def _filled(recorded: Array | None, count: int, value: float) -> Array | None:
+def _filled(recorded: Any, count: int, value: float) -> Array | None:
     """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
     return None if recorded is None else np.full((*recorded.shape[:-1], count), value)
 
