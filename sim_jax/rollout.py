@@ -16,7 +16,7 @@ from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
 from sim_jax.markers import estimated
 from sim_jax.motor import Lag, LagSlope, SwitchedLag
-from sim_jax.numeric import GRAVITY, Array, Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.plant import Plant, Sample
 from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule

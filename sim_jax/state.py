@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sim_jax.constants import GRAVITY
 from sim_jax.motor import reference_speed
-from sim_jax.numeric import GRAVITY, Array, Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule

@@ -17,7 +17,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.control.gains import Controller
 from sim_jax.control.mixer import ROTORS, torque_of
 from sim_jax.motor import command_of
-from sim_jax.numeric import GRAVITY, Array, Scalar
+from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.state import Start

@@ -17,7 +17,6 @@ import numpy as np
 from lanes import Argument, Program
 from sim_jax.constants import GRAVITY
 from sim_jax.environment import Environment
-from sim_jax.numeric import GRAVITY
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
-from sim_jax.numeric import GRAVITY, Array
+from sim_jax.numeric import Array
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.terms.air import Air
