@@ -17,6 +17,9 @@ from tests.docs.px4_logs import write_logs
 from tuner.cli import main
 from tuner.cli.results import print_run
 from tuner.evaluate.write import write_flights
+from tuner.report.contents import read_contents
+from tuner.report.paper import plot_file
+from tuner.report.sections import sections_of
 from tuner.result import read_run
 
 pytestmark = pytest.mark.slow
@@ -79,10 +82,20 @@ def test_its_commands_run_and_print_what_it_shows(
     for block in blocks(page, "text"):
         for shown in block.splitlines():
             assert is_printed(shown, printed), shown
-    drawn = {path.name for path in place.glob("runs/*/plots/*.svg")}
-    if not set(figures(page)) <= drawn:
-        drawn = {path.name for path in (request.getfixturevalue("demo")[0] / "plots").iterdir()}
-    assert set(figures(page)) <= drawn
+    folders = [path.parent for path in place.glob("runs/*/report.html")]
+    if not set(figures(page)) <= _drawn(folders):
+        folders = [request.getfixturevalue("demo")[0]]
+    assert set(figures(page)) <= _drawn(folders)
+
+
+def _drawn(folders: list[Path]) -> set[str]:
+    """Return the files of the figures of some result folders' pages."""
+    return {
+        plot_file(folder, chart).name
+        for folder in folders
+        for section in sections_of(read_contents(folder))
+        for chart in section.charts
+    }
 
 
 def is_printed(line: str, printed: str) -> bool:

@@ -116,9 +116,9 @@ def test_a_page_about_hostile_flights_is_drawn_with_their_names(tmp_path, monkey
     folder.mkdir()
     with nothing_outside(folder):
         making.write_run(folder, FREE, ROLLING)
-        page = render(folder).read_text()
+        page = render(folder, plots=True).read_text()
     assert "../../evil (held out)" in page or "../../evil: position" in page
     (folder / "plots").rename(folder / "drawn")
     (folder / "plots").symlink_to(tmp_path)
     with nothing_outside(folder), pytest.raises(OutputError, match="leads out of"):
-        render(folder)
+        render(folder, plots=True)

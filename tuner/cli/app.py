@@ -66,6 +66,7 @@ COMMANDS = {
     "report": (
         "Render the report of a run again.",
         "tune report runs/demo --open",
+        "tune report runs/demo --plots",
     ),
     "bench": (
         "Estimate coefficients from ground measurements: pendulum, stands, steps, hovers, spins.",

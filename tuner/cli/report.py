@@ -16,6 +16,7 @@ def report(
     /,
     *,
     open_: Annotated[bool, Parameter(name="--open", negative=())] = False,
+    plots: bool = False,
     quiet: Quiet = False,
 ) -> None:
     """Render report.html of a result folder again, from what the folder holds.
@@ -26,11 +27,13 @@ def report(
         The result folder.
     open_
         Show the page in the browser.
+    plots
+        Also write its figures as SVG, into plots/ of the folder.
     """
     from tuner.core.errors import InputError
     from tuner.report import render
 
-    path = render(run)
+    path = render(run, plots=plots)
     if open_ and not webbrowser.open(path.resolve().as_uri()):
         raise InputError("--open", "finds no browser here", f"open {path} yourself")
     if not quiet:

@@ -135,14 +135,6 @@ def _counted(name: str) -> Iterator[None]:
         recorder.spans.append(Span(name, begin, recorder.now(), processor=spent))
 
 
-def add_beside(name: str, began: float, ended: float) -> None:
-    """Add what another process did between two readings of `time.time`."""
-    recorder = _RECORDER.get()
-    if recorder is not None:
-        shift = recorder.now() - time.time()
-        recorder.spans.append(Span(name, began + shift, ended + shift, beside=True))
-
-
 @contextmanager
 def recording() -> Iterator[Recorder]:
     """Record the spans of a block, jax's own included."""

@@ -41,7 +41,6 @@ from tuner.job.folder import folder_for
 from tuner.job.listener import SILENT, Listener
 from tuner.job.results import result_of, with_errors_of_refits, write_folder
 from tuner.report import render, write_search, write_traces
-from tuner.report.background import BackgroundDrawing
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, RunResult
 from tuner.search.estimation import OnProgress, parameters_of
@@ -118,7 +117,7 @@ def run(
         resume=resume,
         force=options.force,
     )
-    job, drawing = selected.job, BackgroundDrawing()
+    job = selected.job
     fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
     explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
@@ -176,13 +175,12 @@ def run(
         explanation.part("knowledge", partial(write_knowledge, *of_fit), None)
         listener.on_message("Simulating which flight would be the most informative next.")
         explanation.part("next flight", partial(write_next_flight, *of_fit), None)
-    drawing.begin(folder)
     explanation.part("exports", partial(_export, folder, settings, listener), None)
     if explanation.findings != result.findings[len(fitted.findings) :]:
         findings = (*fitted.findings, *explanation.findings)
         result = result.model_copy(update={"findings": findings})
         result.write(folder)
-    explanation.part("page", partial(render, folder, wait_for_plots=drawing.wait), None)
+    explanation.part("page", partial(render, folder), None)
     return folder, result
 
 

@@ -6,14 +6,13 @@ import base64
 import gzip
 import hashlib
 import json
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from tuner.core.disk import write_text
-from tuner.core.spans import span
 from tuner.design.proposals import proposals_in_words
 from tuner.report.contents import Contents, read_contents
 from tuner.report.interactive import figure_of
@@ -31,18 +30,15 @@ from tuner.report.sections import sections_of
 REPORT_FILE = "report.html"
 
 
-def render(
-    folder: str | Path, *, wait_for_plots: Callable[[], Collection[str]] = frozenset
-) -> Path:
-    """Write ``report.html`` and ``plots/*.svg`` of a result folder, and return the page's path.
+def render(folder: str | Path, *, plots: bool = False) -> Path:
+    """Write ``report.html`` of a result folder, and return its path.
 
     Parameters
     ----------
     folder
         Of a run, or of an examination without one.
-    wait_for_plots
-        Returns the keys of the figures that another process has written to ``plots/`` by then,
-        see `tuner.report.background`; the others are drawn here.
+    plots
+        Also write its figures into ``plots/``, as SVG.
 
     Raises
     ------
@@ -54,10 +50,8 @@ def render(
     charts = [chart for section in sections for chart in section.charts]
     figures = json.dumps([figure_of(chart) for chart in charts], allow_nan=False)
     library = _plotly()
-    with span("waiting for figures"):
-        drawn = wait_for_plots()
-    with span("figures"):
-        write_plots([chart for chart in charts if chart.key not in drawn], contents.folder)
+    if plots:
+        write_plots(charts, contents.folder)
     path = contents.folder / REPORT_FILE
     write_text(path, _page(contents, sections, figures, library))
     return path

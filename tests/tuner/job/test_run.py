@@ -72,15 +72,13 @@ def test_estimate_latency_within_half_a_millisecond(finished, truth):
 
 
 @pytest.mark.slow
-def test_a_profile_names_every_stage_and_what_another_process_draws(finished):
+def test_a_profile_names_every_stage(finished):
     folder, _ = finished
     rows = csv.DictReader(io.StringIO((folder / "profile.csv").read_text()))
     seconds = {row["stage"]: float(row["seconds [s]"]) for row in rows}
     assert {"reading", "check", "search", "selection of terms", "examination"} <= set(seconds)
     assert {"validation", "results", "next flight", "page", "exports"} <= set(seconds)
     assert seconds["elsewhere"] < 0.1 * sum(seconds.values())
-    events = json.loads((folder / "profile.json").read_text())["traceEvents"]
-    assert any(event["tid"] == 2 and event["name"] == "figures" for event in events)
 
 
 @pytest.mark.slow

@@ -41,7 +41,6 @@ def test_the_folder_holds_tables_matrices_and_the_report(examined):
         "next_flight.csv",
         "about.json",
         "report.html",
-        "plots",
     } <= names
     about = json.loads((examined.folder / "about.json").read_text())
     assert about["flights"][0]["name"] == "small_circle"

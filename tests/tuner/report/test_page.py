@@ -92,7 +92,7 @@ def test_the_main_figures_are_written_for_papers(report: Path) -> None:
 def test_the_same_folder_renders_the_same_page_and_figures(report: Path) -> None:
     files = [report, *sorted((report.parent / "plots").iterdir())]
     before = [file.read_bytes() for file in files]
-    render(report.parent)
+    render(report.parent, plots=True)
     assert [file.read_bytes() for file in files] == before
 
 
