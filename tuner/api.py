@@ -1,4 +1,4 @@
-"""What the command line does, as functions: the same names, the same defaults, the same errors."""
+"""The commands as functions of Python: the same names, defaults and errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is done with a vehicle from Python: it is simulated, or exported for another simulator."""
+"""Functions of Python on a vehicle: simulate it, export it for another simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the parameters of several commands share."""
+"""Parameters that several commands share."""
 
 from __future__ import annotations
 

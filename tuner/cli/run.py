@@ -1,4 +1,4 @@
-"""One command run from its arguments: what goes wrong becomes one line and an exit status."""
+"""One command from its arguments; an error becomes one line and an exit status."""
 
 from __future__ import annotations
 

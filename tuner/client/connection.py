@@ -1,4 +1,4 @@
-"""Requests to a server, whose refusals become the same one-line errors as those of this machine."""
+"""HTTP requests to a server; its refusals become `InputError`."""
 
 from __future__ import annotations
 

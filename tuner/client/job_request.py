@@ -1,4 +1,4 @@
-"""What the options of `tune` ask for, as a server takes it: contents in place of paths."""
+"""Options of `tune` as a request to a server: contents in place of paths."""
 
 from __future__ import annotations
 

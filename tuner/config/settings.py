@@ -1,4 +1,4 @@
-"""Where the command line, the job file and the defaults meet: one settled job."""
+"""The settings of one job: options over the job file over the defaults."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How jax is set up for this program: threads, precision, compiled code.
+"""Set-up of jax: threads, precision, compiled code.
 
 A job's flights run as kernels of `lanes`, which have threads of their own. What XLA computes in a
 job is small, and its thread pool makes it slower: it is turned off. Flights that do run through XLA

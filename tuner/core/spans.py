@@ -1,4 +1,4 @@
-"""Where a run's seconds go: stages as spans of time, with what jax does in them.
+"""Times of a run's stages, with jax's tracing and compiling in them.
 
 A stage is a block ``with span("search"):``. Unless a run is recorded it costs a look at a variable.
 """

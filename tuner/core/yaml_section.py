@@ -1,4 +1,4 @@
-"""What all configuration models share: field types, unknown keys, errors in one line."""
+"""Base of all configuration models: field types, unknown keys, errors in one line."""
 
 from __future__ import annotations
 

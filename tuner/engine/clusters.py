@@ -15,8 +15,8 @@ from distributed import Client, LocalCluster
 from distributed.security import Security
 
 from tuner.core.errors import InputError
-from tuner.engine.choose import extra
 from tuner.engine.cluster_file import ClusterFile, JobQueue, Kubernetes
+from tuner.engine.selection import extra
 
 ANSWER = 10
 """s within which a scheduler answers."""

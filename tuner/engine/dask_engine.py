@@ -1,4 +1,4 @@
-"""Dask as the engine: its clusters, scheduler and retries; here are only the ends of its wires.
+"""An engine on a Dask cluster. Scheduling, retries and the loss of workers are Dask's.
 
 A task that a lost worker had is computed again by another, at most as often as Dask's setting
 ``distributed.scheduler.allowed-failures`` says, three times. What a client's end needs beside that:

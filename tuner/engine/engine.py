@@ -1,4 +1,4 @@
-"""What an engine is: tasks in, results out, in order, wherever they are computed.
+"""The interface of an engine: tasks in, results out, in order, wherever they are computed.
 
 A task is a module's function and one argument that can be pickled; it gives the same result
 wherever and however often it is computed, so that an engine may compute it again after losing a

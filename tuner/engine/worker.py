@@ -1,4 +1,4 @@
-"""In a worker: its cores are set up, tasks report, shared values arrive."""
+"""The worker's side of the Dask engine: set-up of cores, reports of tasks, shared values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One attempt at a job: its folder, its process, what that says, and the result into the store."""
+"""One attempt at a job: its folder, its process and messages, its result into the store."""
 
 from __future__ import annotations
 

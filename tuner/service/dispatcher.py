@@ -1,4 +1,4 @@
-"""What takes jobs from the table and has them worked on, as many at a time as there are workers."""
+"""The dispatcher: it claims jobs and starts an attempt at each, one a worker at a time."""
 
 from __future__ import annotations
 

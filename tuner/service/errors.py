@@ -1,4 +1,4 @@
-"""What the service refuses: each is a sentence for the user, and a status of HTTP."""
+"""Refusals of the service: a sentence for the user and an HTTP status each."""
 
 from __future__ import annotations
 

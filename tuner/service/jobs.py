@@ -1,4 +1,4 @@
-"""Jobs as users deal with them: submitted, listed, looked at, cancelled, tried again."""
+"""Operations on jobs: submit, list, read, cancel, retry."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What Prometheus reads: requests, uploads, jobs by state, deaths of workers."""
+"""Metrics for Prometheus: requests, uploads, jobs by state, deaths of workers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What users call things, made fit to be a file's name here, never a path, or to be shown."""
+"""Names that users give, made safe as file names, never paths, and for display."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings as users deal with them: taken in, inspected, listed."""
+"""Operations on recordings: inspect and store an upload, find, list."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a job is asked to fit, checked at once as far as that goes without reading a recording."""
+"""The request for a job, checked as far as that goes without reading a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of a result as they are sent, one by one or as an archive made meanwhile, in blocks."""
+"""Downloads of a result: a file, or an archive that is made while it is sent."""
 
 from __future__ import annotations
 

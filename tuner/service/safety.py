@@ -1,4 +1,4 @@
-"""What every request passes first: host, origin, token, rate and size; and headers on the way out.
+"""Checks of every request: host, origin, token, rate and size; and headers of every answer.
 
 A page elsewhere on the web must not reach a server on this machine through its user's browser: not
 under a name that it made point here (the host is checked), and not with a form of its own (the

@@ -11,7 +11,7 @@ from types import FrameType
 import uvicorn
 
 from tuner.core.errors import InputError
-from tuner.engine.choose import engine_for
+from tuner.engine.selection import engine_for
 from tuner.service import tokens
 from tuner.service.app import create_app
 from tuner.service.service import Service

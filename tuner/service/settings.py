@@ -1,4 +1,4 @@
-"""What a server is started with: where things lie, who works, and how much is too much."""
+"""Settings of a server: folders, database, workers, and limits on visitors and processes."""
 
 from __future__ import annotations
 

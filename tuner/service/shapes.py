@@ -1,4 +1,4 @@
-"""What the HTTP interface answers, as JSON."""
+"""JSON models of the HTTP answers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An upload from the network to the disk and into the store, never held in memory."""
+"""The receiver of uploads: a multipart body to the disk, hashed, never held in memory."""
 
 from __future__ import annotations
 

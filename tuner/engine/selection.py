@@ -1,4 +1,4 @@
-"""Which engine ``--workers`` and ``--cluster`` name."""
+"""The engine that ``--workers`` and ``--cluster`` name."""
 
 from __future__ import annotations
 
