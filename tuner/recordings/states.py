@@ -10,7 +10,7 @@ is averaged.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -34,39 +34,23 @@ STILL = 0.1
 
 
 @dataclass(frozen=True)
-class States:
-    """Recorded states at n times; NaN where a signal was not recorded around a time.
+class States(InitialState):
+    """Recorded states at n times: `InitialState` with an axis of n before that of every array.
+
+    NaN where a signal was not recorded near a time.
 
     Attributes
     ----------
     time
         (n,) s since the mission's start.
-    position, velocity, body_rate
-        (n, 3) m and m/s, world ENU; rad/s, body FLU.
-    attitude
-        (n, 4) unit quaternions (w, x, y, z), body to world.
-    rotor_speed, command
-        (n, 4) rad/s and 0..1.
     """
 
     time: Array
-    position: Array
-    velocity: Array
-    attitude: Array
-    body_rate: Array
-    rotor_speed: Array
-    command: Array
 
     def at(self, number: int) -> InitialState:
         """Return one of them."""
-        return InitialState(
-            position=self.position[number],
-            velocity=self.velocity[number],
-            attitude=self.attitude[number],
-            body_rate=self.body_rate[number],
-            rotor_speed=self.rotor_speed[number],
-            command=self.command[number],
-        )
+        names = [field.name for field in fields(InitialState)]
+        return InitialState(**{name: getattr(self, name)[number] for name in names})
 
 
 def states_at(series: Mapping[str, Series], times: Array) -> States:
