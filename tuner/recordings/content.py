@@ -186,7 +186,7 @@ def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
         require_pose(recording, chosen, places, given=given is not None)
     raw, contents, noticed = extract(recording, places, chosen.time)
     of_map = None if given is None else given.motor_order
-    of_log = motor_order_of(getattr(recording, "parameters", {}))
+    of_log = motor_order_of(recording.parameters)
     order = sidecar.motor_order or of_map or of_log or chosen.motor_order
     notes = [
         Note(NoteCode.TOPIC_MAP, "info", count=len(places), names=(chosen.name,)),

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.recording import NANOSECONDS, Contents, Request, Samples, Topic, Usual
+from tuner.recordings.recording import NANOSECONDS, Contents, Recording, Request, Samples, Topic
 
 MAGIC = 0xBC
 #: Logs are read into memory; a kilohertz of ten variables is 3 MB a minute.
@@ -56,7 +56,7 @@ class _Event:
     layout: np.dtype[np.void]
 
 
-class MicroSdRecording:
+class MicroSdRecording(Recording):
     """A micro-SD log; every event type is a topic, every variable a field.
 
     Raises
@@ -83,10 +83,6 @@ class MicroSdRecording:
             for number, event in self._events.items()
         )
 
-    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
-        """Return None: users choose the variables of a log."""
-        return None
-
     def fields(self, topic: str) -> list[str]:
         """Return the variables of an event."""
         return [
@@ -96,11 +92,6 @@ class MicroSdRecording:
             for name in event.layout.names or ()
             if name not in _OWN
         ]
-
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some variables that an event does not have."""
-        known = self.fields(topic)
-        return tuple(name for name in fields if name not in known)
 
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read the wanted variables of some events."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,36 +128,50 @@ class Contents:
     damage: tuple[Damage, ...] = ()
 
 
-class Recording(Protocol):
-    """An open file of any format."""
+class Recording(ABC):
+    """An open file of any format.
 
-    @property
-    def path(self) -> Path:
-        """Where the recording lies."""
-        ...
+    Attributes
+    ----------
+    path
+        Where the recording lies.
+    format
+        The `Reader.format` by which it was opened.
+    topics
+        Every topic in the file.
+    parameters
+        Of the flight controller, where its log holds them: name -> value.
+    units
+        Column of a table -> what a row of units says of it.
+    obstacle
+        Why its fields say nothing by themselves, and what to do; None where they may.
+    """
 
-    @property
-    def format(self) -> str:
-        """The `Reader.format` by which it was opened."""
-        ...
+    path: Path
+    format: str
+    topics: Sequence[Topic]
+    parameters: Mapping[str, float] = {}
+    units: Mapping[str, str] = {}
+    obstacle: tuple[str, str] | None = None
 
-    @property
-    def topics(self) -> Sequence[Topic]:
-        """Every topic in the file."""
-        ...
-
-    def usual(self, topic: str, signal: str) -> Usual | None:
+    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
         """Return where messages of this topic's type hold a signal; None if they do not."""
-        ...
+        return None
 
+    @abstractmethod
     def fields(self, topic: str) -> Sequence[str]:
         """Return the names of a topic's fields, for hints; structures by their first part."""
-        ...
 
     def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:
         """Return those of some fields that messages of a topic do not have."""
-        ...
+        known = self.fields(topic)
+        return tuple(name for name in fields if name not in known)
 
+    def undefined(self, topic: str) -> str | None:  # noqa: ARG002
+        """Return the message type of a topic if its definition is nowhere; None if it is known."""
+        return None
+
+    @abstractmethod
     def read(self, wanted: Mapping[str, Request]) -> Contents:
         """Read some topics: topic -> what is wanted of it.
 
@@ -166,10 +180,9 @@ class Recording(Protocol):
         RecordingError
             A topic has no such field, or nothing can be read.
         """
-        ...
 
 
-class TabularRecording:
+class TabularRecording(Recording):
     """A recording with one row a time and one number a column; the base of tabular formats.
 
     Parameters
@@ -180,35 +193,17 @@ class TabularRecording:
         The `Reader.format`.
     columns
         Their names.
-
-    Attributes
-    ----------
-    units
-        Column -> what a row of units says of it.
-    obstacle
-        Why its columns say nothing by themselves, and what to do; None where they may.
     """
-
-    units: Mapping[str, str] = {}
-    obstacle: tuple[str, str] | None = None
 
     def __init__(self, path: Path, format_name: str, columns: Sequence[str]) -> None:
         self.path = path
         self.format = format_name
         self.columns = columns
-        self.topics: Sequence[Topic] = (Topic(ROWS, "table", 1),)
-
-    def usual(self, topic: str, signal: str) -> Usual | None:  # noqa: ARG002
-        """Return None: columns have no usual names."""
-        return None
+        self.topics = (Topic(ROWS, "table", 1),)
 
     def fields(self, topic: str) -> Sequence[str]:  # noqa: ARG002
         """Return the columns."""
         return self.columns
-
-    def lacking(self, topic: str, fields: tuple[str, ...]) -> tuple[str, ...]:  # noqa: ARG002
-        """Return those of some columns that are not there."""
-        return tuple(name for name in fields if name not in self.columns)
 
     def clock(self, request: Request) -> Clock:
         """Return the column that holds the time.
@@ -226,7 +221,3 @@ class TabularRecording:
             f"has no time column among {', '.join(self.columns[:8])}, ...",
             "name it under 'time' in the topic map",
         )
-
-    @abstractmethod
-    def read(self, wanted: Mapping[str, Request]) -> Contents:
-        """Read the wanted columns of `ROWS`."""

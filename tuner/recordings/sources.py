@@ -148,7 +148,7 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
     if not is_tabular(recording.format):
         return topics, ()
     columns = recording.fields("")
-    found = recognised(columns, getattr(recording, "units", {}))
+    found = recognised(columns, recording.units)
     held = locate(recording, topics)[0]
     if not {"position", "attitude"} <= set(held) and len(found) > len(held):
         topics = topics.replace(name="the columns' names", time=(), signals={})
@@ -172,9 +172,8 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
 def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool) -> tuple[str, str]:
     """Return why a table holds no pose, and what to do."""
     columns = recording.fields("")
-    obstacle = getattr(recording, "obstacle", None)
-    if obstacle is not None and not given:
-        return str(obstacle[0]), str(obstacle[1])
+    if recording.obstacle is not None and not given:
+        return recording.obstacle
     listed = f"{', '.join(columns[:NAMED])}{', ...' if len(columns) > NAMED else ''}"
     clocks = [clock.field for clock in topics.time]
     if not any(field in columns for field in clocks):
@@ -202,10 +201,9 @@ def _obstacle(recording: Recording, topics: TopicMap, what: str, *, given: bool)
 
 def _require_definitions(recording: Recording, signals: Iterable[str]) -> None:
     """Raise if topics would hold some signals, but the definitions of their types are missing."""
-    undefined = getattr(recording, "undefined", lambda _: None)
     for topic in recording.topics:
         holds = topic.count and any(recording.usual(topic.name, signal) for signal in signals)
-        if holds and undefined(topic.name) is not None:
+        if holds and recording.undefined(topic.name) is not None:
             raise RecordingError(
                 recording.path,
                 f"holds {topic.name}, but not the definition of its type {topic.type}, which "

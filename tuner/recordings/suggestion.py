@@ -41,8 +41,7 @@ def suggested_map(path: Path) -> str:
         lines = [f"format: {recording.format}", f"extends: {chosen.name}"]
         return _text(path, lines, found, why, [])
     columns = recording.fields("")
-    units = getattr(recording, "units", {})
-    known = recognised(columns, units)
+    known = recognised(columns, recording.units)
     lines = ["# time: {field: ..., unit: ms}      # no column seems to hold it"]
     if "time" in known:
         unit = known["time"].unit

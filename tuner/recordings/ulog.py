@@ -26,6 +26,7 @@ from tuner.recordings.recording import (
     NANOSECONDS,
     Clock,
     Contents,
+    Recording,
     Request,
     Samples,
     Topic,
@@ -46,7 +47,7 @@ READ_AT_ONCE = 1 << 22
 Formats = dict[str, list[tuple[str, int, str]]]
 
 
-class ULogRecording:
+class ULogRecording(Recording):
     """A PX4 log.
 
     A further instance of a message is the topic ``name[1]``.

@@ -11,7 +11,9 @@ from __future__ import annotations
 import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -142,36 +144,25 @@ class Db3:
         ):
             if encoding == "cdr" and isinstance(topic, str) and isinstance(kind, str):
                 definition = texts.get(kind, _NO_DEFINITION)
-                count = counts.get(number, 0)
-                self.connections[number] = Connection(number, topic, kind, definition, count)
+                messages = counts.get(number, 0)
+                self.connections[number] = Connection(number, topic, kind, definition, messages)
 
 
-class _opened:  # noqa: N801 (used like a function)
-    """A database opened for reading only, in which nothing can act or go on forever."""
-
-    def __init__(self, path: Path) -> None:
-        # A recorder that crashed leaves its last messages in a log beside the database.
-        unfinished = path.with_name(path.name + "-wal").exists()
-        how = "mode=ro" if unfinished else "mode=ro&immutable=1"
-        self._database = sqlite3.connect(f"file:{quote(str(path.resolve()))}?{how}", uri=True)
-        self._database.text_factory = lambda raw: raw.decode(errors="replace")
-        self._cut = _is_cut(path)
-        self._steps = 0
-
-    def __enter__(self) -> sqlite3.Connection:
-        self._database.execute("PRAGMA trusted_schema = OFF")
-        self._database.execute("PRAGMA cell_size_check = ON")
-        if self._cut:  # else SQLite refuses a file that is shorter than it says
-            self._database.execute("PRAGMA writable_schema = ON")
-        self._database.set_progress_handler(self._tick, 1_000_000)
-        return self._database
-
-    def __exit__(self, *_: object) -> None:
-        self._database.close()
-
-    def _tick(self) -> int:
-        self._steps += 1
-        return int(self._steps > PATIENCE)
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database for reading only, in which nothing can act or go on forever."""
+    # A recorder that crashed leaves its last messages in a log beside the database.
+    unfinished = path.with_name(path.name + "-wal").exists()
+    how = "mode=ro" if unfinished else "mode=ro&immutable=1"
+    steps = count(1)
+    with closing(sqlite3.connect(f"file:{quote(str(path.resolve()))}?{how}", uri=True)) as database:
+        database.text_factory = lambda raw: raw.decode(errors="replace")
+        database.execute("PRAGMA trusted_schema = OFF")
+        database.execute("PRAGMA cell_size_check = ON")
+        if _is_cut(path):  # else SQLite refuses a file that is shorter than it says
+            database.execute("PRAGMA writable_schema = ON")
+        database.set_progress_handler(lambda: int(next(steps) > PATIENCE), 1_000_000)
+        yield database
 
 
 def _is_cut(path: Path) -> bool:

@@ -17,6 +17,7 @@ from tuner.recordings.recording import (
     Clock,
     Contents,
     Nanoseconds,
+    Recording,
     Request,
     Samples,
     Topic,
@@ -40,7 +41,7 @@ def open_container(path: Path) -> Container:
     return Bag1(path) if magic in (b"#ROSBAG", b"") else open_file(path)
 
 
-class RosRecording:
+class RosRecording(Recording):
     """Topics of a ROS container.
 
     Parameters
