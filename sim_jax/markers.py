@@ -8,8 +8,8 @@ its axes a degree off. What is simulated is the centre of mass in body axes; wha
 Both numbers belong to the set-up and act where a simulation is compared with a recording: at its
 start, which comes from the recorded pose, and on what it gives. Position and attitude control see
 the same pose where the estimator is fed by motion capture and knows of no offset, and the velocity
-of that point; else the centre of mass in body axes (`Controller.sees_markers`). The gyro, and what
-follows it, is the vehicle's own.
+of that point; else the centre of mass in the autopilot's axes (`Controller.sees_markers`). The
+gyro, and what follows it, is the autopilot's own (`sim_jax.autopilot`).
 """
 
 from __future__ import annotations
@@ -18,17 +18,15 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Bool
 
+from sim_jax.autopilot import tilt_of
 from sim_jax.control.gains import Controller
-from sim_jax.numeric import Array, Scalar, safe_sqrt
+from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
-from sim_jax.rotation import Quaternion
+from sim_jax.rotation import Quaternion, rotation
 from sim_jax.state import Start
 from sim_jax.trees import where
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
-
-SMALL = 1e-6
-"""rad² below which sin(a)/a is its series."""
 
 
 class Markers(eqx.Module):
@@ -95,7 +93,7 @@ class Markers(eqx.Module):
 
 def markers_of(vehicle: Vehicle) -> Markers | None:
     """Return a vehicle's markers; None where they are at its centre of mass and along its axes."""
-    offset, tilt = _vector(vehicle, "marker_offset"), _vector(vehicle, "marker_tilt")
+    offset, tilt = vehicle.along_axes("marker_offset"), vehicle.along_axes("marker_tilt")
     if offset is None and tilt is None:
         return None
     return Markers(offset, None if tilt is None else rotation(tilt))
@@ -103,29 +101,15 @@ def markers_of(vehicle: Vehicle) -> Markers | None:
 
 def estimated(vehicle: Vehicle, controller: Controller, motion: Motion) -> Motion:
     """Return the motion that position and attitude control see of a motion, were it not old."""
-    markers = markers_of(vehicle)
-    if markers is None:
+    markers, tilt = markers_of(vehicle), tilt_of(vehicle)
+    if markers is None and tilt is None:
         return motion
-    return where(controller.sees_markers > 0.5, markers.seen(motion), motion)
-
-
-def rotation(vector: Vec3) -> Quaternion:
-    """Return the rotation by a vector in rad, exp(vector / 2), with its derivative at zero."""
-    square = 0.25 * vector.dot(vector)
-    small = square < SMALL
-    half = safe_sqrt(jnp.where(small, 1.0, square))
-    cosine = jnp.where(small, 1.0 - square / 2.0, jnp.cos(half))
-    scale = 0.5 * jnp.where(small, 1.0 - square / 6.0, jnp.sin(half) / half)
-    turn = vector * scale
-    return Quaternion(cosine, turn.x, turn.y, turn.z)
-
-
-def _vector(vehicle: Vehicle, name: str) -> Vec3 | None:
-    parts = [vehicle.effects.get(f"{name}_{axis}") for axis in "xyz"]
-    if all(part is None for part in parts):
-        return None
-    x, y, z = (jnp.zeros(()) if part is None else part for part in parts)
-    return Vec3(x, y, z)
+    by_markers = motion if markers is None else markers.seen(motion)
+    by_sensors = motion
+    if tilt is not None:
+        attitude = motion.attitude.product(tilt)
+        by_sensors = Motion(motion.position, motion.velocity, attitude, motion.body_rate)
+    return where(controller.sees_markers > 0.5, by_markers, by_sensors)
 
 
 def _of_each(flag: Array, first: Quaternion, second: Quaternion) -> Quaternion:

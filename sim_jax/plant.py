@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, PyTree
 
+from sim_jax.autopilot import Gyro
 from sim_jax.control import attitude, mixer, rate
 from sim_jax.control.gains import Controller
 from sim_jax.control.position import (
@@ -71,6 +72,8 @@ class Plant(eqx.Module):
     inlet: Inlet
     lag: Lag | SwitchedLag
     gyro: GyroFilter
+    senses: Gyro | None = None
+    """What the gyro reads; None where that is the body rate."""
 
     def position_control(
         self, state: State, step: Int[Array, ""], reference: ReferenceInlet
@@ -129,7 +132,10 @@ class Plant(eqx.Module):
     def _stabilise(self, state: State) -> State:
         """Run gyro filters, rate PID and mixer once; PX4 thinks in FRD."""
         controller, rate_hz = self.controller, self.schedule.rate_control_rate
-        gyro = filtered(self.gyro, state.gyro, state.motion.body_rate, rate_hz)
+        reading = state.motion.body_rate
+        if self.senses is not None:
+            reading = self.senses.reading(reading)
+        gyro = filtered(self.gyro, state.gyro, reading, rate_hz)
         measured, wanted = _frd(gyro.rate), _frd(state.setpoints.rate)
         torque = rate.torque_setpoint(
             controller.rate,

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Int, PyTree
 
+from sim_jax.autopilot import gyro_of
 from sim_jax.constants import GRAVITY
 from sim_jax.control import mixer
-from sim_jax.control.gains import Controller
+from sim_jax.control.gains import Controller, with_gains_of
 from sim_jax.crash import Limits
 from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.inlet import Inlet
@@ -97,9 +98,10 @@ def begun(
     dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
     vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
     shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
+    senses = gyro_of(vehicle)
     plant = Plant(
         vehicle=vehicle,
-        controller=controller,
+        controller=with_gains_of(controller, vehicle),
         environment=environment,
         schedule=schedule,
         limits=Limits() if limits is None else limits,
@@ -108,9 +110,18 @@ def begun(
         inlet=inlet,
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
+        senses=senses,
     )
-    seen = estimated(vehicle, controller, start.motion)
-    return plant, first_state(start, vehicle.motor, schedule, plant.gyro, shape, seen=seen)
+    rate = start.motion.body_rate
+    return plant, first_state(
+        start,
+        vehicle.motor,
+        schedule,
+        plant.gyro,
+        shape,
+        seen=estimated(vehicle, controller, start.motion),
+        read=rate if senses is None else senses.reading(rate),
+    )
 
 
 def rollout(

@@ -9,6 +9,9 @@ from jaxtyping import Float
 from sim_jax.numeric import Array, Scalar, safe_divide, safe_sqrt, saturate
 from sim_jax.vector import Vec3
 
+SMALL = 1e-6
+"""rad² below which sin(a)/a is its series."""
+
 
 class Matrix3(eqx.Module):
     """A rotation matrix by its columns: the body axes in world coordinates."""
@@ -175,3 +178,14 @@ class Quaternion(eqx.Module):
         """Return the rotation that does nothing, in the shape and precision of a scalar."""
         zero = jnp.zeros_like(like)
         return Quaternion(jnp.ones_like(like), zero, zero, zero)
+
+
+def rotation(vector: Vec3) -> Quaternion:
+    """Return the rotation by a vector in rad, exp(vector / 2), with its derivative at zero."""
+    square = 0.25 * vector.dot(vector)
+    small = square < SMALL
+    half = safe_sqrt(jnp.where(small, 1.0, square))
+    cosine = jnp.where(small, 1.0 - square / 2.0, jnp.cos(half))
+    scale = 0.5 * jnp.where(small, 1.0 - square / 6.0, jnp.sin(half) / half)
+    turn = vector * scale
+    return Quaternion(cosine, turn.x, turn.y, turn.z)

@@ -83,14 +83,16 @@ def first_state(
     shape: tuple[int, ...],
     *,
     seen: Motion,
+    read: Vec3,
 ) -> State:
     """Return the state at time 0, every leaf in the full shape of the batch.
 
-    ``seen``: the start's motion as position and attitude control see it.
+    ``seen``: the start's motion as position and attitude control see it; ``read``: its body rate as
+    the gyro reads it, rad/s.
     """
     dtype = jnp.result_type(*jax.tree.leaves(start))
-    start, seen = jax.tree.map(
-        lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), (start, seen)
+    start, seen, read = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), (start, seen, read)
     )
     speeds = (reference_speed(motor, command) for command in start.command)
     references = tuple(jnp.broadcast_to(speed, shape).astype(dtype) for speed in speeds)
@@ -105,7 +107,7 @@ def first_state(
         length = history_length(schedule.longest_actuator_latency, schedule.step)
         now = jnp.stack(references)
         reference_history = jnp.broadcast_to(now, (length, *now.shape))
-    memory = GyroMemory.settled(gyro, start.motion.body_rate)
+    memory = GyroMemory.settled(gyro, read)
     thrust = sum(start.command[1:], start.command[0]) * (1.0 / len(start.command))
     return State(
         motion=start.motion,

@@ -8,6 +8,7 @@ is recorded may answer the mission's first set-point already.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TypeAlias
 
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from sim_jax.motor import command_of
 from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
-from sim_jax.state import Start
+from sim_jax.state import Start, hover_speed
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
 from sim_jax.vector import Vec3
@@ -78,9 +79,16 @@ def in_trim(
 def trim_speeds(vehicle: Vehicle, *, gravity: float = GRAVITY) -> PerRotor:
     """Return the speeds in rad/s at which four rotors carry the weight and all moments cancel.
 
-    At rest in still air every force and moment is linear in the squares of the rotor speeds, so
-    that four of these follow from Newton's and Euler's equations in equilibrium.
+    At rest in still air every force and moment is linear in what the motor constant multiplies, the
+    squares of the rotor speeds, so that four of these follow from Newton's and Euler's equations in
+    equilibrium. With another ``thrust_exponent`` they are those of other speeds.
     """
+    exponent = vehicle.effects.get("thrust_exponent")
+    if exponent is not None:
+        others = {name: e for name, e in vehicle.effects.items() if name != "thrust_exponent"}
+        squares = trim_speeds(replace(vehicle, effects=others), gravity=gravity)
+        hovering = hover_speed(vehicle, gravity=gravity)
+        return tuple(speed * (speed / hovering) ** (2.0 / exponent - 1.0) for speed in squares)
     rest = Vec3.zeros(vehicle.body.mass)
     motion = Motion(rest, rest, Quaternion.identity(rest.x), rest)
     air = Air.around(vehicle, motion, rotor_acceleration=(rest.x,) * ROTORS)

@@ -111,3 +111,13 @@ class Vehicle(eqx.Module):
     """Coefficients of terms beyond the base model by name; a term without them does not act."""
     rotor_radius: Scalar = eqx.field(converter=_number, default=0.13)
     """m, of which the ground effect depends; an 11 inch propeller has 0.14."""
+
+    def along_axes(self, stem: str, neutral: float = 0.0) -> Vec3 | None:
+        """Return the effects ``stem_x``, ``_y``, ``_z``, absent ones neutral; None without any."""
+        parts = [self.effects.get(f"{stem}_{axis}") for axis in "xyz"]
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        absent = jnp.full_like(known[0], neutral)
+        x, y, z = (absent if part is None else part for part in parts)
+        return Vec3(x, y, z)

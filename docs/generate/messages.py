@@ -98,6 +98,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.LAW_LACKING: "Recorded accelerations hold a force or moment that the model does not; the "
     "line says along which axis, what it goes with, which coefficients it may have moved, whose "
     "intervals hold that, and which terms are of that kind.",
+    Code.TERM_SHOWS: "A term that was found says something of the vehicle or its files: thrust "
+    "grows with another power of the rotor speed than the second, the rate controller's gains are "
+    "not those of the file, the autopilot sits askew, or its gyro's scale is off.",
     Code.ROTOR_CHANGED: "From some time of this flight a rotor gives less, or more, thrust at the "
     "same speed than before: the flight is used up to there. Look at its propeller, motor and "
     "mount before you fly again.",

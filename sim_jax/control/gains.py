@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from sim_jax.numeric import Scalar
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import Vehicle
 
 
 class PositionGains(eqx.Module):
@@ -81,3 +82,23 @@ class Controller(eqx.Module):
     mixer: MixerSettings
     sees_markers: Scalar = eqx.field(default_factory=lambda: jnp.zeros(()))
     """1: position and attitude control see the motion capture's frame; 0: the centre of mass."""
+
+
+def with_gains_of(controller: Controller, vehicle: Vehicle) -> Controller:
+    """Return the controller with K of the rates times ``rate_gain_roll_pitch`` and ``_yaw``.
+
+    What the autopilot's gains are over those of the controller file, where a vehicle has these
+    effects: parameters that were changed since, or scaled by an autotune or by the battery (PX4
+    MC_BAT_SCALE_EN).
+    """
+    across, about = (vehicle.effects.get(f"rate_gain_{axis}") for axis in ("roll_pitch", "yaw"))
+    if across is None and about is None:
+        return controller
+    k = controller.rate.k
+    x, y, z = k.x, k.y, k.z
+    if across is not None:
+        x, y = x * across, y * across
+    if about is not None:
+        z = z * about
+    changed: Controller = eqx.tree_at(lambda c: c.rate.k, controller, Vec3(x, y, z))
+    return changed

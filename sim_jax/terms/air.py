@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax.numpy as jnp
 
 from sim_jax.environment import NOTHING_AROUND, Environment
 from sim_jax.numeric import Scalar
@@ -41,7 +40,7 @@ class Air(eqx.Module):
             through = through - environment.wind
         velocity = motion.attitude.to_body(through)
         arms = tuple(rotor.position for rotor in vehicle.rotors)
-        offset = _center_of_mass(vehicle)
+        offset = vehicle.along_axes("center_of_mass")
         if offset is not None:
             arms = tuple(arm - offset for arm in arms)
         return Air(
@@ -52,14 +51,3 @@ class Air(eqx.Module):
             rotor_acceleration=rotor_acceleration,
             draught=environment.draught,
         )
-
-
-def _center_of_mass(vehicle: Vehicle) -> Vec3 | None:
-    """Return where the centre of mass lies from where the vehicle file has it, in m."""
-    names = [f"center_of_mass_{axis}" for axis in "xyz"]
-    known = [vehicle.effects[name] for name in names if name in vehicle.effects]
-    if not known:
-        return None
-    zero = jnp.zeros_like(known[0])
-    x, y, z = (vehicle.effects.get(name, zero) for name in names)
-    return Vec3(x, y, z)

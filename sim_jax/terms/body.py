@@ -5,7 +5,6 @@ v is the velocity of the centre of mass through the air and ω the body rate, bo
 
 from __future__ import annotations
 
-from sim_jax.numeric import Scalar
 from sim_jax.rigid_body import Motion, Wrench
 from sim_jax.terms.air import Air
 from sim_jax.vector import Vec3
@@ -40,7 +39,7 @@ def linear_drag(
     Source: Faessler, Franchi, Scaramuzza, "Differential flatness of quadrotor dynamics subject to
     rotor drag", RA-L 2018.
     """
-    coefficients = _along_axes(vehicle, "linear_drag", air.velocity.x)
+    coefficients = vehicle.along_axes("linear_drag")
     if coefficients is None:
         return None
     return Wrench(-coefficients.scaled_by(air.velocity), Vec3.zeros(air.velocity.x))
@@ -53,7 +52,7 @@ def torque_trim(
     air: Air,
 ) -> Wrench | None:
     """Return the steady moment torque_trim: what rotors and blades that differ leave over."""
-    moment = _along_axes(vehicle, "torque_trim", air.velocity.x)
+    moment = vehicle.along_axes("torque_trim")
     return None if moment is None else Wrench(Vec3.zeros(air.velocity.x), moment)
 
 
@@ -64,17 +63,7 @@ def angular_drag(
     air: Air,
 ) -> Wrench | None:
     """Return the moment -angular_drag·ω, axis by axis: what is left of inflow and flapping."""
-    coefficients = _along_axes(vehicle, "angular_drag", air.velocity.x)
+    coefficients = vehicle.along_axes("angular_drag")
     if coefficients is None:
         return None
     return Wrench(Vec3.zeros(air.velocity.x), -coefficients.scaled_by(motion.body_rate))
-
-
-def _along_axes(vehicle: Vehicle, stem: str, like: Scalar) -> Vec3 | None:
-    """Return the effects ``stem_x``, ``_y``, ``_z``, absent ones zero; None if all are absent."""
-    names = [f"{stem}_{axis}" for axis in "xyz"]
-    if not any(name in vehicle.effects for name in names):
-        return None
-    zero = Vec3.zeros(like).x
-    x, y, z = (vehicle.effects.get(name, zero) for name in names)
-    return Vec3(x, y, z)

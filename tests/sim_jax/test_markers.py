@@ -8,9 +8,10 @@ from sim_jax.constants import GRAVITY
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.markers import Markers, markers_of, rotation
+from sim_jax.numeric import GRAVITY
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import rollout
-from sim_jax.rotation import Quaternion
+from sim_jax.rotation import Quaternion, rotation
 from sim_jax.state import Start, hover
 from sim_jax.vector import Vec3
 from tests.sim_jax.derivatives import assert_derivatives

@@ -13,6 +13,7 @@ from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover_speed
 from sim_jax.terms.air import Air
+from sim_jax.terms.rotor import lifting
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
 from tests.sim_jax.support import quaternion, vec, vehicle
 from tuner.vehicle import REGISTRY
@@ -125,6 +126,16 @@ def test_ground_lifts_by_cheeseman_and_bennett():
     ratio = wrench(with_effects(ground_effect=1.0), level)[2] / wrench(CRAFT, level)[2]
     height = 0.2 + float(CRAFT.rotors[0].position.z)
     assert float(ratio) == pytest.approx(1 / (1 - (0.13 / (4 * height)) ** 2), rel=1e-9)
+
+
+@pytest.mark.parametrize("exponent", [1.8, 1.93, 2.15])
+def test_thrust_grows_by_a_power_of_the_speed_about_the_hovers(exponent):
+    speeds = np.linspace(0.34, 2.0, 12) * float(hover_speed(CRAFT))
+    lifted = np.asarray(lifting(with_effects(thrust_exponent=exponent))(jnp.asarray(speeds)))
+    power = (speeds / float(hover_speed(CRAFT))) ** (exponent - 2.0)
+    np.testing.assert_allclose(lifted / speeds**2, power, rtol=2e-3)
+    near = np.abs(speeds / float(hover_speed(CRAFT)) - 1.0) < 0.3
+    np.testing.assert_allclose((lifted / speeds**2)[near], power[near], rtol=1e-5)
 
 
 def test_time_constants_grow_with_the_speed_and_stay_at_hover():

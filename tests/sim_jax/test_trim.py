@@ -26,6 +26,7 @@ UNEVEN = {
     "rotor_thrust_scale_2": 0.985,
     "rotor_thrust_scale_3": 0.99,
     "torque_trim_z": 0.01,
+    "thrust_exponent": 1.9,
 }
 AT_REST = jnp.asarray(True)
 

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array, lax
 from jaxtyping import Float
 
+from sim_jax.autopilot import gyro_rate
 from sim_jax.crash import AIRBORNE
 from sim_jax.disturbance import Disturbance
 from sim_jax.markers import markers_of
@@ -198,7 +199,7 @@ class Observer(eqx.Module):
         command = state.command
         if "command" in self.channels:
             command = self.plant.inlet.next_command(self.plant, state, self._step(tick)).command
-        rate = motion.body_rate
+        rate = gyro_rate(self.plant.vehicle, motion.body_rate)
         signals = {
             "position": (position.x, position.y, position.z),
             "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),

@@ -5,7 +5,8 @@ Each is named after its code in `tuner.findings.findings.Code`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from tuner.core.phrases import as_sentence, listed, percent
@@ -13,6 +14,8 @@ from tuner.recordings.notes import Cause, Damage, Note, NoteCode, damage_sentenc
 
 if TYPE_CHECKING:
     from tuner.findings.findings import Finding
+
+Numbers = Mapping[str, float]
 
 WITHOUT_SUBJECT = {"cannot", "claims", "extends", "has", "holds", "is", "keeps", "lacks"}
 """Words with which an error begins that says something of the file which it names."""
@@ -209,6 +212,76 @@ def rotor_changed(finding: Finding) -> str:
         f"From t = {seconds:.1f} s of this flight rotor {finding.numbers['rotor']:.0f} ({place}) "
         f"gives {change} thrust at the same speed than before: the flight is used up to there."
     )
+
+
+def term_shows(finding: Finding) -> str:
+    """Return what a term that was found says of the vehicle, its autopilot or its files."""
+    return _SHOWS[finding.subject][0](finding.numbers)
+
+
+def term_remedy(finding: Finding) -> str:
+    """Return what to do about it."""
+    return _SHOWS[finding.subject][1]
+
+
+def _thrust_exponent(numbers: Numbers) -> str:
+    value, error = numbers["thrust_exponent"], numbers["thrust_exponent_error"]
+    slower = "slower" if value < 2.0 else "faster"
+    return (
+        f"Thrust and drag torque grow as the rotor speed to the power {value:.3g} ± {error:.1g}, "
+        f"{slower} than with its square."
+    )
+
+
+def _rate_gain(numbers: Numbers) -> str:
+    axes = {"rate_gain_roll_pitch": "roll and pitch react", "rate_gain_yaw": "yaw reacts"}
+    parts = [
+        f"{reacts} as if the rate controller's P, I and D were {_more(numbers, name)}"
+        for name, reacts in axes.items()
+        if name in numbers
+    ]
+    return as_sentence(f"{listed(parts)} than in the controller file")
+
+
+def _autopilot_tilt(numbers: Numbers) -> str:
+    parts = [
+        f"{math.degrees(numbers[name]):+.2f} ± {math.degrees(numbers[f'{name}_error']):.2f}° "
+        f"about the axis that points {axis}"
+        for name, axis in (("autopilot_tilt_x", "forward"), ("autopilot_tilt_y", "left"))
+        if name in numbers
+    ]
+    return f"The autopilot's axes are turned against the vehicle's: {listed(parts)}."
+
+
+def _gyro_scale(numbers: Numbers) -> str:
+    axes = {"gyro_scale_x": "roll", "gyro_scale_y": "pitch", "gyro_scale_z": "yaw"}
+    parts = [f"in {axis} {_more(numbers, name)}" for name, axis in axes.items() if name in numbers]
+    return f"The gyro's readings are {listed(parts)} than how the recorded attitude turns."
+
+
+def _more(numbers: Numbers, name: str) -> str:
+    """Return by how much a factor differs from one, in percent with its standard error."""
+    more = 100.0 * (numbers[name] - 1.0)
+    error = 100.0 * numbers[f"{name}_error"]
+    return f"{abs(more):.2g} ± {error:.1g} % {'higher' if more > 0.0 else 'lower'}"
+
+
+_SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
+    "thrust_exponent": (
+        _thrust_exponent,
+        "A simulator without such a term has the right thrust at the hover alone.",
+    ),
+    "rate_gain": (
+        _rate_gain,
+        "Compare it with the autopilot's parameters (MC_ROLLRATE_K, _P, MC_BAT_SCALE_EN).",
+    ),
+    "autopilot_tilt": (
+        _autopilot_tilt,
+        "Mount it straight, or calibrate its level (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF).",
+    ),
+    "gyro_scale": (_gyro_scale, "Calibrate the gyro, or compare it with another."),
+}
+"""Group of terms -> what it says, and what to do."""
 
 
 def flight_unmatched(finding: Finding) -> str:

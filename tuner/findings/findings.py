@@ -339,6 +339,11 @@ class Code(Worded):
         composed.rotor_changed,
         "Look at its propeller, motor and mount before you fly again.",
     )
+    TERM_SHOWS = (
+        "term_shows",  # NAME, NAME_error; names: NAMEs; the subject is their group
+        composed.term_shows,
+        composed.term_remedy,
+    )
     INPUT_LATE = (
         "input_late",  # seconds
         (

@@ -56,6 +56,7 @@ from tuner.terms.balanced_inertia import with_inputs_balanced
 from tuner.terms.refit_with_disturbances import Examined, examined
 from tuner.terms.search_with_terms import search_with_terms, with_first_terms
 from tuner.terms.selection_state import Selected
+from tuner.terms.shown import terms_shown
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
@@ -103,7 +104,7 @@ def run(
     settings, logged = as_logged(settle(options))
     listener.on_settings(settings)
     folder = folder_for(out, resume=resume)
-    job, findings = _prepared(settings)
+    job, findings = prepared(settings)
     findings = (*logged, *findings)
     explanation = Explanation(listener.on_message)
     _check(findings, explanation, force=options.force)
@@ -197,7 +198,7 @@ class _Found:
         return job is self.job and fitted is self.fitted
 
 
-def _prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
+def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:
     """Return the job of some settings, and what there is to say of it before it is simulated."""
     with span("reading"):
         recordings, left_out = read_usable(settings)
@@ -313,6 +314,7 @@ def _known(
     uncertainty, known = examination.uncertainty, examination.known
     explanation.notice(finer_than_steps(uncertainty))
     explanation.notice(laws_lacking(examination.laws, uncertainty))
+    explanation.notice(terms_shown(fitted, uncertainty))
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}
     )

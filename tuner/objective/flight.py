@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Float, Int
 
+from sim_jax.autopilot import gyro_of, gyro_rate
 from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet
@@ -71,10 +73,11 @@ def recorded_of(
     position, attitude = motion.position, motion.attitude
     if markers is not None:
         position, attitude = markers.recorded(motion)
+    rate = gyro_rate(model.vehicle, motion.body_rate)
     logged = {
         "position": (position.x, position.y, position.z),
         "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
-        "body_rate": (motion.body_rate.x, motion.body_rate.y, motion.body_rate.z),
+        "body_rate": _parts(rate),
         "rotor_speed": log.rotor_speed,
         "command": log.command,
         MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
@@ -156,7 +159,10 @@ def beginning_of(
     The arguments are those of `simulate_segments`.
     """
     start, inlet = segments.start, segments.inlet
-    markers = markers_of(model.vehicle)
+    gyro, markers = gyro_of(model.vehicle), markers_of(model.vehicle)
+    if gyro is not None:
+        true = gyro.body_rate(start.motion.body_rate)
+        start = replace(start, motion=replace(start.motion, body_rate=true))
     if markers is not None:
         start = markers.start(start, segments.resting, model.controller.sees_markers)
     environment = environment_of(model, segments, conditions)

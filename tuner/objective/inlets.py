@@ -62,6 +62,12 @@ TURNING = (
     *(f"torque_trim_{axis}" for axis in "xyz"),
 )
 """Coefficients that turn the vehicle, and do nothing else."""
+OF_RATE_CONTROL = (
+    "gyro_cutoff",
+    "rate_gain_roll_pitch",
+    "rate_gain_yaw",
+)
+"""Coefficients between a rate set-point and a motor command alone."""
 STEADY_TORQUE = ("torque_trim_x", "torque_trim_y", "torque_trim_z")
 """Rotors differ and the mass is never quite in the middle: recorded inputs hold a steady torque
 that turns nothing, and that a simulation which is fed with them has to know of."""
@@ -140,7 +146,7 @@ class RecordedCommand(RecordedInlet):
     feeds = ActuatorInlet
     needs = ("command",)
     silences = ("command", "acceleration")
-    bypasses = ("estimate_latency", "gyro_cutoff")
+    bypasses = ("estimate_latency", *OF_RATE_CONTROL)
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rate_integral",)
@@ -167,7 +173,7 @@ class RecordedRotorSpeed(RecordedInlet):
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
     silences = ("command", "rotor_speed", "acceleration")
-    bypasses = ("estimate_latency", "gyro_cutoff", *OF_MOTORS)
+    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *OF_MOTORS)
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rotor_speed", "rate_integral")
@@ -212,7 +218,7 @@ class RecordedAttitude(RecordedInlet):
     feeds = AttitudeInlet
     needs = ("attitude",)
     silences = ("attitude", "body_rate", "command", "rotor_speed")
-    bypasses = ("estimate_latency", "gyro_cutoff", *TURNING)
+    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *TURNING)
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
     starts_recorded = False
     window = 1.0

@@ -19,6 +19,7 @@ import equinox as eqx
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_jax.autopilot import gyro_of
 from sim_jax.markers import markers_of
 from tuner.core.numerics import huber_weights, robust_sd, scaled_solve
 from tuner.findings.findings import Code, Finding, Level
@@ -168,7 +169,8 @@ def with_inputs_balanced(
     objective = fitted.objective
     segments = objective.segments
     model = objective.tunable.at(np.asarray(fitted.point.coefficients))
-    moved = bool(objective.conditions) or markers_of(model.vehicle) is not None
+    frames = markers_of(model.vehicle), gyro_of(model.vehicle)
+    moved = bool(objective.conditions) or any(frame is not None for frame in frames)
     if (
         moved
         or job.accelerations is not None

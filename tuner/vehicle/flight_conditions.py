@@ -13,21 +13,46 @@ _CLOCKS = "clocks of the recording"
 _SMOOTHED = "smoothing error of the motion capture"
 
 
-def _marker(name: str, unit: str, meaning: str) -> Coefficient:
-    """Return the row of one axis of where motion capture's rigid body sits on the vehicle."""
+def _frame(name: str, unit: str, meaning: str, source: str, *, prior_sd: float) -> Coefficient:
+    """Return the row of one axis of where something sits on the vehicle, off by what is usual."""
     return Coefficient(
         name=name,
         unit=unit,
         meaning=meaning,
-        source="the rigid body as defined in the motion capture's software",
+        source=source,
         scope="setup",
         place=(EFFECTS, name),
         scale="linear",
         bounds=(-0.3, 0.3),
-        prior_sd=0.03,
+        prior_sd=prior_sd,
         step=0.01,
         neutral=0.0,
         group=name[:-2],
+        exported_as=_OUTSIDE,
+    )
+
+
+_marker = partial(
+    _frame, source="the rigid body as defined in the motion capture's software", prior_sd=0.03
+)
+
+
+def _factor(
+    name: str, meaning: str, source: str, *, group: str, bounds: float, prior_sd: float
+) -> Coefficient:
+    """Return the row of a factor of the set-up that is one where all is as it is said to be."""
+    return Coefficient(
+        name=name,
+        unit="",
+        meaning=meaning,
+        source=source,
+        scope="setup",
+        place=(EFFECTS, name),
+        bounds=bounds,
+        prior_sd=prior_sd,
+        step=0.5 * prior_sd,
+        neutral=1.0,
+        group=group,
         exported_as=_OUTSIDE,
     )
 
@@ -124,6 +149,41 @@ SURROUNDING_ROWS = (
             f"rotation vector from the body to the motion capture's axes, {direction}",
         )
         for axis, direction in _AXES.items()
+    ),
+    *(
+        _frame(
+            f"autopilot_tilt_{axis}",
+            "rad",
+            f"rotation vector from the body's axes to the autopilot's, {direction}",
+            "how the autopilot is mounted; PX4 SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF",
+            prior_sd=0.02,
+        )
+        for axis, direction in (("x", "forward"), ("y", "left"))
+    ),
+    *(
+        _factor(
+            f"gyro_scale_{axis}",
+            f"what the gyro reads over the body rate about {direction}",
+            "sensitivity of MEMS gyros, by their data sheets off by a percent or two",
+            group="gyro_scale",
+            bounds=1.2,
+            prior_sd=0.01,
+        )
+        for axis, direction in _AXES.items()
+    ),
+    *(
+        _factor(
+            f"rate_gain_{axes}",
+            f"P, I and D of the rate controller about {words} over those of its file",
+            f"PX4 {parameter}; parameters that are not those of the flight",
+            group="rate_gain",
+            bounds=2.0,
+            prior_sd=0.1,
+        )
+        for axes, words, parameter in (
+            ("roll_pitch", "roll and pitch", "MC_ROLLRATE_K, MC_PITCHRATE_K"),
+            ("yaw", "yaw", "MC_YAWRATE_K"),
+        )
     ),
     # what a recording may get wrong by a constant
     _of_flight(

@@ -31,13 +31,14 @@ def _effect(
     informed_by: str | None = None,
     stands_in: bool = False,
     reads: str = "",
+    neutral: float = 0.0,
 ) -> Coefficient:
-    """Return the row of an effect that vanishes at zero and is searched between ±limit.
+    """Return the row of an effect that is searched within a limit about its neutral value.
 
     ``gazebo`` and ``px4`` are where SDF and PX4 hold it, or why they do not.
     """
     held = {
-        target: entry if isinstance(entry, Written) else NotCarried(entry, 0.0)
+        target: entry if isinstance(entry, Written) else NotCarried(entry, neutral)
         for target, entry in (("sdf", gazebo), ("px4", px4))
     }
     return Coefficient(
@@ -47,12 +48,12 @@ def _effect(
         source=source,
         place=(EFFECTS, name),
         scale="linear",
-        bounds=(-limit, limit),
+        bounds=(neutral - limit, neutral + limit),
         prior_sd=prior_sd,
         step=step,
         mass_exponent=mass_exponent,
         length_exponent=length_exponent,
-        neutral=0.0,
+        neutral=neutral,
         group=group,
         stands_in=stands_in,
         reads=reads,
@@ -143,6 +144,19 @@ EFFECT_ROWS = (
         gazebo="the motor plugins know no drag of the body",
         px4="the SIH model's drag is linear in the velocity",
         informed_by="speed",
+    ),
+    _effect(
+        "thrust_exponent",
+        "",
+        "power of the rotor speed with which thrust and drag torque grow, about the hover's",
+        "thrust stands: blades at low Reynolds numbers, or that bend",
+        group="thrust_exponent",
+        limit=0.7,
+        prior_sd=0.05,
+        step=0.05,
+        neutral=2.0,
+        gazebo="the motor plugins' thrust goes with the squared rotor speed",
+        px4="the SIH model's thrust goes with the command",
     ),
     _effect(
         "thrust_inflow_coefficient",

@@ -172,6 +172,13 @@ MADE = {
         {"share": -0.09},
         ("force_z", "rotor_speed", "motor_constant", "input_scaling"),
     ),
+    Code.TERM_SHOWS: Finding(
+        Code.TERM_SHOWS,
+        "warning",
+        "thrust_exponent",
+        {"thrust_exponent": 1.93, "thrust_exponent_error": 0.004},
+        ("thrust_exponent",),
+    ),
     Code.ROTOR_CHANGED: Finding(
         Code.ROTOR_CHANGED,
         "warning",

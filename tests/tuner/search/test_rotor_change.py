@@ -8,7 +8,7 @@ import pytest
 
 from tuner.config import Options, settle
 from tuner.findings.findings import Code
-from tuner.job.run import _prepared
+from tuner.job.run import prepared
 from tuner.recordings.flight import Series
 from tuner.search.job_flights import read_recordings
 from tuner.search.rotor_change import WINDOW, change_of, used_up_to_changes
@@ -82,7 +82,7 @@ def test_a_job_uses_a_flight_up_to_the_change(flown, monkeypatch):
     assert circle.flight.duration > BROKEN + 5.0
     broken = replace(circle, flight=weakened(circle.flight, settings.vehicle, 0.05))
     monkeypatch.setattr("tuner.job.run.read_usable", lambda _: ((broken, *others), ()))
-    job, findings = _prepared(settings)
+    job, findings = prepared(settings)
     (finding,) = [finding for finding in findings if finding.code is Code.ROTOR_CHANGED]
     assert (finding.subject, finding.names) == (circle.flight.name, ("front right",))
     cut = next(flight for flight in job.flights if flight.name == circle.flight.name)

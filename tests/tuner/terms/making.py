@@ -11,6 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim_jax.inlet import BodyRateInlet
+from sim_jax.vector import Vec3
 from tests.tuner.uncertainty.making import (
     FLIGHTS,
     NOISE,
@@ -22,7 +24,9 @@ from tests.tuner.uncertainty.making import (
 )
 from tuner.config import JobFile
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.normal import with_conditions
+from tuner.objective.flight import SETPOINTS
+from tuner.objective.flown import fly
+from tuner.objective.normal import Objective, with_conditions
 from tuner.objective.space import space_of
 from tuner.recordings.flight import InitialState
 from tuner.search.estimation import free_offsets
@@ -47,16 +51,22 @@ def unfitted_with(
     job: JobFile | None = None,
     tilt: tuple[float, float] = (0.0, 0.0),
     around: Mapping[str, Sequence[float]] | None = None,
+    effects: Mapping[str, float] | None = None,
+    setpoints: bool = False,
 ) -> tuple[Job, Fitted]:
     """Return a job whose flights were flown with some drag of the body, and its start as a fit.
 
     Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
-    each of them.
+    each of them, and ``effects`` what flew instead of the drag. With ``setpoints`` those of rate
+    and thrust are fed in, as control without these effects asks for them.
     """
-    truth = problem((*BASE, "fuselage_drag"))
+    there = {"fuselage_drag": drag} if effects is None else dict(effects)
+    truth = problem((*BASE, *there))
+    if setpoints:
+        truth = fed_with_setpoints(truth)
     vector = truth.space.vector_of(
         dict(zip(truth.space.names, [p.initial for p in truth.space.parameters], strict=True))
-        | {"fuselage_drag": drag}
+        | there
     )
     names = tuple(around or ())
     flown, point = with_conditions(truth, truth.start(vector), names)
@@ -71,7 +81,7 @@ def unfitted_with(
         SimpleNamespace(
             flight=SimpleNamespace(name=name, initial=hovering(tilt), has=lambda _: False),
             holdout=False,
-            inlet="reference",
+            inlet="body_rate" if setpoints else "reference",
             time_offset=0.0,
         )
         for name in FLIGHTS
@@ -81,6 +91,22 @@ def unfitted_with(
     )
     made = Job(settings, recordings, NOISE, space, objective)
     return made, fitted_of(objective, objective.start(space.initial))
+
+
+def fed_with_setpoints(objective: Objective) -> Objective:
+    """Return a problem whose flights enter by the set-points that its own control asks for."""
+    segments = objective.segments
+    flown = fly(
+        objective.model,
+        segments,
+        objective.schedule,
+        samples=objective.samples,
+        limits=objective.limits,
+        channels=(SETPOINTS,),
+    )
+    rows = jnp.asarray(np.moveaxis(flown.channels[SETPOINTS], 0, -1))
+    inlet = BodyRateInlet(Vec3(rows[:, 0], rows[:, 1], rows[:, 2]), rows[:, 3])
+    return replace(objective, segments=replace(segments, inlet=inlet))
 
 
 def hovering(tilt: tuple[float, float], heading: float = 0.4) -> InitialState:

@@ -1,0 +1,54 @@
+"""Terms of autopilot and thrust law: found where they flew, with intervals that hold, else not."""
+
+import pytest
+
+from tests.tuner.terms.making import BASE, job_with
+from tests.tuner.uncertainty.making import FLIGHTS
+from tuner.terms import search_with_terms
+from tuner.terms.search_with_terms import with_terms_selected
+from tuner.uncertainty.examination import examine
+from tuner.vehicle import term_groups
+
+TRUTH = {
+    "thrust_exponent": 1.93,
+    "autopilot_tilt_x": 0.015,
+    "autopilot_tilt_y": -0.02,
+    "gyro_scale_x": 1.01,
+    "gyro_scale_y": 0.985,
+    "gyro_scale_z": 1.015,
+    "rate_gain_roll_pitch": 1.05,
+    "rate_gain_yaw": 0.93,
+}
+GROUPS = {
+    group: names for group, names in term_groups().items() if set(names) <= set(TRUTH)
+}  # fmt: skip
+
+
+def selected(monkeypatch, **given):
+    """Return the selection among these terms alone, which makes it cheap."""
+    monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: GROUPS)
+    monkeypatch.setattr(search_with_terms, "groups_around", lambda *_, **__: {})
+    fit = job_with(0.0, seed=0, **given)
+    return with_terms_selected(*fit, lambda *_: None, lambda _: None)
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("setpoints", [False, True], ids=["reference", "setpoints"])
+def test_they_are_found_where_they_flew_and_their_intervals_hold_the_truth(monkeypatch, setpoints):
+    result = selected(monkeypatch, effects=TRUTH, setpoints=setpoints)
+    assert {row.group for row in result.rows if row.kept} == set(GROUPS)
+    known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
+    base = result.job.space.values(result.job.space.initial)
+    for name in (*BASE, *TRUTH):
+        low, high = known[name].ci95
+        assert low < TRUTH.get(name, float(base[name])) < high, name
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize("setpoints", [False, True], ids=["reference", "setpoints"])
+def test_none_is_found_where_none_flew(monkeypatch, setpoints):
+    result = selected(monkeypatch, effects={}, setpoints=setpoints)
+    assert len(result.rows) == len(GROUPS)
+    assert not any(row.kept for row in result.rows)
