@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
+from benchmarks.lab_effects import NOTHING, Effect, controller_with, inlet_with, logged_speeds
+from sim_jax.autopilot import gyro_rate
 from sim_jax.constants import GRAVITY
 from sim_jax.disturbance import Disturbance
 from sim_jax.environment import Environment
@@ -28,6 +30,7 @@ from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover
 from sim_jax.trim import in_trim
+from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.disk import write_text
 from tuner.core.shipped import find_config
@@ -35,7 +38,7 @@ from tuner.evaluate.simulate import Simulation
 from tuner.evaluate.write import write_bag
 from tuner.objective.trajectory import Published, published
 from tuner.vehicle import ControllerFile, VehicleFile, read_vehicle, term_groups, with_values
-from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed
+from tuner.vehicle.model import Model, model_of, schedule_of, vehicle_of, with_terms_computed
 
 Numbers = NDArray[np.float64]
 
@@ -83,6 +86,8 @@ class Lab:
         Whether the air moves.
     sees_markers
         Whether its position and attitude controllers see the motion capture's frame.
+    effect
+        What a fit may not know of it.
     """
 
     vehicle: VehicleFile
@@ -91,10 +96,11 @@ class Lab:
     drain: float
     gusts: bool
     sees_markers: bool = False
+    effect: Effect = NOTHING
 
 
-def drawn(seed: int) -> Lab:
-    """Return the laboratory of a seed; every other one has gusts."""
+def drawn(seed: int, effect: Effect = NOTHING) -> Lab:
+    """Return the laboratory of a seed, with an effect; every other one has gusts."""
     random = np.random.default_rng(seed)
 
     def between(low: float, high: float, *, signed: bool = False) -> float:
@@ -147,22 +153,26 @@ def drawn(seed: int) -> Lab:
     }
     for group, coefficients in effects.items():
         values |= coefficients if has[group] else {}
-    vehicle = with_values(base, values)
+    vehicle = with_values(base, values | effect.values)
     battery = vehicle.battery.replace(reference_voltage=VOLTS)
     return Lab(
         vehicle=vehicle.replace(battery=battery),
-        groups=tuple(group for group, there in has.items() if there),
+        groups=(
+            *(group for group, there in has.items() if there),
+            *([effect.name] if effect.values else []),
+        ),
         resistance=between(0.006, 0.012),
         drain=between(2e-4, 6e-4),
         gusts=bool(seed % 2),
         sees_markers=has["marker_offset"] and bool(random.random() < 0.5),
+        effect=effect,
     )
 
 
 def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
     """Fly all trajectories, and write a recording of each beside the laboratory's job file."""
     random = np.random.default_rng([seed, 1])
-    controller = ControllerFile()
+    controller = controller_with(lab.effect, ControllerFile())
     fine = controller.replace(
         physics=controller.physics.replace(rate=float(PHYSICS)),
         sensing=controller.sensing.replace(sees_markers=lab.sees_markers),
@@ -174,10 +184,11 @@ def write(lab: Lab, folder: Path, *, seed: int) -> list[Path]:
     ]
     air = _air(lab, random, schedule) if lab.gusts else None
     model = with_terms_computed(model_of(lab.vehicle, fine), _all_terms())
+    references = inlet_with(lab.effect, _references(sent))
     volts = np.full((round(SECONDS * schedule.position_control_rate) + 2, len(sent)), VOLTS)
     for _ in range(SAGS):
         during = 0.5 * (volts + np.roll(volts, -1, axis=0))  # a tick, which takes one value
-        flown = _flier(schedule)(model, _references(sent), jnp.log(during / VOLTS), air)
+        flown = _flier(schedule)(model, references, jnp.log(during / VOLTS), air)
         volts = _voltage(lab, flown, len(volts))
     if bool(jnp.isfinite(flown.crash_time).any()):
         raise SystemExit(f"the vehicle of seed {seed} crashed")
@@ -304,12 +315,15 @@ def _measured(
     )
     true = Rotation.from_quat(signals["attitude"], scalar_first=True)
     turning = true.apply(np.cross(signals["body_rate"], offset))
+    gyro = gyro_rate(vehicle_of(lab.vehicle), Vec3.of(jnp.asarray(signals["body_rate"].T)))
     noise = Rotation.from_rotvec(TURNED * random.normal(size=(len(signals["lap"]), 3)))
     measured = {
         **signals,
         "position": signals["position"] + true.apply(offset),
         "velocity": signals["velocity"] + lab.sees_markers * turning,
         "attitude": (true * Rotation.from_rotvec(tilt) * noise).as_quat(scalar_first=True),
+        "body_rate": np.asarray(gyro.stacked()).T,
+        "rotor_speed": logged_speeds(lab.effect, signals["rotor_speed"], RATE),
     }
     for name, deviation in NOISE.items():
         measured[name] = measured[name] + deviation * random.normal(size=measured[name].shape)

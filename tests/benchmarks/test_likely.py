@@ -24,7 +24,7 @@ def test_the_truth_is_as_likely_as_the_fit_but_for_what_noise_buys(seed, tmp_pat
     monkeypatch.setattr(lab_flights, "METER", 0.0)
     monkeypatch.setattr(lab_flights, "PHYSICS", ControllerFile().physics.rate)
     lab = lab_flights.drawn(seed)
-    selected = searched(job_at(lab, tmp_path, seed=seed), tmp_path)
+    selected = searched(job_at(lab, tmp_path, seed=seed)[0], tmp_path)
     fitted, space = selected.fitted, selected.fitted.objective.space
     found = {row.group for row in selected.rows if row.kept}
     assert found == set(lab.groups)

@@ -1,0 +1,189 @@
+"""Effects of laboratories that a fit may not know: one is drawn for two laboratories of three.
+
+The first have terms in the registry; the others none, and are flown here by a changed loop or
+recorded otherwise than they were.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from sim_jax.inlet import ReferenceInlet, Stages, Step
+from sim_jax.numeric import Scalar
+from sim_jax.plant import Plant
+from sim_jax.state import State
+from sim_jax.trees import replaced
+from sim_jax.vehicle import PerRotor
+from tuner.vehicle import ControllerFile
+
+Numbers = NDArray[np.float64]
+
+KNOWN = ("thrust_exponent", "rate_gain", "autopilot_tilt", "gyro_scale")
+"""Groups of terms."""
+UNKNOWN = (
+    "second_lag",
+    "rotor_damage",
+    "filtered_speeds",
+    "translational_lift",
+    "integral_gain",
+    "gyro_filter",
+)
+CHOICE = os.environ.get("TUNE_LAB_EFFECT", "drawn")
+"""An effect's name for all laboratories, ``none``, or ``drawn``."""
+ROTORS = 4
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What a laboratory has that a fit may not know.
+
+    Attributes
+    ----------
+    name
+        Of `KNOWN` or `UNKNOWN`; empty for nothing.
+    values
+        Coefficients of the registry.
+    size
+        Of what is in no row: s of a second lag of the motors; share of its thrust that a rotor
+        loses; s of the filter through which rotor speeds went before they were logged; gain of
+        thrust per squared air velocity across the rotors, s²/m²; factor on the controller file's
+        I, or on its gyro's cutoff.
+    rotor, flight, begin
+        Which rotor loses thrust, in which flight, from which s on.
+    """
+
+    name: str = ""
+    values: Mapping[str, float] = field(default_factory=dict)
+    size: float = 0.0
+    rotor: int = 0
+    flight: int = 0
+    begin: float = 0.0
+
+
+NOTHING = Effect()
+
+
+def effect_of(seed: int, *, seconds: float, flights: int) -> Effect:
+    """Return the effect of a laboratory whose fitted flights last so many seconds."""
+    random = np.random.default_rng([seed, 3])
+
+    def signed(low: float, high: float) -> float:
+        return float(random.choice([-1.0, 1.0]) * random.uniform(low, high))
+
+    has, name = random.random() < 2.0 / 3.0, str(random.choice([*KNOWN, *UNKNOWN]))
+    values = {
+        "thrust_exponent": {"thrust_exponent": 2.0 + signed(0.03, 0.1)},
+        "rate_gain": {
+            "rate_gain_roll_pitch": float(np.exp(signed(0.03, 0.1))),
+            "rate_gain_yaw": float(np.exp(signed(0.03, 0.1))),
+        },
+        "autopilot_tilt": {f"autopilot_tilt_{axis}": signed(0.006, 0.025) for axis in "xy"},
+        "gyro_scale": {f"gyro_scale_{axis}": float(np.exp(signed(5e-3, 0.02))) for axis in "xyz"},
+    }
+    sizes = {
+        "second_lag": random.uniform(0.003, 0.008),
+        "rotor_damage": random.uniform(0.03, 0.07),
+        "filtered_speeds": random.uniform(0.005, 0.02),
+        "translational_lift": random.uniform(0.002, 0.006),
+        "integral_gain": float(np.exp(signed(0.2, 0.5))),
+        "gyro_filter": float(np.exp(signed(0.2, 0.5))),
+    }
+    drawn = Effect(
+        name=name,
+        rotor=int(random.integers(ROTORS)),
+        flight=int(random.integers(flights)),
+        begin=float(random.uniform(0.4, 0.8) * seconds),
+    )
+    if CHOICE != "drawn":
+        has, name = CHOICE != "none", CHOICE
+    if not has:
+        return NOTHING
+    return Effect(
+        name, values.get(name, {}), sizes.get(name, 0.0), drawn.rotor, drawn.flight, drawn.begin
+    )
+
+
+def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
+    """Return the controller that flies, which is not the file's."""
+    if effect.name == "integral_gain":
+        axes = {name: getattr(file.rate, name) for name in ("roll", "pitch", "yaw")}
+        changed = {name: axis.replace(i=effect.size * axis.i) for name, axis in axes.items()}
+        return file.replace(rate=file.rate.replace(**changed))
+    if effect.name == "gyro_filter":
+        cutoff = effect.size * (file.filters.gyro_cutoff or 0.0)
+        return file.replace(filters=file.filters.replace(gyro_cutoff=cutoff))
+    return file
+
+
+class Beyond(ReferenceInlet):
+    """The loop with motors and rotors that no coefficient describes; what is None is not there."""
+
+    second_lag: Scalar | None = None
+    """s of a lag of first order before the motors' own."""
+    loss: Array | None = None
+    """(rotors, flights) of thrust and torque, from ``begin`` on."""
+    begin: Scalar | None = None
+    """s."""
+    lift: Scalar | None = None
+    """s²/m², by which thrust grows with the squared air velocity across the rotors."""
+
+    def next_rotor_speeds(
+        self, stages: Stages, state: State, step: Step
+    ) -> tuple[PerRotor, PerRotor]:
+        assert isinstance(stages, Plant)
+        if self.second_lag is not None:
+            history = _lagged(state.reference_history, step, stages.schedule.step / self.second_lag)
+            state = replaced(state, reference_history=history)
+        speeds, acting = stages.motors(state, step)
+        if self.lift is not None:
+            through = state.motion.attitude.to_body(state.motion.velocity)
+            factor = jnp.sqrt(1.0 + self.lift * (through.x * through.x + through.y * through.y))
+            acting = tuple(factor * speed for speed in acting)
+        if self.loss is not None:
+            lost = jnp.where(step * stages.schedule.step >= self.begin, self.loss, 0.0)
+            acting = tuple(jnp.sqrt(1.0 - lost[i]) * speed for i, speed in enumerate(acting))
+        return speeds, acting
+
+
+def _lagged(history: Array | None, step: Step, steps: Scalar) -> Array:
+    """Return a delay line of held references as a lag of so many steps' inverse leaves them."""
+    assert history is not None
+    length = len(history)
+    ages = jnp.arange(length)
+    order = jnp.mod(step - ages, length)
+    apart = ages[None, :] - ages[:, None]
+    weight = jnp.where(apart >= 0, jnp.exp(-jnp.abs(apart) * steps), 0.0)
+    weight = weight / weight.sum(axis=1, keepdims=True)
+    return history.at[order].set(jnp.tensordot(weight, history[order], axes=1))
+
+
+def inlet_with(effect: Effect, inlet: ReferenceInlet) -> ReferenceInlet:
+    """Return the loop's inlet with what no coefficient describes."""
+    parts = (inlet.points, inlet.spins, inlet.yaw_rate, inlet.level_held)
+    size = jnp.asarray(effect.size)
+    if effect.name == "second_lag":
+        return Beyond(*parts, second_lag=size)
+    if effect.name == "translational_lift":
+        return Beyond(*parts, lift=size)
+    if effect.name == "rotor_damage":
+        loss = np.zeros((ROTORS, len(inlet.spins)))
+        loss[effect.rotor, effect.flight] = effect.size
+        return Beyond(*parts, loss=jnp.asarray(loss), begin=jnp.asarray(effect.begin))
+    return inlet
+
+
+def logged_speeds(effect: Effect, speeds: Numbers, rate: float) -> Numbers:
+    """Return rotor speeds (n, rotors) as they were filtered before they were logged."""
+    if effect.name != "filtered_speeds":
+        return speeds
+    keep = np.exp(-1.0 / rate / effect.size)
+    settled = speeds[:1] * keep
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], speeds, axis=0, zi=settled)[0])
