@@ -104,7 +104,7 @@ def lifting(vehicle: Vehicle) -> Callable[[Scalar], Scalar]:
 
     Ω²·(Ω/Ω_h)^(thrust_exponent - 2): blades at low Reynolds numbers, or that bend, lift by another
     power of the speed than the second. At Ω_h, at which equal rotors carry the weight, motor
-    constant and hover are what they are without. The power is that to two parts in a thousand from a
+    constant and hover are what they are without. The power is right to two thousandths from a
     third of Ω_h to twice it, by approximants that cost a tenth: ln x by 3(x² - 1)/(x² + 4x + 1),
     the exponential by Padé's of second order. Source: thrust stands; Bangura and Mahony, "Nonlinear
     dynamic modeling for high performance control of a quadrotor", 2012, 3.2.

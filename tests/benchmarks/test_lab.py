@@ -1,5 +1,6 @@
 """The drawn laboratories are ones that fly, and the table of their fits counts right."""
 
+from collections import Counter
 from dataclasses import dataclass
 from types import SimpleNamespace
 
@@ -7,14 +8,16 @@ import numpy as np
 import pytest
 
 from benchmarks import lab as laboratory
+from benchmarks import lab_effects, lab_flights
 from benchmarks.lab import Trial, _rows, _voltages, section
-from benchmarks.lab_flights import METER, drawn
+from benchmarks.lab_effects import KNOWN, UNKNOWN, effect_of
+from benchmarks.lab_flights import METER, SECONDS, drawn
 from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
 from tuner.objective.battery import VOLTAGE
 from tuner.recordings.flight import Series
 from tuner.uncertainty.records import ErrorParts
-from tuner.vehicle import term_groups, values_of
+from tuner.vehicle import COEFFICIENTS, term_groups, values_of
 
 SEEDS = range(8)
 
@@ -39,6 +42,42 @@ def test_laboratories_differ_in_what_they_have():
         assert there == set(lab.groups)
 
 
+def test_two_laboratories_of_three_have_an_effect_and_all_effects_are_drawn():
+    effects = [effect_of(seed, seconds=SECONDS, flights=3) for seed in range(300)]
+    names = Counter(effect.name for effect in effects)
+    assert set(names) == {"", *KNOWN, *UNKNOWN}
+    assert 80 < names[""] < 120
+    for effect in effects:
+        assert bool(effect.values) == (effect.name in KNOWN)
+        assert bool(effect.size) == (effect.name in UNKNOWN)
+    assert set(KNOWN) <= set(term_groups())
+    assert not set(UNKNOWN) & set(COEFFICIENTS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", UNKNOWN)
+def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_path, name):
+    """And nothing in them before a rotor is damaged."""
+    monkeypatch.setattr(lab_effects, "CHOICE", name)
+    monkeypatch.setattr(lab_flights, "PHYSICS", 400)
+    monkeypatch.setattr(lab_flights, "SAGS", 1)
+    effect = effect_of(0, seconds=SECONDS, flights=3)
+    flown = []
+    monkeypatch.setattr(lab_flights, "write_bag", lambda simulation, _: flown.append(simulation))
+    for lab in (drawn(0), drawn(0, effect)):
+        lab_flights.write(lab, tmp_path, seed=0)
+    pairs = list(zip(flown[:4], flown[4:], strict=True))
+    moved = [
+        np.abs(after.signals["rotor_speed"] - before.signals["rotor_speed"]).max(axis=1)
+        for before, after in pairs
+    ]
+    assert max(part.max() for part in moved) > 1.0
+    if name == "rotor_damage":
+        early = pairs[effect.flight][0].time < effect.begin
+        assert moved[effect.flight][early].max() < 1e-6
+        assert all(part.max() < 1e-6 for i, part in enumerate(moved) if i != effect.flight)
+
+
 def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     lab = drawn(0)
     true = values_of(lab.vehicle)["motor_constant"]
@@ -46,7 +85,9 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     def trial(error, half):
         value, off = true * (1.0 + error), half * true
         parts = ErrorParts(noise=0.1 * off, residuals=0.2 * off, left_out=0.5 * off, terms=off)
-        estimate = SimpleNamespace(value=value, ci95=(value - off, value + off), parts=parts)
+        estimate = SimpleNamespace(
+            value=value, std_error=off / 2.0, ci95=(value - off, value + off), parts=parts
+        )
         return Trial(lab, (), {"motor_constant": estimate}, {"motor_constant": 0.5}, 1.0)
 
     trials = [trial(0.02, 0.03), trial(0.04, 0.01)]  # half as wide, the first would hold no longer
@@ -62,6 +103,8 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     )
     assert "1 of 2 that are twice the oracle's" in part.text
     assert "In gusts" not in part.text
+    by_effect = "| none |  | 2 |  | 1 of 2 | 1 (motor_constant) | motor_constant +8.0 |  |"
+    assert by_effect in part.text.splitlines()
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ import pytest
 from sim_jax.constants import GRAVITY
 from sim_jax.control.position import ReferencePoint
 from sim_jax.inlet import ReferenceInlet
-from sim_jax.markers import Markers, markers_of, rotation
-from sim_jax.numeric import GRAVITY
+from sim_jax.markers import Markers, markers_of
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import rollout
 from sim_jax.rotation import Quaternion, rotation
