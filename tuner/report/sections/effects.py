@@ -8,58 +8,22 @@ import numpy as np
 
 from tuner.report.chart import Chart, Heat, Panel
 from tuner.report.contents import Contents
-from tuner.report.section import Section, Table
-from tuner.uncertainty.sensitivity_json import Knowledge, OutputSensitivity
+from tuner.report.section import Section
+from tuner.uncertainty.sensitivity_json import Knowledge
 
 FAINTEST = 1e-4
 """Changes smaller than this share of the present RMSE are drawn as this."""
 
 
 def effects(contents: Contents) -> Section | None:
-    """Return heat maps of the change for +1 %, and the RMSE for ±10 %."""
+    """Return heat maps of the change for +1 %."""
     knowledge = contents.knowledge
     if knowledge is None or not knowledge.outputs:
         return None
     names = [name for name in knowledge.coefficients if name in knowledge.outputs[0].change]
-    channels = [c for c in knowledge.channels if _of(knowledge, c)]
-    units = {channel: _of(knowledge, channel)[0].unit for channel in channels}
-    now = [
-        f"{_words(c)} {_number(_together([o.rmse for o in _of(knowledge, c)]))} {units[c]}"
-        for c in channels
-    ]
-    rows = [
-        (
-            name,
-            *(
-                f"{_number(_together([o.rmse_down[name] for o in _of(knowledge, c)]))} / "
-                f"{_number(_together([o.rmse_up[name] for o in _of(knowledge, c)]))}"
-                for c in channels
-            ),
-        )
-        for name in names
-    ]
-    columns = ("coefficient", *(f"{_words(c)} [{units[c]}]" for c in channels))
-    table = Table(columns, rows, words=("coefficient",), fold="RMSE for −10 % / +10 % of each")
     charts = (_by_signal(knowledge, names), *_over_time(knowledge, names))
-    note = (
-        "RMSE for −10 % / +10 % of one coefficient, the others unchanged, over all axes and "
-        f"flights of a channel; now: {', '.join(now)}."
-    )
-    return Section(
-        "effects", "Local sensitivity", tables=(table,), charts=charts, note=note, folded=True
-    )
-
-
-def _words(channel: str) -> str:
-    return channel.replace("_", " ")
-
-
-def _number(value: float | None) -> str:
-    return "crash" if value is None else f"{value:.3g}"
-
-
-def _of(knowledge: Knowledge, channel: str) -> list[OutputSensitivity]:
-    return [output for output in knowledge.outputs if output.channel == channel]
+    note = "The RMSE for −10 % and +10 % of each coefficient is in sensitivity.csv."
+    return Section("effects", "Local sensitivity", charts=charts, note=note, folded=True)
 
 
 def _together(rmse: Sequence[float | None]) -> float | None:

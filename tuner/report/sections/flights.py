@@ -43,8 +43,8 @@ PER_AXIS = {axis: (1e3, "mm") if unit == "m" else (1.0, "°") for axis, unit in 
 """Axis -> what its RMSE is multiplied by for a table, and the unit then."""
 WORSE = 1.05
 """Times the error before beyond which it is marked as worse."""
-SMALLEST = 1e-6
-"""Errors below this are drawn as this on a logarithmic axis."""
+SMALLEST = 1e-3
+"""Errors below this, mm or degrees, are drawn as this on a logarithmic axis."""
 TIME = "time since the mission's start [s]"
 PREFIX = "acting_"
 CLOCK = "time"
@@ -139,7 +139,7 @@ def _over_time(name: str, title: str, quantity: str, arrays: Mapping[str, Array]
 
 def _errors(name: str, title: str, arrays: Mapping[str, Array]) -> Chart:
     panels = []
-    for quantity, (_, unit) in QUANTITIES.items():
+    for quantity, scale, unit in (("position", 1e3, "mm"), ("attitude", 1.0, "°")):
         time = rounded(arrays[f"{quantity}_time"], 3)
         curves = []
         for which, (suffix, look) in CURVES.items():
@@ -148,8 +148,8 @@ def _errors(name: str, title: str, arrays: Mapping[str, Array]) -> Chart:
             error = arrays[quantity + suffix] - arrays[quantity]
             if quantity == "attitude":
                 error = (error + 180.0) % 360.0 - 180.0
-            size = np.maximum(np.linalg.norm(error, axis=1), SMALLEST)
-            curves.append(Line(which, time, rounded(size, 6), look))
+            size = np.maximum(scale * np.linalg.norm(error, axis=1), SMALLEST)
+            curves.append(Line(which, time, rounded(size, 4), look))
         panels.append(Panel(curves, y_title=f"{quantity} [{unit}]", y_scale="log"))
     return Chart(f"{name}_error", f"{title}: error over time", panels, x_title=TIME, height=420)
 
