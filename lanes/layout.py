@@ -200,11 +200,10 @@ class Layout:
     def _results(self, lower: Lowering, frame: _Frame) -> list[Memory]:
         """Return the memory of each result, where each lane writes its own part."""
         b = lower.b
-        is_first = constant(BOOL, 0)
+        is_first, nowhere = constant(BOOL, 0), constant(I64, 0)
         for turn in frame.turn:
             is_first = b.or_(is_first, b.icmp_signed("==", turn, constant(I64, 0)))
         memories = []
-        nowhere = ir.Constant(I64, 0)
         for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
             if moved:
                 in_loop = is_laid_by_loop(shape, self.lengths)
@@ -222,6 +221,7 @@ class Layout:
                 stride, *rest = lower.row_major((0, *shape.shape))
                 strides = tuple(rest)
                 begins = [b.mul(segment, stride) for segment in frame.segment]
+            is_wanted = b.icmp_unsigned("!=", b.ptrtoint(pointer, I64), nowhere)
             storage = Storage(
                 pointer,
                 type_of(shape.dtype),
@@ -231,9 +231,7 @@ class Layout:
                 column_stride=constant(I64, 1) if moved else None,
                 scattered=begins,
                 writable=True,
-                guard=None
-                if moved
-                else b.and_(is_first, b.icmp_unsigned("!=", b.ptrtoint(pointer, I64), nowhere)),
+                guard=is_wanted if moved else b.and_(is_first, is_wanted),
             )
             memories.append(Memory(storage, tuple(shape.shape)))
         return memories

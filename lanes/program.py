@@ -367,7 +367,7 @@ class _Compiled:
         )
         found: list[Any] = []
         for shape, moved, is_wanted in zip(self.outputs, self.moved, asked, strict=True):
-            if not (moved or is_wanted):
+            if not is_wanted:
                 found.append(None)
                 continue
             own = tuple(sizes.get(n, n) for n in shape.shape)
@@ -407,7 +407,7 @@ class _Compiled:
         structure = self.structure.children()[0]
         by_column = [
             None
-            if not moved
+            if not moved or array is None
             else array
             if is_laid_by_loop(shape, self.lengths)
             else joined(array, columns)

@@ -126,9 +126,9 @@ def test_what_is_not_wanted_is_not_returned_and_changes_nothing(program):
     values, moved = given(5, 8)
     whole = program(values, moved, lanes=5, turns=8)
     wanted = jax.tree.map(lambda _: True, (whole.values, whole.columns))
-    wanted[0][0]["high"] = wanted[0][0]["twice"] = False
+    wanted[0][0]["high"] = wanted[0][0]["twice"] = wanted[1][0]["state"] = False
     some = program(values, moved, lanes=5, turns=8, wanted=wanted)
-    assert some.values[0]["high"] is None
+    assert some.values[0]["high"] is some.columns[0]["state"] is None
     np.testing.assert_array_equal(some.values[0]["state"], whole.values[0]["state"])
     np.testing.assert_array_equal(some.columns[0]["twice"], whole.columns[0]["twice"])
 

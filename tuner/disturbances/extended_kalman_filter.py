@@ -54,6 +54,8 @@ GATE = 4.0
 """Standard deviations beyond which an innovation corrects no further: an outlier."""
 WIDER = 4.0
 """Times, each innovation in a row that lies beyond."""
+AT_ONCE = 6
+"""Columns of derivatives in one pass over a block of segments."""
 WIDEST = 5
 """In a row beyond which the gate grows no further."""
 
@@ -196,11 +198,12 @@ def innovations(
     """
     static = _Static("innovations", _undelayed(simulator), 0, moves=directions is not None)
     moved = None if directions is None else _tangents(expected, np.asarray(directions, float))
-    run = _run(_given(feed, expected, gains), static, moved)
-    white = np.moveaxis(run.values, 0, -1)
+    wanted = (True, False) if moved is None else ((True, False), (False, True))
+    run = _run(_given(feed, expected, gains), static, moved, wanted)
+    white = np.moveaxis(run.values[0], 0, -1)
     if directions is None:
         return white, np.zeros((0, *white.shape))
-    by_pass = np.moveaxis(run.columns, (2, -1, 0), (0, 1, -1))
+    by_pass = np.moveaxis(run.columns[1], (2, -1, 0), (0, 1, -1))
     return white, by_pass.reshape(-1, *by_pass.shape[2:])
 
 
@@ -278,7 +281,7 @@ def _run(
     given: _Given,
     static: _Static,
     tangents: list[NDArray[np.float64]] | None = None,
-    wanted: _Told | None = None,
+    wanted: Any = None,
 ) -> Run:
 
     def table(leaf: Any) -> Argument:
@@ -322,7 +325,9 @@ def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> P
     def function(given: _Given, lengths: Mapping[str, int]) -> Any:
         return flown(given, static, lengths["turns"])
 
-    return Program(function, jax.tree.unflatten(structure, leaves), name=static.kind, at_once=6)
+    return Program(
+        function, jax.tree.unflatten(structure, leaves), name=static.kind, at_once=AT_ONCE
+    )
 
 
 def _observer(given: _Given, static: _Static) -> tuple[Observer, State]:
@@ -401,15 +406,18 @@ def _filter(given: _Given, static: _Static, ticks: int) -> _Told:
     return told
 
 
-def _innovations(given: _Given, static: _Static, ticks: int) -> Array:
-    """Fly one segment with gains that are given: its whitened innovations (ticks, m)."""
+def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Array]:
+    """Fly one segment with gains that are given: its whitened innovations (ticks, m).
+
+    And the same in single precision, of which derivatives are taken: they take most of the memory.
+    """
     assert given.gains is not None
     observer, first = _observer(given, static)
     gains, factors = given.gains.gain, given.gains.factors
     wide, size = gains.shape[1:]
     in_flight = commands_in_flight(first, size - COUNT)
 
-    def tick(carried: Any, number: Array) -> tuple[Any, Array]:
+    def tick(carried: Any, number: Array) -> tuple[Any, tuple[Array, Array]]:
         state, pushed, before, beyond = carried
         read = row_of(given.samples, number)
         error = jnp.concatenate(observer.errors(observer.seen(state, number), before, read))
@@ -437,8 +445,9 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> Array:
         pushed = pushed + change[-COUNT:]
         before = observer.seen(state, number)
         after = observer.next(state, pushed, number)
-        return (after, pushed * observer.processes.keeps, before, beyond), white
+        carried = after, pushed * observer.processes.keeps, before, beyond
+        return carried, (white, white.astype(jnp.float32))
 
     begin = first, jnp.zeros(COUNT), observer.seen(first, jnp.asarray(0)), jnp.zeros(wide, int)
-    white_rows: Array = lax.scan(tick, begin, jnp.arange(ticks))[1]
-    return white_rows
+    rows: tuple[Array, Array] = lax.scan(tick, begin, jnp.arange(ticks))[1]
+    return rows
