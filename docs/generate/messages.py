@@ -95,6 +95,8 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "position and attitude controllers that see that frame, or with controllers that see the "
     "centre of mass and the body's axes, other than the controller file has it; it was simulated "
     "so. Set sensing.sees_markers in the controller file.",
+    Code.FLIGHT_NOT_FLOWN: "The fitted model does not fly this flight although it flies others; "
+    "the line says from when on, and whether the simulated position control is beyond its limit.",
     Code.LAW_LACKING: "Recorded accelerations hold a force or moment that the model does not; the "
     "line says along which axis, what it goes with, which coefficients it may have moved, whose "
     "intervals hold that, and which terms are of that kind.",

@@ -19,13 +19,14 @@ from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
 from tuner.objective.segments import CLOCKS, OFFSETS
-from tuner.recordings.flight import Flight
+from tuner.recordings.flight import Array, Flight
 from tuner.search.fitted import Fitted
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import with_conditions, with_offsets
 from tuner.search.loop import loop_of
 from tuner.search.problem import Job
 from tuner.vehicle import COEFFICIENTS, ControllerFile, VehicleFile, initial_values, with_values
+from tuner.vehicle.controller import PositionControl
 
 
 def controller_flown(job: Job, fitted: Fitted) -> ControllerFile:
@@ -246,6 +247,74 @@ def flights_worse(
                     Finding(Code.FLIGHT_WORSE, "warning", flight, numbers, (what, unit))
                 )
     return tuple(findings)
+
+
+ODD, FAR = 5.0, 0.05
+"""Times the middle of the others, and m, from which a flight's position RMSE stands out."""
+AT_LIMIT = 0.05
+"""Share of a flight by which the simulated one is longer at the limit of position control."""
+
+
+def flights_not_flown(job: Job, errors: Mapping[str, FlightErrors]) -> tuple[Finding, ...]:
+    """Return which flights the closed loop does not follow although it follows others.
+
+    With the time from which, and how long position control asks for more than its limit, in the
+    simulation and in the recording. Beyond that limit it leans on a loop that knows no way back: a
+    start that is off is forgotten in seconds, and a rotor that lifts a few percent less keeps a
+    fast flight there for good.
+
+    Parameters
+    ----------
+    job
+        Its flights, fitted ones and those held out, and its controller.
+    errors
+        Flight -> errors of a simulation with the fitted coefficients.
+    """
+    flown = {
+        r.flight.name: r.flight
+        for r in job.recordings
+        if INLETS[r.inlet].closed_loop
+        and not r.flight.spins_freely
+        and errors[r.flight.name].crash_time is None
+    }
+    lengths = {name: errors[name].length("position") for name in flown}
+    findings = []
+    for name, flight in flown.items():
+        others = [length for other, length in lengths.items() if other != name]
+        typical = float(np.median(others)) if len(others) > 1 else np.inf
+        if lengths[name] < max(ODD * typical, FAR):
+            continue
+        position = errors[name].position
+        away = np.linalg.norm(np.nan_to_num(position.error), axis=1) > max(ODD * typical, FAR)
+        numbers = {
+            "rmse": lengths[name],
+            "others": typical,
+            "seconds": float(position.time[int(np.argmax(away))]),
+        }
+        shares = [
+            _beyond_limit(flight, job.settings.controller.position, position.time, there)
+            for there in (position.simulated, position.recorded)
+        ]
+        if shares[0] > shares[1] + AT_LIMIT:
+            numbers |= {"beyond": shares[0], "beyond_recorded": shares[1]}
+        findings.append(Finding(Code.FLIGHT_NOT_FLOWN, "warning", name, numbers))
+    return tuple(findings)
+
+
+def _beyond_limit(flight: Flight, control: PositionControl, time: Array, position: Array) -> float:
+    """Return the share of a flight in which the feedback asked for is longer than its limit."""
+    asked = np.zeros_like(position)
+    for kind, gains, there in (
+        ("position", control.kp, position),
+        ("velocity", control.kv, np.gradient(position, time, axis=0)),
+    ):
+        series = flight.series.get(f"reference_{kind}")
+        if series is None:
+            return 0.0
+        wanted = [np.interp(time, series.time, column) for column in series.values.T]
+        asked += np.array(gains) * (np.column_stack(wanted) - there)
+    limit = control.max_feedback_acceleration
+    return float(np.mean(np.linalg.norm(asked, axis=1) > limit))
 
 
 def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:

@@ -173,6 +173,33 @@ def disturbances_followed(finding: Finding) -> str:
     )
 
 
+def flight_not_flown(finding: Finding) -> str:
+    """Return from when on the loop does not follow a flight, and whether it is at its limit."""
+    numbers = finding.numbers
+    limit = ""
+    if "beyond" in numbers:
+        limit = (
+            " Its position control asks for more than max_feedback_acceleration "
+            f"{percent(numbers['beyond'])} of the time, the recorded flight's "
+            f"{percent(numbers['beyond_recorded'])}: beyond that limit the loop does not come back."
+        )
+    return (
+        f"The fitted model does not fly this flight: position RMSE {numbers['rmse']:.2g} m, of the "
+        f"others {numbers['others']:.2g} m. It leaves the recorded one at t = "
+        f"{numbers['seconds']:.1f} s.{limit}"
+    )
+
+
+def flight_not_flown_remedy(finding: Finding) -> str:
+    """Return what to look at where the loop does not follow a flight."""
+    if "beyond" in finding.numbers:
+        return (
+            "Check position.max_feedback_acceleration in the controller file; at this speed a few "
+            "percent of thrust decide: fly it slower, and judge the fit by the other flights."
+        )
+    return "Look at what changes there: wind, damage, a reference or a controller that is another."
+
+
 def law_lacking(finding: Finding) -> str:
     """Return which law the model lacks, and whose intervals hold what it may have moved."""
     axis, feature, *moved = finding.names

@@ -329,6 +329,11 @@ class Code(Worded):
         composed.disturbances_followed,
         "",
     )
+    FLIGHT_NOT_FLOWN = (
+        "flight_not_flown",  # rmse, others (m), seconds; beyond, beyond_recorded (shares)?
+        composed.flight_not_flown,
+        composed.flight_not_flown_remedy,
+    )
     LAW_LACKING = (
         "law_lacking",  # share; names: axis, what it goes with, coefficients it moves
         composed.law_lacking,

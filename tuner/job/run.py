@@ -23,6 +23,7 @@ from tuner.design.proposals import LogProposal
 from tuner.evaluate.compare import table_of
 from tuner.evaluate.held_out import (
     Validation,
+    flights_not_flown,
     flights_worse,
     holding_better,
     validate,
@@ -278,6 +279,7 @@ def _of_flights(
     """
     return (
         *flights_worse(validation.initial, validation.best),
+        *flights_not_flown(job, validation.best),
         *holding_better(job, validation),
         *(inertia or turning_unexplained(job, validation.turning_explained)),
     )

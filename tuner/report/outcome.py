@@ -33,6 +33,8 @@ DOUBTS = frozenset(
         Code.MODEL_UNMATCHED,
         Code.FLIGHT_UNMATCHED,
         Code.FLIGHT_WORSE,
+        Code.FLIGHT_NOT_FLOWN,
+        Code.LAW_LACKING,
         Code.HOLDING_BETTER,
         Code.GROUND_CONFLICT,
         Code.BENCH_CONFLICT,

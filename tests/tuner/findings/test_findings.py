@@ -165,6 +165,12 @@ MADE = {
     ),
     Code.INPUT_LATE: Finding(Code.INPUT_LATE, "info", "a", {"seconds": 0.012}),
     Code.GYRO_OFFSET: Finding(Code.GYRO_OFFSET, "info", "a", {"rate": 0.01}, ("gyro_x",)),
+    Code.FLIGHT_NOT_FLOWN: Finding(
+        Code.FLIGHT_NOT_FLOWN,
+        "warning",
+        "a",
+        {"rmse": 0.29, "others": 0.011, "seconds": 12.5, "beyond": 0.5, "beyond_recorded": 0.01},
+    ),
     Code.LAW_LACKING: Finding(
         Code.LAW_LACKING,
         "warning",
