@@ -123,7 +123,7 @@ def _loss_at_start(job: Job, fitted: Fitted) -> float:
     objective, criterion = fitted.objective, fitted.criterion
     start = objective.start(job.space.initial)
     flight = np.asarray(objective.segments.flight)
-    sums = objective.sums(start, criterion)
+    sums = objective.sums(start, criterion, derivatives=False)
     loss, _, _ = normal_equations(objective.space, flight, start, criterion, sums)
     return float(loss)
 

@@ -226,20 +226,22 @@ def information_from_jacobian(
         time = np.asarray(objective.segments.measured[channel].time)
         scale = np.asarray(criterion.scale[channel])[np.asarray(objective.segments.flight)]
         for segment in range(segments):
-            rows = columns[..., segment] / scale[segment]
+            rows = (
+                np.moveaxis(columns[..., segment], 0, -1) / scale[segment]
+            )  # as it lies in memory
             error = residuals[..., segment] / scale[segment]
             robust = huber_weights(error, float(criterion.huber))
             stretch = np.minimum((time[:, segment] / block).astype(int), blocks - 1)
             for index in range(blocks):
                 inside = stretch == index
-                columns_inside = rows[:, inside].reshape(size, -1)
-                weighted = columns_inside * robust[inside].ravel()
-                information[number, segment, index] = weighted @ columns_inside.T
+                own = rows[inside].reshape(-1, size)
+                weighted = (own * robust[inside].reshape(-1, 1)).T
+                information[number, segment, index] = weighted @ own
                 score[number, segment, index] = weighted @ error[inside].ravel()
             for name, others in otherwise.items():
                 change = others[channel][..., segment] / scale[segment] - error
-                changes[name][segment] += rows.reshape(size, -1) @ (robust * change).ravel()
-            compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=0)
+                changes[name][segment] += (robust * change).ravel() @ rows.reshape(-1, size)
+            compared = (weight[..., segment] > 0) & np.any(rows != 0, axis=-1)
             if compared.any():
                 spread[number, segment] = np.mean((robust * error**2)[compared])
     flight = np.asarray(objective.segments.flight)
