@@ -122,7 +122,7 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     "flights is kept. Take these inertias for effective ones, and measure them on the ground "
     "(tune bench).",
     Code.DISTURBANCES_FOLLOWED: "The residuals hold more than noise, as gusts leave it, and a "
-    "Kalman filter follows what pushed the flights. Nothing to do.",
+    "Kalman filter estimates the disturbances. Nothing to do.",
     Code.FLIGHT_UNMATCHED: "The simulation does not match this flight, and its weight in the fit "
     "was lowered accordingly. Look at its figures: the controller, the clock, wind, damage or the "
     "vehicle may differ.",

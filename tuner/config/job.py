@@ -230,7 +230,7 @@ class JobFile(Section):
         left out are predicted worse, ``none`` adds none; else the groups, or coefficients, to add.
     disturbances
         ``follow`` fits once more where the residuals hold more than measurement noise and rate and
-        thrust set-points were recorded: a Kalman filter follows what pushed the flights, which
+        thrust set-points were recorded: an extended Kalman filter estimates the disturbances, which
         takes some minutes; of more than some four minutes of flight it is left to the intervals, as
         ``none`` leaves it. ``auto`` follows where the fit has chosen its terms, so that what is
         left is none of them.

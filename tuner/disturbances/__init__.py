@@ -1,4 +1,4 @@
-"""Filter error: coefficients estimated with what pushed the vehicle, which a Kalman filter follows.
+"""Filter error: coefficients and disturbances estimated together by an extended Kalman filter.
 
 Output error, simulated minus recorded, is efficient where measurement noise alone is left over. A
 gust that the closed loop turns into a slow wander of all signals moves its estimates. Here the

@@ -45,7 +45,7 @@ ASIDE = 0.25
 """Share of a tick by which a clock moves before samples are laid on ticks again: until then they
 are met by the straight line through the two ticks that they were laid between."""
 ENOUGH = 0.1
-"""Gain that a step promises, in half a unit of χ², below which it is not worth taking."""
+"""Predicted gain of a step, in half a unit of χ², below which it is not worth taking."""
 
 
 def with_least_innovations(

@@ -162,14 +162,14 @@ def inertia_balanced(finding: Finding) -> str:
 
 
 def disturbances_followed(finding: Finding) -> str:
-    """Return how strong what pushed the flights is, and how long it lasts."""
+    """Return how strong the estimated disturbances are, and their correlation times."""
     numbers = finding.numbers
     return (
-        "The residuals hold more than measurement noise, as gusts leave it: a Kalman filter "
-        f"follows a push of {100.0 * numbers['gust']:.2g} % of the weight that lasts "
-        f"{numbers['gust_seconds']:.2g} s, and thrust that wanders by "
-        f"{100.0 * numbers['thrust']:.2g} % for {1e3 * numbers['thrust_seconds']:.0f} ms. The "
-        "coefficients are those that then predict every sample best from the ones before."
+        "The residuals hold more than measurement noise, as in gusts: an extended Kalman filter "
+        f"estimates a disturbance force of {100.0 * numbers['gust']:.2g} % of the weight "
+        f"(correlation time {numbers['gust_seconds']:.2g} s) and thrust that varies by "
+        f"{100.0 * numbers['thrust']:.2g} % ({1e3 * numbers['thrust_seconds']:.0f} ms). The "
+        "coefficients are those that predict each sample best from the samples before."
     )
 
 

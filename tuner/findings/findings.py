@@ -449,7 +449,7 @@ class Code(Worded):
         ),
         "Fit it by itself: another build, battery or propeller turns the vehicle otherwise.",
     )
-    RATE_FORETOLD = (
+    RATE_PREDICTED = (
         "rate_foretold",  # before, after, hold (rad/s), seconds
         (
             "From its commands alone the fitted coefficients predict the body rate of this flight, "
@@ -458,7 +458,7 @@ class Code(Worded):
         ),
         "",
     )
-    RATE_NOT_FORETOLD = (
+    RATE_NOT_PREDICTED = (
         "rate_not_foretold",  # before, after, hold (rad/s), seconds
         (
             "From its commands alone the fitted coefficients predict the body rate of this flight "

@@ -88,8 +88,8 @@ def fit_without_pose(
         findings=(
             *left_out,
             *_left_open(settings, combination.names),
-            *_foretold(used, start, vehicle),
-            *_foretold(held_out, start, vehicle, held_out=True),
+            *_predicted(used, start, vehicle),
+            *_predicted(held_out, start, vehicle, held_out=True),
             *conflicts_of(combination),
         ),
         settings={"command": command, "origin": dict(settings.origin)},
@@ -118,16 +118,16 @@ def _measured(
     return measured, used, [left_out_of(name, error) for name, error in errors]
 
 
-def _foretold(
+def _predicted(
     flights: Sequence[InertialFlight],
     start: VehicleFile,
     vehicle: VehicleFile,
     *,
     held_out: bool = False,
 ) -> tuple[Finding, ...]:
-    """Return of which flights body rate is foretold worse than before, or than by holding it.
+    """Return of which flights body rate is predicted worse than before, or than by holding it.
 
-    Of flights that were held out it is said how well it is foretold in any case.
+    Of flights that were held out it is said how well it is predicted in any case.
     """
     findings = []
     for flight in flights:
@@ -143,9 +143,9 @@ def _foretold(
         if errors.fitted > errors.initial:
             findings.append(Finding(Code.RATE_WORSE, "warning", flight.name, numbers))
         elif errors.fitted > errors.hold:
-            findings.append(Finding(Code.RATE_NOT_FORETOLD, "info", flight.name, numbers))
+            findings.append(Finding(Code.RATE_NOT_PREDICTED, "info", flight.name, numbers))
         elif held_out:
-            findings.append(Finding(Code.RATE_FORETOLD, "info", flight.name, numbers))
+            findings.append(Finding(Code.RATE_PREDICTED, "info", flight.name, numbers))
     return tuple(findings)
 
 

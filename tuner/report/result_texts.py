@@ -161,7 +161,7 @@ _REASONS = {
     "with it, where no flight is by others",
     SelectionCode.SIGNIFICANT: "chance does not explain what it is worth, and no flight left out "
     "of the fit contradicts it",
-    SelectionCode.PREDICTS_SAMPLES: "once what pushed the flights is followed, samples are "
+    SelectionCode.PREDICTS_SAMPLES: "once disturbances are estimated, samples are "
     "predicted better with it by more than chance",
     SelectionCode.ASKED_FOR: "the job file names it",
     SelectionCode.OPEN_LOOP: "it is from the beginning: inputs are fed in below the loop that "

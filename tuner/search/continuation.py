@@ -193,15 +193,15 @@ def _finished(problem: StageProblem, progress: Progress) -> Progress:
     """Return where the search stands after the stage, the next one's weights included."""
     stage, iterate = problem.stage, progress.iterate
     assert iterate is not None, "a stage takes at least one step"
-    onward = None if problem.last else iterate.onward
+    next_start = None if problem.last else iterate.next_start
     progress = replace(
         progress,
         stage=progress.stage + 1,
-        points=iterate.points if onward is None else onward.points,
+        points=iterate.points if next_start is None else next_start.points,
         losses=iterate.losses,
         steps=0,
         iterate=None,
-        damping=np.ones(len(iterate.losses)) if onward is None else onward.damping,
+        damping=np.ones(len(iterate.losses)) if next_start is None else next_start.damping,
     )
     if iterate.sums is None:
         return progress

@@ -95,7 +95,7 @@ class Fitted:
     held: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def leaves_noise_alone(self) -> bool:
+    def residuals_at_noise_level(self) -> bool:
         """Whether residuals hold no more than measurement noise, on any flight and channel."""
         return max(max(scale.values()) for scale in self.scales.values()) < COLOURED
 

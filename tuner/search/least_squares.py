@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tuner.objective.criterion import Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import Step, advance, begin
-from tuner.search.optimiser import Iterate, Onward, Optimiser, StageProblem
+from tuner.search.optimiser import Iterate, NextStageStart, Optimiser, StageProblem
 from tuner.search.weights import NEAR, worst_channels
 
 FAR = 5.0
@@ -51,7 +51,7 @@ def are_far(starts: NDArray[np.float64] | None, reference: NDArray[np.float64] |
 
 
 HANDED_ON = 0.01
-"""Share of the loss: where a stage's normal equations promise no more, their step is not tried in
+"""Share of the loss: where a stage's normal equations predict no more, their step is not tried in
 it, but in the next. With 0.05 instead, a flight of noise among good ones leads the search astray,
 `examples/search_trials.py`."""
 LEAST_DAMPING = 1e-6
@@ -113,7 +113,7 @@ class LeastSquares(Optimiser):
             position_rmse=_position_rmse(problem.objective, step, best),
             damping=float(step.damping[best]),
             sums=step.best,
-            onward=_onward(problem, step),
+            next_start=_next_stage_start(problem, step),
         )
         states = starts_asked_for(step.best, best, state.states)
         if step.accepted[best]:
@@ -128,13 +128,13 @@ class LeastSquares(Optimiser):
         `Step.still` ends a start whose nine leading digits no longer change. No recording has so
         many, so that a stage's tolerance ends it sooner: as soon as the loss gains less than that,
         by the last accepted step or by the last three tries; or before that step is tried, where
-        the normal equations promise no gain that matters.
+        the normal equations predict no gain that matters.
         """
         if not state.losses:
             return False
         tolerance, last = problem.stage.tolerance, state.losses[-1]
         ended = (last <= problem.stage.enough) | np.asarray(state.step.still)
-        ended |= _promises_little(problem, state.step)
+        ended |= _predicts_little(problem, state.step)
         if len(state.losses) == 1:
             return bool(np.all(ended))
         accepted = np.asarray(state.step.accepted)
@@ -149,14 +149,14 @@ def _gains_little(losses: Sequence[NDArray[np.float64]], tolerance: float) -> ND
     return np.asarray(first - last <= tolerance * np.abs(last))
 
 
-def _promises_little(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
+def _predicts_little(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
     """Return (S,) whether no step from the best points is worth to be tried in this stage."""
-    promise = np.asarray(step.promise)
+    predicted = np.asarray(step.predicted_reduction)
     if not problem.last:
-        return np.asarray((promise <= HANDED_ON) & _is_near(problem, step))
+        return np.asarray((predicted <= HANDED_ON) & _is_near(problem, step))
     assert step.sums is not None, "what has stepped has sums"
     compared = sum(np.sum(np.asarray(n), axis=-1) for n in step.sums.counts.values())
-    return np.asarray(promise * np.asarray(step.loss) * compared <= SETTLED)
+    return np.asarray(predicted * np.asarray(step.loss) * compared <= SETTLED)
 
 
 def _is_near(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
@@ -170,17 +170,17 @@ def _is_near(problem: StageProblem, step: Step) -> NDArray[np.bool_]:
     return np.asarray(np.asarray(step.accepted) & (np.median(worst, axis=-1) <= NEAR))
 
 
-def _onward(problem: StageProblem, step: Step) -> Onward:
+def _next_stage_start(problem: StageProblem, step: Step) -> NextStageStart:
     """Return what a next stage begins with: the trust that was earned, if the fit is near."""
     near = _is_near(problem, step)
-    untried = np.asarray(near & (step.promise <= HANDED_ON))
+    untried = np.asarray(near & (step.predicted_reduction <= HANDED_ON))
     points: Point = jax.tree.map(
         lambda new, old: np.where(untried.reshape(-1, *[1] * (old.ndim - 1)), new, old),
         step.tried,
         step.point,
     )
     damping = np.where(near, np.clip(step.damping, LEAST_DAMPING, 1.0), 1.0)
-    return Onward(points, damping)
+    return NextStageStart(points, damping)
 
 
 def _position_rmse(objective: Objective, step: Step, start: int) -> float:

@@ -56,7 +56,7 @@ class Step:
         (S,) λ of the next step, relative to the Hessian per compared value.
     still
         (S,) whether the accepted point and its loss differ from those before by next to nothing.
-    promise
+    predicted_reduction
         (S,) share of the loss at the best point by which its minimum would be lower, were the
         residuals linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
     quadratics
@@ -71,7 +71,7 @@ class Step:
     accepted: NDArray[np.bool_]
     damping: Array
     still: NDArray[np.bool_]
-    promise: Array
+    predicted_reduction: Array
     quadratics: tuple[NormalEquations, ...] = ()
 
 
@@ -96,7 +96,7 @@ def begin(points: Point, damping: Array | None = None) -> Step:
         accepted=np.ones(starts, bool),
         damping=np.ones(starts) if damping is None else np.asarray(damping, float),
         still=np.zeros(starts, bool),
-        promise=np.full(starts, np.inf),
+        predicted_reduction=np.full(starts, np.inf),
     )
 
 
@@ -141,7 +141,7 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
         accepted=accepted,
         damping=np.array([step.damping for step in steps]),
         still=np.array([step.still for step in steps]),
-        promise=np.array([step.promise for step in steps]),
+        predicted_reduction=np.array([step.predicted_reduction for step in steps]),
         quadratics=tuple(step.quadratic for step in steps),
     )
 
@@ -155,7 +155,7 @@ class _Stepped:
     damping: float
     quadratic: NormalEquations
     tried: Point
-    promise: float
+    predicted_reduction: float
 
 
 def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.intp]) -> _Stepped:

@@ -75,13 +75,13 @@ class StageProblem:
 
 
 @dataclass(frozen=True)
-class Onward:
+class NextStageStart:
     """What a stage hands on.
 
     Attributes
     ----------
     points
-        S points; one that promises to differ by little has not been tried.
+        S points; one predicted to differ by little has not been tried.
     damping
         (S,) λ.
     """
@@ -109,7 +109,7 @@ class Iterate:
     sums
         The segments' sums at the best points, S first; None where they were not computed. The next
         stage's weights and starts follow from those of the last step.
-    onward
+    next_start
         What the next stage begins with, if there is one; None for ``points`` and a damping of 1.
     """
 
@@ -119,7 +119,7 @@ class Iterate:
     position_rmse: float
     damping: float = float("nan")
     sums: SegmentSums | None = None
-    onward: Onward | None = None
+    next_start: NextStageStart | None = None
 
 
 class Optimiser(ABC):

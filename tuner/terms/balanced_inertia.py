@@ -54,7 +54,7 @@ TOLERATED = 0.2
 squares gains so much from flights that are like each other, and loses it on others."""
 LEFT_OUT = Stage("left out", 0, 1.0, True, False, 8, 1e-3, False, False)
 """From the fit to all, a fit to the others is a few steps away, or with other inertia."""
-TOLD = 0.1
+REPORT_ABOVE = 0.1
 """Share by which an inertia changes from which it is said."""
 
 
@@ -273,7 +273,7 @@ def _fitted_to(
 
 
 def _findings(fitted: Fitted, balanced: Point, loss: float, *, taken: bool) -> tuple[Finding, ...]:
-    """Return which moments of inertia the balance changes by more than `TOLD`, if any.
+    """Return which moments of inertia the balance changes by more than `REPORT_ABOVE`, if any.
 
     ``loss`` is that of what was left out, over the fit's.
     """
@@ -282,7 +282,7 @@ def _findings(fitted: Fitted, balanced: Point, loss: float, *, taken: bool) -> t
     changed = {
         name: (before[name], after[name])
         for name in before
-        if name.startswith("inertia_") and abs(after[name] / before[name] - 1.0) > TOLD
+        if name.startswith("inertia_") and abs(after[name] / before[name] - 1.0) > REPORT_ABOVE
     }
     if not changed:
         return ()

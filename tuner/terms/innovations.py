@@ -1,4 +1,4 @@
-"""Which terms the flights call for once what pushed them is followed, and how far others matter.
+"""Which terms innovations call for once disturbances are estimated, and how far others matter.
 
 Least squares sees a term through gusts that the loop has turned into a slow wander of all signals,
 and hardly tells it from chance. Innovations are white: they tell the same term up to ten times as

@@ -1,4 +1,4 @@
-"""The coefficients once more with what pushed the flights, where something did."""
+"""Refit with estimated disturbances."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def with_disturbances(
     on_progress: Callable[[Job, Progress], None],
     on_message: Callable[[str], None],
 ) -> tuple[Selected, Fitted, Examination] | None:
-    """Return the fit in which what pushed the flights is estimated too, and its examination.
+    """Return the fit in which disturbances are estimated too, and its examination.
 
     None where the job does not ask for it, where the residuals hold no more than noise, where
     set-points were not recorded, where flights are too many or too long, where a filter loses them,
@@ -88,17 +88,17 @@ def with_disturbances(
     job, fitted = selected.job, selected.fitted
     asked = job.settings.job.disturbances
     follows = asked == "follow" or (asked == "auto" and candidates_of(job))
-    if fitted.leaves_noise_alone or not fitted.polished or not follows:
+    if fitted.residuals_at_noise_level or not fitted.polished or not follows:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
     predictor = Predictor.of(full.objective, full.point, job.fitted)
     if predictor is None:
         return None
     if predictor.memory > full.objective.memory // 2:
-        on_message("What pushed the flights is not followed: there are too many of them for that.")
+        on_message("Disturbances are not estimated: the flights are too long for that.")
         return None
     clock = time.perf_counter()
-    on_message("The residuals hold more than noise: fitting again with what pushed the flights.")
+    on_message("The residuals hold more than noise: refitting with estimated disturbances.")
     there, predictor = _descended(selected, fitted, predictor, steps=ROUGHLY)
     seen = Innovations.of(selected, there, predictor)
     had = _kept(selected)
@@ -112,7 +112,7 @@ def with_disturbances(
         there, predictor = _descended(selected, there, predictor)
         seen = Innovations.of(selected, there, predictor)
     if not predictor.keeps_track:
-        on_message("What pushed them cannot be followed: the model lacks something else.")
+        on_message("Disturbances cannot be estimated: the model lacks something else.")
         return None
     job = seen.selected.job
     offsets = free_offsets(job)

@@ -46,7 +46,7 @@ from tuner.terms.doubt import in_doubt
 from tuner.terms.held_out_score import predicted_losses, vector_after
 from tuner.terms.linear import linear_at
 from tuner.terms.score import Score, score, surviving
-from tuner.terms.selection_state import Selected, Standing, offsets_of, row_of
+from tuner.terms.selection_state import LinearisedFit, Selected, offsets_of, row_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import with_coefficients
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
@@ -79,7 +79,7 @@ class Selection:
 
     def run(self) -> Selected:
         """Add groups until none earns its place."""
-        state = self.seen(self.fitted, {})
+        state = self.linearised(self.fitted, {})
         dropped: dict[str, SelectionCode] = {}
         if self._worth_fitting(state, dropped):
             state = self._with_all(state) or state
@@ -101,7 +101,7 @@ class Selection:
         selected = Selected(job, fitted if state.added else self.fitted, rows, base=base)
         return replace(selected, in_doubt=self._in_doubt(state, selected.left_out))
 
-    def _in_doubt(self, state: Standing, groups: Sequence[Sequence[str]]) -> dict[str, float]:
+    def _in_doubt(self, state: LinearisedFit, groups: Sequence[Sequence[str]]) -> dict[str, float]:
         """Return how far each coefficient of the model would move with what is not in it."""
         names = [*self.job.space.names, *names_in(state.added)]
         outside = [(self._columns(group), presence_of(group)) for group in groups]
@@ -109,7 +109,9 @@ class Selection:
         coefficients = [name for name in names if name not in conditions_in(self.candidates)]
         return dict(zip(coefficients, moves[self._columns(coefficients)].tolist(), strict=True))
 
-    def _wanted(self, state: Standing, dropped: Mapping[str, SelectionCode]) -> dict[str, Score]:
+    def _wanted(
+        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
+    ) -> dict[str, Score]:
         """Return the groups to fit next: all that gain by more than chance, if one predicts.
 
         As long as terms are missing, those that are there stand in for them and even what is true
@@ -119,7 +121,7 @@ class Selection:
         return scores if any(found.earns_place for found in scores.values()) else {}
 
     def _worth_fitting(
-        self, state: Standing, dropped: Mapping[str, SelectionCode]
+        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
     ) -> dict[str, Score]:
         """Return the groups that gain by more than chance in the fit, whatever they predict."""
         return {
@@ -129,7 +131,7 @@ class Selection:
             if (found := self._score(state, group)).reason in WORTH_FITTING
         }
 
-    def _with_all(self, base: Standing) -> Standing | None:
+    def _with_all(self, base: LinearisedFit) -> LinearisedFit | None:
         """Return what backward elimination leaves of all groups, if it predicts better.
 
         Where something is missing the base fit lies anywhere, and what little it shows of the
@@ -154,8 +156,8 @@ class Selection:
         return None
 
     def _grown(
-        self, state: Standing, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
-    ) -> Standing | None:
+        self, state: LinearisedFit, wanted: Mapping[str, Score], dropped: dict[str, SelectionCode]
+    ) -> LinearisedFit | None:
         """Return the fit with the groups that hold their places in it, if it predicts better."""
         best = max(wanted, key=lambda name: wanted[name].gain_holdout)
         for names in dict.fromkeys([tuple(wanted), (best,)]):
@@ -168,7 +170,7 @@ class Selection:
         dropped[best] = SelectionCode.WORSE_AFTER_REFIT
         return None
 
-    def _pruned(self, state: Standing) -> Standing:
+    def _pruned(self, state: LinearisedFit) -> LinearisedFit:
         """Return the fit without the groups that do not hold their places beside the others."""
         kept, taken = surviving(
             state.linear,
@@ -185,7 +187,7 @@ class Selection:
         groups = {name: self.candidates[name] for name in kept}
         return self._pruned(self._refitted(self._without(state, taken), groups))
 
-    def _without(self, state: Standing, taken: Collection[str]) -> Standing:
+    def _without(self, state: LinearisedFit, taken: Collection[str]) -> LinearisedFit:
         """Return a fit moved to where, to first order, the others end without some groups.
 
         They have to make up for what is taken away: from where they are, whole flights would lead
@@ -208,7 +210,9 @@ class Selection:
         point = Point(np.asarray(moved), np.asarray(offsets))
         return replace(state, fitted=replace(state.fitted, point=point))
 
-    def _refitted(self, state: Standing, groups: Groups, *, anew: bool = False) -> Standing:
+    def _refitted(
+        self, state: LinearisedFit, groups: Groups, *, anew: bool = False
+    ) -> LinearisedFit:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted, around = coefficients_in(groups), conditions_in(self.candidates)
         idle = tuple(name for name in around if name not in conditions_in(groups))
@@ -250,9 +254,9 @@ class Selection:
             fitted = polished(
                 self.job, from_here, free=free_ones, title=title, on_progress=on_progress
             )
-        return self.seen(fitted, groups)
+        return self.linearised(fitted, groups)
 
-    def seen(self, fitted: Fitted, added: Groups) -> Standing:
+    def linearised(self, fitted: Fitted, added: Groups) -> LinearisedFit:
         """Return a fit as all candidates see it."""
         objective, point = with_terms(
             self._objective_of(fitted),
@@ -275,7 +279,7 @@ class Selection:
             offsets_fitted=np.asarray(at.offsets) != 0.0,
             around=around,
         )
-        return Standing(fitted, added, linear)
+        return LinearisedFit(fitted, added, linear)
 
     def _objective_of(self, fitted: Fitted) -> Objective:
         """Return a fit's base problem with all candidates in the model, at their neutral values."""
@@ -319,7 +323,7 @@ class Selection:
         ]
         return np.array([self._space.index(name) for name in wanted], np.intp)
 
-    def _score(self, state: Standing, group: str) -> Score:
+    def _score(self, state: LinearisedFit, group: str) -> Score:
         """Return what a group is worth beside the others in the model."""
         others = {name: names for name, names in state.added.items() if name != group}
         return score(
@@ -332,7 +336,7 @@ class Selection:
         )
 
     def _rows(
-        self, state: Standing, dropped: Mapping[str, SelectionCode]
+        self, state: LinearisedFit, dropped: Mapping[str, SelectionCode]
     ) -> tuple[SelectionRow, ...]:
         """Return the table: what is in the model first, by what it predicts."""
         groups = dict.fromkeys([*state.added, *self.candidates])
@@ -350,11 +354,11 @@ class Selection:
 
     def rows_of_named(self) -> tuple[SelectionRow, ...]:
         """Return the rows of the terms that the job names, with what each is worth in the fit."""
-        state = self.seen(self.fitted, {})
+        state = self.linearised(self.fitted, {})
         return tuple(self._rows_of(state, self.job.first_terms, SelectionCode.ASKED_FOR))
 
     def _rows_of(
-        self, state: Standing, groups: Groups, reason: SelectionCode
+        self, state: LinearisedFit, groups: Groups, reason: SelectionCode
     ) -> list[SelectionRow]:
         """Return the rows of groups of the base model."""
         return [
@@ -362,7 +366,7 @@ class Selection:
             for group, names in groups.items()
         ]
 
-    def _worth(self, state: Standing, names: Sequence[str]) -> Score:
+    def _worth(self, state: LinearisedFit, names: Sequence[str]) -> Score:
         """Return what a group of the base model is worth beside all else in the model."""
         others = [name for name in self.job.space.names if name not in names]
         return score(
@@ -373,7 +377,9 @@ class Selection:
             neutral=self._neutral,
         )
 
-    def _predicts_better(self, trial: Standing, state: Standing, *, by_flight: bool) -> bool:
+    def _predicts_better(
+        self, trial: LinearisedFit, state: LinearisedFit, *, by_flight: bool
+    ) -> bool:
         """Return whether a refit predicts flights left out better than the fit before it.
 
         By more than the standard error over the flights, or, where only sections of flights can
@@ -386,12 +392,12 @@ class Selection:
         scatter = float(np.sqrt(len(gains)) * np.std(gains, ddof=1))
         return bool(gains.sum() > (scatter if by_flight else -scatter))
 
-    def _predicted(self, state: Standing, scale: Mapping[str, Array]) -> NDArray[np.float64]:
+    def _predicted(self, state: LinearisedFit, scale: Mapping[str, Array]) -> NDArray[np.float64]:
         model = self._columns([*self.job.space.names, *names_in(state.added)])
         own = self._columns(state.fitted.objective.space.names)
         return predicted_losses(state.fitted, state.linear, model, own, scale)
 
 
-def _no_gust(state: Standing, group: str) -> bool:
+def _no_gust(state: LinearisedFit, group: str) -> bool:
     """Return whether no gust can pass for a group: it reads a recording, or noise alone is left."""
-    return reads_recording(group) or state.fitted.leaves_noise_alone
+    return reads_recording(group) or state.fitted.residuals_at_noise_level

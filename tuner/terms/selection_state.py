@@ -83,7 +83,7 @@ class Selected:
 
 
 @dataclass(frozen=True)
-class Standing:
+class LinearisedFit:
     """A fit with some groups in it, seen in linear approximation by all that could be in it.
 
     Attributes

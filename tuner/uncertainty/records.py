@@ -32,7 +32,7 @@ class ErrorParts(Part):
         of the finest step in which simulators take it; None where that was not asked.
     readings
         How it scatters when the battery's voltmeter is read again, with errors like those that it
-        made; None where the fit has no battery, or follows what pushed the flights.
+        made; None where the fit has no battery, or estimates disturbances.
     lack
         How far it would move with the laws that recorded accelerations follow beside the model's;
         None where none was found.

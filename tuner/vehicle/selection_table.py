@@ -24,7 +24,7 @@ class SelectionCode(StrEnum):
     SIGNIFICANT = "significant"
     """Kept: chance does not explain what it is worth, and nothing left out contradicts it."""
     PREDICTS_SAMPLES = "predicts_samples"
-    """Kept: once what pushed the flights is followed, each sample is predicted better with it."""
+    """Kept: once disturbances are estimated, each sample is predicted better with it."""
     ASKED_FOR = "asked_for"
     """Kept: the job file names it."""
     OPEN_LOOP = "open_loop"

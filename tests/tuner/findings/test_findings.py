@@ -104,14 +104,14 @@ MADE = {
         "a",
         {"before": 7.6, "after": 8.2, "hold": 1.8, "seconds": 0.5},
     ),
-    Code.RATE_FORETOLD: Finding(
-        Code.RATE_FORETOLD,
+    Code.RATE_PREDICTED: Finding(
+        Code.RATE_PREDICTED,
         "info",
         "a",
         {"before": 7.6, "after": 5.2, "hold": 1.8, "seconds": 0.5},
     ),
-    Code.RATE_NOT_FORETOLD: Finding(
-        Code.RATE_NOT_FORETOLD,
+    Code.RATE_NOT_PREDICTED: Finding(
+        Code.RATE_NOT_PREDICTED,
         "info",
         "a",
         {"before": 7.6, "after": 5.2, "hold": 1.8, "seconds": 0.5},

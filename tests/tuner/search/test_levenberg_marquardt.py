@@ -47,7 +47,7 @@ def test_every_start_reaches_the_minimum_and_stands_still(advanced):
     *_, last = advanced([START, [3.0, -2.0]], 60)
     np.testing.assert_allclose(last.point.coefficients, [END, END], atol=1e-7)
     assert last.still.all()
-    assert last.promise.max() < 1e-9
+    assert last.predicted_reduction.max() < 1e-9
 
 
 def test_a_loss_that_rises_is_rejected_and_damps_more(advanced):
@@ -66,7 +66,7 @@ def test_the_first_step_is_the_damped_one(advanced):
     expected = START - np.linalg.solve(hessian + 2.0 * np.eye(2), gradient)
     np.testing.assert_allclose(first.tried.coefficients[0], expected, rtol=1e-9)
     gain = 0.5 * gradient @ np.linalg.solve(hessian, gradient)
-    assert first.promise[0] == pytest.approx(gain / valley(START).loss)
+    assert first.predicted_reduction[0] == pytest.approx(gain / valley(START).loss)
 
 
 def test_what_is_held_stays(advanced):

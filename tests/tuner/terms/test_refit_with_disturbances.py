@@ -72,7 +72,7 @@ def test_flights_whose_gains_would_not_fit_are_left_to_the_intervals(monkeypatch
         selected = Selected(job, fitted(2.0 * COLOURED))
         found = with_disturbances(selected, lambda *_: None, said.append)
         assert found is None
-    assert ("What pushed the flights is not followed" in said[0]) == says
+    assert ("Disturbances are not estimated" in said[0]) == says
 
 
 @pytest.mark.parametrize(

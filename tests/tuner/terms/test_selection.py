@@ -14,7 +14,7 @@ from tuner.terms import search_with_terms as terms
 from tuner.terms import selection
 from tuner.terms.score import Score
 from tuner.terms.search_with_terms import with_terms_selected
-from tuner.terms.selection_state import Standing
+from tuner.terms.selection_state import LinearisedFit
 from tuner.uncertainty.estimates import uncertainty_of
 from tuner.uncertainty.examination import examine
 from tuner.vehicle import term_groups
@@ -135,7 +135,7 @@ def test_of_all_groups_only_the_battery_is_judged_as_one_that_a_recorded_signal_
     monkeypatch.setattr(selection.Selection, "_columns", lambda *_: ())
     groups = {**term_groups(), "wind": ("wind_x", "wind_y")}
     job = SimpleNamespace(space=SimpleNamespace(names=BASE_IN_ORDER))
-    standing = Standing(SimpleNamespace(leaves_noise_alone=False), groups, None)
+    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), groups, None)
     selection.Selection(job, None, groups, print, print)._pruned(standing)
     assert judged == ["battery"]
 
@@ -154,11 +154,11 @@ def test_all_terms_are_tried_where_one_gains_even_if_none_predicts_flights(
 ):
     """The base fit of a vehicle that lacks several lies anywhere."""
     searched, own = [], selection.Selection
-    fitted = SimpleNamespace(leaves_noise_alone=False, point=None, objective=None)
-    standing = Standing(fitted, {}, None)
-    monkeypatch.setattr(Standing, "vector", {})
+    fitted = SimpleNamespace(residuals_at_noise_level=False, point=None, objective=None)
+    standing = LinearisedFit(fitted, {}, None)
+    monkeypatch.setattr(LinearisedFit, "vector", {})
     monkeypatch.setattr(own, "_score", lambda *_: Score(0.4, 0.3, 0.1, 0.5, reason))
-    monkeypatch.setattr(own, "seen", lambda *_: standing)
+    monkeypatch.setattr(own, "linearised", lambda *_: standing)
     monkeypatch.setattr(own, "_with_all", lambda *_: searched.append(True))
     monkeypatch.setattr(own, "_grown", lambda *_: standing)
     monkeypatch.setattr(own, "_rows", lambda *_: ())
@@ -183,7 +183,7 @@ def test_terms_that_are_free_from_the_beginning_stand_in_the_table_with_what_the
     job = SimpleNamespace(
         space=SimpleNamespace(names=names, free=names), first_terms={"marker_tilt": tilt}
     )
-    standing = Standing(SimpleNamespace(leaves_noise_alone=False), {}, None)
+    standing = LinearisedFit(SimpleNamespace(residuals_at_noise_level=False), {}, None)
     groups = {"fuselage_drag": ("fuselage_drag",)}
     rows = selection.Selection(job, None, groups, print, print)._rows(standing, {})
     assert [(row.group, row.kept, row.reason) for row in rows] == [
