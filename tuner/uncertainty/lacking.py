@@ -176,11 +176,11 @@ def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:
     attitude, position = series["attitude"], series["position"]
     turned = Rotation.from_quat(attitude.values, scalar_first=True)
     if markers.turn is not None:
-        tilt = Rotation.from_quat(np.asarray(markers.turn.stacked()), scalar_first=True)
+        tilt = Rotation.from_quat(np.array(markers.turn.stacked()), scalar_first=True)
         turned = turned * tilt.inv()
     moved = {"attitude": Series(attitude.time, turned.as_quat(scalar_first=True))}
     if markers.offset is not None:
-        offset = np.asarray(markers.offset.stacked())
+        offset = np.array(markers.offset.stacked())  # SciPy takes no array that is read-only
         arm = Series(attitude.time, turned.apply(offset))
         moved["position"] = _less(position, arm)
         if "velocity" in series and float(model.controller.sees_markers) > 0.5:

@@ -57,9 +57,16 @@ def references() -> ReferenceInlet:
     )
 
 
-def problem(effects: dict[str, float], *, random: np.random.Generator | None = None) -> Objective:
+def problem(
+    effects: dict[str, float],
+    *,
+    random: np.random.Generator | None = None,
+    sees_markers: bool = False,
+) -> Objective:
     """Return the problem of a vehicle with some effects, in gusts where they are drawn."""
     vehicle, controller = with_values(making.vehicle_file(), effects), making.controller_file()
+    sensing = controller.sensing.replace(sees_markers=sees_markers)
+    controller = controller.replace(sensing=sensing)
     space = space_of(vehicle, controller, JobFile(free=FREE))
     model = model_of(vehicle, controller)
     schedule = schedule_of(controller, log_rate=RATE)
@@ -118,11 +125,19 @@ def flown(truth: Objective, seed: int) -> tuple[dict[str, Measured], list[Flight
     return measured, flights
 
 
-def fit_of(effects: dict[str, float], seed: int, *, gusts: bool):
-    """Return the fit of a vehicle without effects to flights of one that has them; the flights."""
+def fit_of(
+    effects: dict[str, float],
+    seed: int,
+    *,
+    gusts: bool,
+    known: dict[str, float] | None = None,
+    sees_markers: bool = False,
+):
+    """Return the fit of a vehicle with what is known of its effects, and the flights it is of."""
     air_of = np.random.default_rng([seed, 1]) if gusts else None
-    measured, flights = flown(problem(effects, random=air_of), seed)
-    objective = problem({})
+    truth = problem(effects, random=air_of, sees_markers=sees_markers)
+    measured, flights = flown(truth, seed)
+    objective = problem(known or {}, sees_markers=sees_markers)
     objective = replace(objective, segments=replace(objective.segments, measured=measured))
     fitted = making.fitted_of(objective, making.truth(objective))
     names = [flight.name for flight in flights]
@@ -163,6 +178,14 @@ def test_the_intervals_of_what_it_moves_hold_it():
     assert all(finding.code is Code.LAW_LACKING for finding in findings)
     assert "rotor_drag_coefficient" in findings[0].names
     assert laws_lacking(without.laws, without.uncertainty) == ()
+
+
+@pytest.mark.parametrize("sees", [False, True])
+def test_markers_beside_the_centre_of_mass_are_no_law(sees):
+    """What is recorded is the markers' frame; the vehicle's own is what forces act on."""
+    beside = {"marker_offset_x": 0.03, "marker_offset_z": -0.02, "marker_tilt_y": 0.02}
+    fitted, flights = fit_of(beside, 0, gusts=False, known=beside, sees_markers=sees)
+    assert lack_of(fitted, flights) is None
 
 
 def test_commands_stand_in_for_tachometers():
