@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import httpx
@@ -33,13 +34,15 @@ def half_way(client: httpx.Client, job: str) -> None:
 
 def worker_of(server: int) -> int:
     """Return the process that fits the only job of a server."""
-    (found,) = [
-        int(folder.name)
-        for folder in Path("/proc").glob("[0-9]*")
-        if (folder / "stat").read_text().rpartition(")")[2].split()[1] == str(server)
-        and b"tuner.service.worker" in (folder / "cmdline").read_bytes()
-    ]
-    return found
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # a process of somebody else's has ended meanwhile
+            parent = (folder / "stat").read_text().rpartition(")")[2].split()[1]
+            is_worker = b"tuner.service.worker" in (folder / "cmdline").read_bytes()
+            if parent == str(server) and is_worker:
+                found.append(int(folder.name))
+    (worker,) = found
+    return worker
 
 
 def coefficients(client: httpx.Client, job: dict) -> dict:
