@@ -27,7 +27,6 @@ from tuner.config import Options, settle
 from tuner.core.phrases import listed
 from tuner.engine import Report, engine_for
 from tuner.findings.findings import Code, Finding, one_line
-from tuner.job.listener import SILENT
 from tuner.job.run import prepared
 from tuner.objective.battery import VOLTAGE, log_voltage_of
 from tuner.objective.windows import Window
@@ -235,7 +234,7 @@ def trial_of(seed: int) -> Trial:
         job, said = job_at(lab, Path(name), seed=seed)
         clock = time.process_time()
         selected = searched(job, Path(name))
-        explanation = Explanation(SILENT)
+        explanation = Explanation(lambda _: None)
         selected, fitted, examination = examined(
             selected, lambda *_: None, lambda _: None, explanation
         )
@@ -374,10 +373,9 @@ def _holds(trial: Trial, name: str, width: float = 1.0) -> bool:
 def _share_without_terms(trial: Trial, name: str) -> float:
     """Return the share of a quoted error that is left without its part `terms`."""
     parts = trial.estimates[name].parts
-    on_top = (parts.step or 0.0) ** 2 + (parts.search or 0.0) ** 2
-    others = max(parts.noise or 0.0, parts.residuals or 0.0, parts.left_out or 0.0)
-    every = max(others, parts.terms or 0.0)
-    return float(np.sqrt((others**2 + on_top) / (every**2 + on_top)))
+    on_top = sum((part or 0.0) ** 2 for part in (parts.step, parts.search, parts.lack))
+    others = max(parts.noise or 0.0, parts.residuals or 0.0, parts.left_out or 0.0) ** 2 + on_top
+    return float(np.sqrt(others / (others + (parts.terms or 0.0) ** 2)))
 
 
 def _named(what: str, groups: Sequence[str]) -> str:

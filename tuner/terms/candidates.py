@@ -108,8 +108,10 @@ def presence_of(names: Collection[str]) -> float:
 
     In a size that flights could tell: from what is as good as absent on.
     """
-    stands_in = any(name in COEFFICIENTS and COEFFICIENTS[name].stands_in for name in names)
-    return STANDS_IN if stands_in else PRESENT
+    rows = [COEFFICIENTS[name] for name in names if name in COEFFICIENTS]
+    if any(row.expected for row in rows):
+        return 1.0
+    return STANDS_IN if any(row.stands_in for row in rows) else PRESENT
 
 
 def reads_recording(group: str) -> bool:

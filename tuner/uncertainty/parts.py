@@ -48,16 +48,17 @@ class Spread:
     def quoted(self) -> Array:
         """The honest standard error (K,).
 
-        Noise, residuals, left-out flights and left-out terms show the same errors in four ways, of
-        which the largest counts; what steps do comes on top, those of the simulation and those that
+        Noise, residuals and left-out flights show the same errors in three ways, of which the
+        largest counts. On top comes what terms would move that were left out: a fit without them
+        does not depend on what the flights say of them, and their effect stands in no residual as
+        long as coefficients take it up. And what steps do, those of the simulation and those that
         the search did not take, what inputs do that were read with errors, and what the model is
         seen to lack.
         """
         error = np.maximum(self.noise, self.residuals)
-        for part in (self.left_out, self.terms):
-            if part is not None:
-                error = np.maximum(error, part)
-        for part in (self.search, self.step, self.readings, self.lack):
+        if self.left_out is not None:
+            error = np.maximum(error, self.left_out)
+        for part in (self.terms, self.search, self.step, self.readings, self.lack):
             if part is not None:
                 error = np.hypot(error, part)
         return np.asarray(error)

@@ -97,6 +97,8 @@ class Coefficient:
         others of its kind and is never chosen by itself.
     stands_in
         Of an effect: whether it describes as a whole what other terms do one by one.
+    expected
+        Of an effect: whether every vehicle has it, if often in a size that flights do not tell.
     reads
         Of an effect: the recorded signal that its law reads beside the simulated state, if any.
     exported_as
@@ -130,6 +132,7 @@ class Coefficient:
     neutral: float | None = None
     group: str = ""
     stands_in: bool = False
+    expected: bool = False
     reads: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None

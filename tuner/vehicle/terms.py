@@ -30,6 +30,7 @@ def _effect(
     length_exponent: float = 0.0,
     informed_by: str | None = None,
     stands_in: bool = False,
+    expected: bool = False,
     reads: str = "",
     neutral: float = 0.0,
 ) -> Coefficient:
@@ -56,6 +57,7 @@ def _effect(
         neutral=neutral,
         group=group,
         stands_in=stands_in,
+        expected=expected,
         reads=reads,
         exported_as=held,
         informed_by=informed_by,
@@ -256,8 +258,9 @@ EFFECT_ROWS = (
         "Cheeseman and Bennett 1955: T/(1 - g·(R/4h)²)",
         group="ground_effect",
         limit=8.0,
-        prior_sd=1.0,
+        prior_sd=2.0,  # four rotors lift by more than one: Sanchez-Cuevas, Heredia, Ollero 2017
         step=0.5,
+        expected=True,
     ),
     *(
         _effect(

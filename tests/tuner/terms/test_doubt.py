@@ -70,16 +70,21 @@ def share(fits, size, *, with_part):
     for linear, alone in fits:
         fit = with_term(linear, size)
         off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
-        error = max(alone, in_doubt(fit, MODEL, [PRESENT])[0] if with_part else 0.0)
+        error = np.hypot(alone, in_doubt(fit, MODEL, [PRESENT])[0] if with_part else 0.0)
         held.append(abs(off) < 1.96 * error)
     return np.mean(held)
 
 
 @pytest.mark.parametrize("size", [0.0, 1.0, 2.0, 3.0, 4.0])
 def test_a_term_too_small_to_be_added_is_covered_whatever_its_size(fits, size):
-    assert share(fits, size, with_part=True) > 0.8
+    assert share(fits, size, with_part=True) > 0.84
     if size >= 2.0:
         assert share(fits, size, with_part=False) < 0.2
+
+
+def test_the_ground_is_there_for_every_vehicle_and_stand_ins_are_seldom_needed():
+    assert presence_of(["ground_effect"]) == 1.0
+    assert presence_of(["linear_drag_x"]) < presence_of(["fuselage_drag"]) < 1.0
 
 
 def test_over_vehicles_of_which_half_have_the_term_in_some_size_intervals_hold(fits):
@@ -92,11 +97,11 @@ def test_over_vehicles_of_which_half_have_the_term_in_some_size_intervals_hold(f
         fit = with_term(linear, size)
         off = fit.step(MODEL, inside=np.ones(len(fit.flight), bool))[0]
         part = in_doubt(fit, MODEL, [(TERM, presence)])[0]
-        held.append([abs(off) < 1.96 * error for error in (alone, max(alone, part))])
+        held.append([abs(off) < 1.96 * error for error in (alone, np.hypot(alone, part))])
         parts.append(part / in_doubt(fit, MODEL, [PRESENT])[0])
     without, with_part = np.mean(held, axis=0)
     assert without < 0.75
-    assert with_part > 0.85
+    assert with_part > 0.91
     assert np.median(parts) < 0.9
 
 

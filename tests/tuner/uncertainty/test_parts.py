@@ -133,7 +133,7 @@ def test_the_quoted_error_holds_every_part():
     assert spread.quoted == pytest.approx(np.hypot(spread.left_out, np.abs(step)), rel=1e-6)
     doubt = 10.0 * spread.left_out
     doubted = spread_of(replace(information, in_doubt=doubt), np.full(COUNT, 0.01), np.zeros(COUNT))
-    assert doubted.quoted == pytest.approx(doubt)
+    assert doubted.quoted == pytest.approx(np.hypot(spread.left_out, doubt))
     parts = spread.of(0, -2.0)
     assert parts.step == pytest.approx(0.6)
     assert parts.noise == pytest.approx(2.0 * spread.noise[0])
