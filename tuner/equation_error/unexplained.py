@@ -323,6 +323,8 @@ def _likeliest(
     own = np.diag(total)[list(rest)]
     alone = own - np.einsum("mr,mr->r", total[np.ix_(list(model), list(rest))], follow)
     tells = alone > OWN * own
+    if not tells.any():
+        return None
     sd = np.sqrt(np.sum(efficient**2, axis=0))
     size = np.where(tells, efficient.sum(axis=0) / np.maximum(sd, 1e-300), 0.0)
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (SIGNS, len(efficient)))

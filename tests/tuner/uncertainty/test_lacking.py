@@ -18,6 +18,7 @@ from sim_jax.state import hover
 from sim_jax.vector import Vec3
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
+from tuner.equation_error.unexplained import _likeliest
 from tuner.findings.findings import Code
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
@@ -186,6 +187,13 @@ def test_markers_beside_the_centre_of_mass_are_no_law(sees):
     beside = {"marker_offset_x": 0.03, "marker_offset_z": -0.02, "marker_tilt_y": 0.02}
     fitted, flights = fit_of(beside, 0, gusts=False, known=beside, sees_markers=sees)
     assert lack_of(fitted, flights) is None
+
+
+def test_a_hover_tells_of_no_law():
+    score = np.random.default_rng(0).normal(size=(9, 3))
+    information = np.zeros((9, 3, 3))
+    information[:, 0, 0] = 1.0
+    assert _likeliest(information, score, [0], [1, 2]) is None
 
 
 def test_commands_stand_in_for_tachometers():
