@@ -175,11 +175,10 @@ def filtered(
     """
     short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
     static = _Static("filter", short, in_flight, moves=False)
-    found = _run(
-        _given(feed, expected), static, wanted=_Told(True, True, True, gains, gains)
-    ).values
-    white, root, loss = (np.moveaxis(rows, 0, -1) for rows in found[:3])
-    return Filtered(white, root, loss, Gains(found.gain, found.factors) if gains else None)
+    wanted = (*[True] * 3, *[gains] * 2)
+    *rows, gain, factors = _run(_given(feed, expected), static, wanted=wanted).values
+    white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
+    return Filtered(white, root, loss, Gains(gain, factors) if gains else None)
 
 
 def innovations(
@@ -267,16 +266,6 @@ def _tangents(expected: Expected, directions: NDArray[np.float64]) -> list[NDArr
     return [*moved, directions[:, count:]]
 
 
-class _Told(NamedTuple):
-    """What a filter returns of a segment, tick by tick, or whether it is wanted."""
-
-    white: Any
-    root: Any
-    loss: Any
-    factors: Any
-    gain: Any
-
-
 def _run(
     given: _Given,
     static: _Static,
@@ -345,8 +334,8 @@ def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Arra
     return order, order(jnp.asarray(given.order.shape[1] - 1))
 
 
-def _filter(given: _Given, static: _Static, ticks: int) -> _Told:
-    """Filter one segment."""
+def _filter(given: _Given, static: _Static, ticks: int) -> Any:
+    """Filter one segment: white, root and loss of `Filtered`, gains and factors of `Gains`."""
     observer, first = _observer(given, static)
     in_flight, processes = static.in_flight, observer.processes
     first_sd = jnp.asarray(first_errors(first, in_flight))
@@ -391,7 +380,7 @@ def _filter(given: _Given, static: _Static, ticks: int) -> _Told:
         gains = rows_of(lambda i: row(told.gain, i, size).astype(jnp.float32), wide)
         matrices = covariance, told.gain, scratch
         carried = after, pushed * processes.keeps, matrices, before, beyond
-        return carried, _Told(white, root, loss, factors.astype(jnp.float32), gains)
+        return carried, (white, root, loss, gains, factors.astype(jnp.float32))
 
     sd = jnp.concatenate([first_sd, processes.sd])
     diagonal = jnp.arange(size)[:, None] == jnp.arange(size)
@@ -402,8 +391,7 @@ def _filter(given: _Given, static: _Static, ticks: int) -> _Told:
         observer.seen(first, jnp.asarray(0)),
         jnp.zeros(wide, int),
     )
-    told: _Told = lax.scan(tick, begin, jnp.arange(ticks))[1]
-    return told
+    return lax.scan(tick, begin, jnp.arange(ticks))[1]
 
 
 def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Array]:
