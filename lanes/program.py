@@ -19,6 +19,7 @@ from typing import Any, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import partial_eval
 from jax.tree_util import PyTreeDef, default_registry
 from numpy.typing import NDArray
 
@@ -40,6 +41,8 @@ _STAND_INS = (
 """Lengths under which a function is traced; no number of a program is likely to be one of them."""
 BUILT = "/lanes/build_duration"
 """What `jax.monitoring` calls the end of building a kernel, once it is traced."""
+FALLBACK = "/lanes/fallback"
+"""What it calls that a program has no kernel, and why."""
 TASKS_A_CORE = 4
 """Pieces of work a core: their sizes differ."""
 WASTE = 0.15
@@ -168,7 +171,10 @@ class Program:
         given = [self._shaped(a, lengths) for a in self.arguments]
         tangents = [given[number] for number in self.moving]
         closed, shapes = jax.make_jaxpr(self._pushed(lengths), return_shape=True)(given, tangents)
-        return closed, shapes, lengths
+        # what a loop computes and nobody reads is neither lowered nor in need of a rule
+        used = [True] * len(closed.jaxpr.outvars)
+        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, used, instantiate=True)
+        return closed.replace(jaxpr=jaxpr), shapes, lengths
 
     @property
     def stand_ins(self) -> dict[str, int]:
@@ -182,6 +188,8 @@ class Program:
             return _Compiled(self)
         except UnsupportedError as missing:
             logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
+            what = f"{self.name}: no rule for {missing}"
+            jax.monitoring.record_event_duration_secs(FALLBACK, 0.0, fun_name=what)
             return None
 
     @property

@@ -273,6 +273,19 @@ def test_what_has_no_rule_runs_through_xla_and_is_named(caplog):
     assert "sorting runs through XLA: no rule for primitive sort" in caplog.text
 
 
+def test_what_a_loop_computes_for_nobody_needs_no_rule():
+    def summed(x, lengths):
+        def turn(total, _):
+            return total + x[0], (jnp.sort(x), total)
+
+        return lax.scan(turn, 0.0, jnp.arange(lengths["turns"]))[0]
+
+    program = Program(summed, Argument((2,), float, lanes=True), name="summed")
+    got = program(np.array([[2.0, 3.0], [1.0, 1.0]]), lanes=2, turns=4)
+    assert program.is_kernel
+    np.testing.assert_array_equal(got.values, [8.0, 12.0])
+
+
 TEXT = "define i32 @seven() {\n ret i32 7\n}\n"
 
 

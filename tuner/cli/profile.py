@@ -92,6 +92,8 @@ def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
     parts = [f"{name} {seconds} s" for name, seconds in beside.items() if float(seconds)]
     if parts:
         screen.print(f"Beside it, by other threads and processes: {listed(parts)}.", markup=False)
+    for program in recorder.fallbacks:
+        screen.print(f"Through XLA, not as a kernel: {program}.", markup=False)
     screen.print(f"profile: {folder / TABLE_FILE}, {folder / TRACE_FILE}", markup=False)
 
 

@@ -19,6 +19,8 @@ LOWERING = "lowering"
 COMPILING = "compiling"
 LOADING = "loading compiled code"
 BUILDING = "building kernels"
+FALLBACK = "/lanes/fallback"
+"""Event of a program that runs through XLA, for what it has no rule for."""
 OF_JAX = {
     "/jax/core/compile/jaxpr_trace_duration": TRACING,
     "/jax/core/compile/jaxpr_to_mlir_module_duration": LOWERING,
@@ -68,6 +70,8 @@ class Recorder:
     """Collects the spans of one run, as they end."""
 
     spans: list[Span] = field(default_factory=list)
+    fallbacks: list[str] = field(default_factory=list)
+    """Programs that run through XLA, and what they have no rule for."""
     thread: int = field(default_factory=threading.get_ident)
     """Whose stages they are."""
     began: float = field(default_factory=lambda: time.perf_counter() - time.process_time())
@@ -79,6 +83,8 @@ class Recorder:
 
     def add_duration(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         """Add what jax reports at its end, if it is one of `OF_JAX`."""
+        if event == FALLBACK:
+            self.fallbacks.append(str(kwargs.get("fun_name", "")))
         if event in OF_JAX:
             end, detail = self.now(), str(kwargs.get("fun_name", ""))
             beside = threading.get_ident() != self.thread

@@ -1,6 +1,7 @@
 """Where a run's seconds go: every instant counted once, and jax's part told from ours."""
 
 import json
+import logging
 import time
 from threading import Thread
 
@@ -119,6 +120,20 @@ def test_a_profile_is_left_in_the_folder_and_on_the_terminal(tmp_path, capsys):
     (reading,) = (row.split(",") for row in rows if row.startswith("reading"))
     assert float(reading[1]) == pytest.approx(0.06, abs=0.05)
     assert json.loads((tmp_path / "profile.json").read_text())["traceEvents"]
+
+
+def test_a_program_without_a_kernel_is_named(tmp_path, capsys):
+    sorting = Program(lambda x, _: jnp.sort(x), Argument((3,), float, lanes=True), name="sorting")
+    log = logging.getLogger("lanes.program")
+    log.setLevel(logging.INFO)  # the suite fails what it hears of a fallback
+    try:
+        with profiling(True, quiet=False) as into:
+            sorting(np.ones((3, 2)), lanes=2)
+            into(tmp_path)
+    finally:
+        log.setLevel(logging.DEBUG)
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Through XLA, not as a kernel: sorting: no rule for primitive sort." in text
 
 
 def test_nothing_is_left_unless_it_is_asked_for(tmp_path):
