@@ -147,7 +147,7 @@ class Beyond(ReferenceInlet):
             through = state.motion.attitude.to_body(state.motion.velocity)
             factor = jnp.sqrt(1.0 + self.lift * (through.x * through.x + through.y * through.y))
             acting = tuple(factor * speed for speed in acting)
-        if self.loss is not None:
+        if self.loss is not None and self.begin is not None:
             lost = jnp.where(step * stages.schedule.step >= self.begin, self.loss, 0.0)
             acting = tuple(jnp.sqrt(1.0 - lost[i]) * speed for i, speed in enumerate(acting))
         return speeds, acting

@@ -153,7 +153,7 @@ def drawn(seed: int, effect: Effect = NOTHING) -> Lab:
     }
     for group, coefficients in effects.items():
         values |= coefficients if has[group] else {}
-    vehicle = with_values(base, values | effect.values)
+    vehicle = with_values(base, {**values, **effect.values})
     battery = vehicle.battery.replace(reference_voltage=VOLTS)
     return Lab(
         vehicle=vehicle.replace(battery=battery),
