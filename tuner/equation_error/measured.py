@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -114,10 +113,10 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
         step=1.0 / rate,
         time=middle,
         motion=Motion(
-            Vec3.of(jnp.asarray(state.position.T)),
-            Vec3.of(jnp.asarray(state.velocity.T)),
-            Quaternion.of(jnp.asarray(state.attitude.T)),
-            Vec3.of(jnp.asarray(np.nan_to_num(state.body_rate).T)),
+            Vec3.of(state.position.T),
+            Vec3.of(state.velocity.T),
+            Quaternion.of(state.attitude.T),
+            Vec3.of(np.nan_to_num(state.body_rate).T),
         ),
         # where it is unknown, one that some rotor might have: derivatives by none are not finite
         rotor_speed=np.where(np.isfinite(mean), mean, np.nanmean(mean)),
@@ -126,6 +125,11 @@ def measured(flight: Flight, *, input_late: float = 0.0) -> Measured | None:
         weights=weights,
         noise=_noise(rotors),
     )
+
+
+def rows_of(vector: Vec3) -> Array:
+    """Return a vector's components on the host (N, 3)."""
+    return np.stack([np.asarray(vector.x), np.asarray(vector.y), np.asarray(vector.z)], axis=1)
 
 
 def _read(series: Series, times: Array) -> Array:

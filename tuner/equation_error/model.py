@@ -119,7 +119,7 @@ def _joined(flights: Sequence[Measured], every: int) -> tuple[Motion, Array, Arr
     """Return motion, rotor speeds and their change at every so many steps of all flights."""
     motions = [jax.tree.map(lambda leaf: leaf[::every], part.motion) for part in flights]
     return (
-        jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *motions),
+        jax.tree.map(lambda *leaves: np.concatenate(leaves), *motions),
         np.concatenate([part.rotor_speed[::every] for part in flights]),
         np.concatenate([part.rotor_acceleration[::every] for part in flights]),
     )

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tuner.equation_error.measured import Measured
+from tuner.equation_error.measured import Measured, rows_of
 from tuner.equation_error.model import Accelerations, Linear
 from tuner.equation_error.regression import ROBUST, convolved, spread, whitening
 from tuner.recordings.flight import Array
@@ -234,8 +234,8 @@ def _moved(part: Measured) -> list[Measured]:
 def _motion(part: Measured, one: Linear, mean: float) -> _Motion:
     through = part.motion.attitude.to_body(part.motion.velocity)
     return _Motion(
-        v=np.asarray(through.stacked()).T,
-        w=np.asarray(part.motion.body_rate.stacked()).T,
+        v=rows_of(through),
+        w=rows_of(part.motion.body_rate),
         faster=part.rotor_speed.mean(axis=1) / mean - 1.0,
         modelled=part.accelerations - one.left,
     )

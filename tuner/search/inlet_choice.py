@@ -10,7 +10,7 @@ import numpy as np
 
 from tuner.config.job import InletName
 from tuner.core.errors import RecordingError
-from tuner.equation_error.measured import Measured, measured
+from tuner.equation_error.measured import Measured, measured, rows_of
 from tuner.equation_error.regression import convolved
 from tuner.findings.findings import Code, Finding
 from tuner.objective.explained import Explained, Source, explained, levers
@@ -52,8 +52,8 @@ def regressors(steps: Measured, vehicle: VehicleFile) -> tuple[Array, Array, Arr
     rotors' speeds, and a steady part.
     """
     speed, motion = steps.rotor_speed, steps.motion
-    body = np.asarray(motion.attitude.to_body(motion.velocity).stacked()).T
-    rate = np.asarray(motion.body_rate.stacked()).T
+    body = rows_of(motion.attitude.to_body(motion.velocity))
+    rate = rows_of(motion.body_rate)
     torque, total = np.square(speed) @ levers(vehicle), speed.sum(axis=1)
     steady = np.ones(len(speed))
     across = (body[:, 1], body[:, 0])

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,6 +25,7 @@ from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
+from sim_jax.vehicle import Motor
 from tuner.equation_error.measured import Measured, measured
 from tuner.equation_error.unexplained import Flown, Law, unexplained
 from tuner.findings.findings import Code, Finding
@@ -87,11 +90,17 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     }
     environment = environment_of(model, segments, conditions)
     driven = [not _tells_speeds(flight) for flight in flights]
+    commands = {
+        number: flight.series["command"]
+        for number, flight in enumerate(flights)
+        if driven[number] and "command" in flight.series
+    }
+    speeds = _driven(commands, model, environment, schedule)
     read = []
     for number, flight in enumerate(flights):
         series = dict(flight.series)
-        if driven[number] and "command" in series:
-            series["rotor_speed"] = _driven(series["command"], model, environment, schedule, number)
+        if number in speeds:
+            series["rotor_speed"] = speeds[number]
         read.append(_recorded(replace(flight, series=series), model, conditions, number))
     flown = fly(
         objective.model,
@@ -199,30 +208,46 @@ def _less(series: Series, other: Series) -> Series:
 
 
 def _driven(
-    commands: Series, model: Model, environment: Environment, schedule: Schedule, number: int
-) -> Series:
-    """Return the rotor speeds that a flight's commands ask for, late as the motors are."""
-    motor, time = model.vehicle.motor, commands.time
-    asked = np.array(reference_speed(motor, jnp.asarray(commands.values)))
-    if environment.log_voltage is not None:
-        volts = np.asarray(environment.log_voltage)[:, number]
-        tick = np.clip((time * schedule.position_control_rate).astype(int), 0, len(volts) - 1)
-        exponent = float(model.vehicle.effects["battery_exponent"])
-        asked *= np.exp(exponent * volts[tick])[:, None]
-    if environment.battery_decline is not None:
-        asked *= 1.0 - float(environment.battery_decline[number]) * np.maximum(time, 0.0)[:, None]
-    lag = Lag.over(motor, jnp.asarray(np.diff(time, prepend=time[0])))
-    up, down = np.asarray(lag.decay_up), np.asarray(lag.decay_down)
-    speeds = asked.copy()
-    for row in range(1, len(asked)):
-        before, now = asked[row - 1], speeds[row - 1]
-        speeds[row] = before + np.where(before > now, up[row], down[row]) * (now - before)
-    return Series(time + float(model.vehicle.setup.actuator_latency), speeds)
+    commands: Mapping[int, Series], model: Model, environment: Environment, schedule: Schedule
+) -> dict[int, Series]:
+    """Return the rotor speeds that flights' commands ask for, late as the motors are."""
+    if not commands:
+        return {}
+    late = float(model.vehicle.setup.actuator_latency)
+    values = np.concatenate([series.values for series in commands.values()])
+    steps = [np.diff(series.time, prepend=series.time[0]) for series in commands.values()]
+    found = _motor_answers(model.vehicle.motor, values, np.concatenate(steps)[:, None])
+    ends = np.cumsum([len(series.time) for series in commands.values()])[:-1]
+    answers = zip(*(np.split(np.asarray(part), ends) for part in found), strict=True)
+    driven = {}
+    for (number, series), (curve, up, down) in zip(commands.items(), answers, strict=True):
+        time, asked = series.time, curve.copy()
+        if environment.log_voltage is not None:
+            volts = np.asarray(environment.log_voltage)[:, number]
+            tick = np.clip((time * schedule.position_control_rate).astype(int), 0, len(volts) - 1)
+            exponent = float(model.vehicle.effects["battery_exponent"])
+            asked *= np.exp(exponent * volts[tick])[:, None]
+        if environment.battery_decline is not None:
+            decline = float(environment.battery_decline[number])
+            asked *= 1.0 - decline * np.maximum(time, 0.0)[:, None]
+        speeds = asked.copy()
+        for row in range(1, len(asked)):
+            before, now = asked[row - 1], speeds[row - 1]
+            speeds[row] = before + np.where(before > now, up[row], down[row]) * (now - before)
+        driven[number] = Series(time + late, speeds)
+    return driven
+
+
+@eqx.filter_jit
+def _motor_answers(motor: Motor, commands: Array, steps: Array) -> tuple[Any, Any, Any]:
+    """Return the speeds that commands ask for, and the shares of a difference that steps leave."""
+    lag = Lag.over(motor, jnp.asarray(steps))
+    return reference_speed(motor, jnp.asarray(commands)), lag.decay_up, lag.decay_down
 
 
 def _through_air(part: Measured, conditions: Mapping[str, Array], number: int) -> Measured:
     x, y = (conditions.get(name, np.zeros(number + 1))[number] for name in ("wind_x", "wind_y"))
-    wind = Vec3(jnp.asarray(x), jnp.asarray(y), jnp.zeros(()))
+    wind = Vec3(np.asarray(x), np.asarray(y), np.zeros(()))
     motion = part.motion
     moved = Motion(motion.position, motion.velocity - wind, motion.attitude, motion.body_rate)
     return replace(part, motion=moved)
@@ -243,8 +268,8 @@ def _simulated(
 
     rows, attitude, speeds = at(MOTION), at(TURNED), at("rotor_speed")
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
-    position, velocity, turning = (Vec3.of(jnp.asarray(rows[:, at].T)) for at in _PARTS)
-    motion = Motion(position, velocity, Quaternion.of(jnp.asarray(attitude.T)), turning)
+    position, velocity, turning = (Vec3.of(rows[:, at].T) for at in _PARTS)
+    motion = Motion(position, velocity, Quaternion.of(attitude.T), turning)
     flown = replace(
         part,
         motion=motion,
