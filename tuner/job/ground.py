@@ -215,6 +215,8 @@ def _has_scale(name: str, value: float) -> bool:
 def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
     """Return the vehicle with the measured coefficients.
 
+    A lag is zero where experiments that each have it near zero combine to less.
+
     Raises
     ------
     ConfigError
@@ -224,6 +226,7 @@ def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> Vehi
         name: value_of(name, float(scaled))
         for name, scaled in zip(combination.names, combination.scaled, strict=True)
     }
+    values |= {n: max(v, 0.0) for n, v in values.items() if COEFFICIENTS[n].unit == "s"}
     moments = [name for name in values if COEFFICIENTS[name].place[0] == "inertia"]
     try:
         return with_values(start, values)

@@ -9,11 +9,13 @@ import pytest
 from tests.tuner.recordings.micro_sd import log_of
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
+from tuner.core.shipped import configs_folder
 from tuner.evaluate.simulate import simulate
 from tuner.findings.findings import Code, one_line
+from tuner.ground.combination import Combination
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.ground import least_noticed
+from tuner.job.ground import least_noticed, vehicle_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.recordings import inspect_recordings
 from tuner.recordings.inertial import read_inertial
@@ -254,3 +256,22 @@ def test_beside_flights_with_a_pose_those_without_one_are_left_out(simulation, f
     assert [recording.flight.name for recording in usable] == ["circle_4mps"]
     assert left_out.subject == "log00"
     assert "by themselves" in one_line(left_out)
+
+
+def test_lags_near_zero_that_combine_to_less_are_zero(tmp_path):
+    combination = Combination(
+        names=("actuator_latency",),
+        scaled=np.array([-0.002]),
+        information=np.array([[1e6]]),
+        covariance=np.array([[1e-6]]),
+        determined=np.array([True]),
+        chi_square=0.0,
+        degrees_of_freedom=1,
+        p_value=1.0,
+    )
+    vehicle = vehicle_of(
+        tmp_path / "a.ulg",
+        read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml"),
+        combination,
+    )
+    assert vehicle.setup.actuator_latency == 0.0
