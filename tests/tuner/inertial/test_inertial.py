@@ -268,6 +268,7 @@ def test_lags_near_zero_that_combine_to_less_are_zero(tmp_path):
         chi_square=0.0,
         degrees_of_freedom=1,
         p_value=1.0,
+        conflicts=(),
     )
     vehicle = vehicle_of(
         tmp_path / "a.ulg",
