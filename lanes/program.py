@@ -295,34 +295,44 @@ class _Compiled:
             (np.dtype(a.dtype).itemsize for a in program.arguments if _is_real(a.dtype)), default=8
         )
         self.width = max(register_bytes() // widest, 1)
-        made = self._made() if program.key is None else kept(program.key, self._made)
-        head, _, code = made.partition(b"\n")
-        known = json.loads(head)
-        self.structure: Any = PyTreeDef.deserialize_using_proto(
-            default_registry, bytes.fromhex(known["structure"])
-        )
-        self.outputs = [
-            jax.ShapeDtypeStruct(tuple(shape), dtype) for shape, dtype in known["outputs"]
-        ]
-        self.moved: list[bool] = known["moved"]
+        self.structure: Any
+        self.outputs: list[jax.ShapeDtypeStruct]
+        self.moved: list[bool]
+        if program.key is None:
+            self.structure, self.outputs, self.moved, code = self._made()
+        else:
+            head, _, code = kept(program.key, self._to_keep).partition(b"\n")
+            known = json.loads(head)
+            self.structure = PyTreeDef.deserialize_using_proto(
+                default_registry, bytes.fromhex(known["structure"])
+            )
+            self.outputs = [
+                jax.ShapeDtypeStruct(tuple(shape), dtype) for shape, dtype in known["outputs"]
+            ]
+            self.moved = known["moved"]
         self.code = Code(code, "run")
         void, whole = ctypes.c_void_p, ctypes.c_int64
         self.function = ctypes.CFUNCTYPE(None, *[void] * 5, *[whole] * 5)(self.code.address)
 
-    def _made(self) -> bytes:
-        """Return the object code behind a line on what it returns: traced, lowered, compiled."""
+    def _made(self) -> tuple[Any, list[jax.ShapeDtypeStruct], list[bool], bytes]:
+        """Return what the program returns, which of it moves, and the object code."""
         program = self.program
         closed, shapes, lengths = program._traced
         outputs, structure = jax.tree.flatten(shapes)
         flags = [False] * len(program.arguments) + [True] * len(program.moving)
-        moved = list(dependent(closed.jaxpr, flags))
+        moved = [bool(moves) for moves in dependent(closed.jaxpr, flags)]
         layout = Layout(program.arguments, program.moving, program.columns, lengths, outputs, moved)
         began = time.perf_counter()
         code = object_code(layout.written(closed, self.width))
         spent = time.perf_counter() - began
         jax.monitoring.record_event_duration_secs(BUILT, spent, fun_name=program.name)
+        return structure, outputs, moved, code
+
+    def _to_keep(self) -> bytes:
+        """Return the object code behind a line on what it returns."""
+        structure, outputs, moved, code = self._made()
         head = {
-            "structure": structure.serialize_using_proto().hex(),  # type: ignore[attr-defined]
+            "structure": structure.serialize_using_proto().hex(),
             "outputs": [(shape.shape, str(shape.dtype)) for shape in outputs],
             "moved": moved,
         }

@@ -30,7 +30,7 @@ def jacobian(factor):
 
 COUNTED = {"forward": (flight, 6_943, 94), "jacobian": (jacobian, 102_175, 94)}
 """Function, floating-point operations, and transcendental functions among what it calls."""
-MOST_PROGRAMS = 245
+MOST_PROGRAMS = 30
 """Programs, small ones too, that the fit of the shipped flights asks jax for."""
 
 
@@ -56,5 +56,4 @@ def test_a_fit_asks_for_as_few_programs_as_it_did(demo):
     with (folder / "profile.csv").open() as table:
         rows = list(csv.DictReader(table))
     asked = {row["stage"]: int(row["programs"]) for row in rows}
-    assert asked["search"] > 0
-    assert sum(asked.values()) <= MOST_PROGRAMS, asked
+    assert 0 < sum(asked.values()) <= MOST_PROGRAMS, asked

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import fields
+
+from tuner.options import Options
 
 FIELDS: Mapping[str, str] = {
     "config": "the settings",
@@ -23,13 +26,18 @@ KEYS: Mapping[str, str] = {"config": "settings"}
 """Option of `tune` -> key of a request, where that is not its name."""
 _OPTION = re.compile(rf"--({'|'.join(FIELDS)})\b(?!-)( [A-Z]+\b)?")
 _ANY = re.compile(r"--([a-z]+(?:-[a-z]+)*)\b")
+_ASKED = {field.name for field in fields(Options)}
 _COMMAND = re.compile(r",? which tune inspect FILE --suggest begins")
 
 
 def over_http(text: str) -> str:
     """Return a message with keys of a request in place of options of the command line."""
-    text = _COMMAND.sub("", text)
-    return _ANY.sub(lambda found: KEYS.get(found[1], found[1].replace("-", "_")), text)
+
+    def key(found: re.Match[str]) -> str:
+        name = found[1].replace("-", "_")
+        return KEYS.get(name, name) if name in _ASKED else found[0]
+
+    return _ANY.sub(key, _COMMAND.sub("", text))
 
 
 def on_the_web(text: str) -> str:

@@ -8,7 +8,7 @@ from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.cli.results import LINES, WIDTH, print_run
 from tuner.evaluate.records import AxesRmse
-from tuner.findings.findings import Finding
+from tuner.findings.findings import Code, Finding
 from tuner.result import read_run
 from tuner.vehicle import COEFFICIENTS
 
@@ -46,6 +46,7 @@ def test_many_warnings_and_coefficients_still_fit(folder, capsys):
         Finding(made.code, "warning", f"a flight with a rather long name, {made.subject}",
                 made.numbers, made.names)
         for made in MADE.values()
+        if made.code is not Code.TERM_SHOWS  # its subject is a term
     )  # fmt: skip
     flights = tuple(
         result.flights[1].model_copy(update={"name": f"held_{number}"}) for number in range(9)

@@ -122,6 +122,8 @@ def test_coefficients_that_an_inlet_bypasses_are_not_fitted(updated, flight):
     assert bypassed_by(["rotor_speed", "actuator"], [flight] * 2) == {
         "estimate_latency",
         "gyro_cutoff",
+        "rate_gain_roll_pitch",
+        "rate_gain_yaw",
     }
     with pytest.raises(ConfigError, match="leaves no coefficient that acts"):
         space_of(

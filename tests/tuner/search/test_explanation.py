@@ -38,7 +38,7 @@ def test_a_part_that_fails_is_named_and_the_rest_goes_on() -> None:
     (finding,) = explanation.findings
     assert (finding.code, finding.subject) == (Code.PART_FAILED, "intervals")
     assert told == [one_line(finding)]
-    assert f"LinAlgError: {CONVERGE}" in told[0]
+    assert f"LinAlgError, {CONVERGE}" in told[0]
 
 
 def test_a_full_disk_is_no_part() -> None:
