@@ -16,7 +16,7 @@ from tuner.vehicle_api import Named, export, simulate, text_of
 
 if TYPE_CHECKING:
     from tuner.client.client import Client
-    from tuner.evaluate.compare import Table
+    from tuner.evaluate.comparison_table import Table
     from tuner.job.sensitivity import SensitivityResult
 
 __all__ = [

@@ -11,8 +11,8 @@ from rich.table import Table
 
 if TYPE_CHECKING:
     from tuner.config import Settings
-    from tuner.evaluate.compare import Row
-    from tuner.evaluate.compare import Table as Comparison
+    from tuner.evaluate.comparison_table import Row
+    from tuner.evaluate.comparison_table import Table as Comparison
     from tuner.evaluate.write import Summary
     from tuner.exporters.export import Exported
     from tuner.vehicle.scaling_laws import Estimate

@@ -9,7 +9,7 @@ from pathlib import Path
 from tuner.core.disk import exists, file_name
 from tuner.core.errors import InputError
 from tuner.design.proposals import Proposals
-from tuner.evaluate.compare import Table
+from tuner.evaluate.comparison_table import Table
 from tuner.ground.bench_json import BenchRecord
 from tuner.recordings.flight import Array
 from tuner.report.record import About, Recording, SearchRecord, read_traces

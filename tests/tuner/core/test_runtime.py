@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tuner.core import runtime
 
 REPORT = """
@@ -76,3 +78,20 @@ def test_garbage_is_looked_for_rarely_unless_the_user_wants_it_rarer_still() -> 
         assert gc.get_threshold() == (10 * rarely[0], 1, 1)
     finally:
         gc.set_threshold(*before)
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        "tuner.cli.results",
+        "tuner.cli.progress",
+        "tuner.report",
+        "tuner.result",
+        "tuner.client.client",
+    ],
+)
+def test_what_is_imported_before_jax_is_set_up_does_without_it(module: str) -> None:
+    # the environment that `configure` sets is read when jax is imported
+    code = f"import sys, {module}; print('jax' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
