@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import sys
+import types
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -25,7 +26,7 @@ TRACED_BY = ("jax", "jaxlib", "equinox", "numpy")
 
 
 class UnknownError(TypeError):
-    """A value has no digest; its message names its type."""
+    """A value has no digest; its message names what has none."""
 
 
 def digest_of(value: Any, packages: tuple[str, ...]) -> str:
@@ -34,7 +35,8 @@ def digest_of(value: Any, packages: tuple[str, ...]) -> str:
     Parameters
     ----------
     value
-        Of numbers, texts, arrays, containers, dataclasses, classes and functions of modules.
+        Of numbers, texts, arrays, containers, dataclasses, and of classes and functions of these
+        packages, of the standard library and of `TRACED_BY`.
     packages
         Whose code is run while a function is traced.
 
@@ -43,24 +45,38 @@ def digest_of(value: Any, packages: tuple[str, ...]) -> str:
     UnknownError
         There is something else in it.
     """
-    parts = (_encoded(value), _sources(("lanes", *packages)), str(jax.config.jax_enable_x64))  # type: ignore[attr-defined]
+    packages = ("lanes", *packages)
+    parts = (_encoded(value, packages), _sources(packages), str(jax.config.jax_enable_x64))  # type: ignore[attr-defined]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _encoded(value: Any) -> str:
-    kind = type(value)
+def _encoded(value: Any, packages: tuple[str, ...]) -> str:
+    def inside(part: Any) -> str:
+        return _encoded(part, packages)
+
     if isinstance(value, dict):
-        content = ", ".join(f"{_encoded(k)}: {_encoded(each)}" for k, each in value.items())
+        content = ", ".join(f"{inside(k)}: {inside(each)}" for k, each in value.items())
     elif isinstance(value, tuple | list):
-        content = ", ".join(map(_encoded, value))
+        content = ", ".join(map(inside, value))
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-        content = _encoded([(f.name, getattr(value, f.name)) for f in dataclasses.fields(value)])
+        content = inside([(f.name, getattr(value, f.name)) for f in dataclasses.fields(value)])
     else:
-        content = _of_one(value)
-    return f"{kind.__module__}.{kind.__qualname__}({content})"
+        content = _of_one(value, packages)
+    return f"{_named(type(value), packages)}({content})"
 
 
-def _of_one(value: Any) -> str:
+def _named(code: Any, packages: tuple[str, ...]) -> str:
+    """Return the name of a class or function, whose source is part of the digest."""
+    where, name = (getattr(code, key, None) or "<>" for key in ("__module__", "__qualname__"))
+    top = where.partition(".")[0]
+    known = top in (*packages, *TRACED_BY) or top in sys.stdlib_module_names
+    of_object = not isinstance(getattr(code, "__self__", None), type(None) | types.ModuleType)
+    if not known or "<" in name or of_object or getattr(code, "__closure__", None):
+        raise UnknownError(f"{where}.{name}")
+    return f"{where}.{name}"
+
+
+def _of_one(value: Any, packages: tuple[str, ...]) -> str:
     """Return what tells a value that holds no others from all of its type."""
     if value is None or isinstance(value, bool | int | str):
         content = repr(value)
@@ -72,10 +88,7 @@ def _of_one(value: Any) -> str:
         array = np.asarray(value)
         content = f"{array.dtype.str} {array.shape} {array.tobytes().hex()}"
     else:
-        where, name = (getattr(value, key, "<>") for key in ("__module__", "__qualname__"))
-        if "<" in f"{where}{name}" or getattr(value, "__closure__", None):
-            raise UnknownError(type(value).__qualname__)
-        content = f"{where}.{name}"
+        content = _named(value, packages)
     return content
 
 

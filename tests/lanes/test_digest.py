@@ -24,6 +24,16 @@ class _Other:
     static: Any = None
 
 
+class _Counter:
+    def __init__(self, by: int) -> None:
+        self.by = by
+
+    def times(self, x: float) -> float:
+        return self.by * x
+
+
+HERE = ("tests",)
+"""Whose source is read for the classes of this module."""
 DIFFERENT = [
     None,
     0,
@@ -60,15 +70,21 @@ DIFFERENT = [
 
 
 def test_what_differs_has_another_digest():
-    assert len({digest_of(value, ()) for value in DIFFERENT}) == len(DIFFERENT)
-    assert digest_of(_Module(np.ones(2)), ()) == digest_of(_Module(np.ones(2)), ())
+    assert len({digest_of(value, HERE) for value in DIFFERENT}) == len(DIFFERENT)
+    assert digest_of(_Module(np.ones(2)), HERE) == digest_of(_Module(np.ones(2)), HERE)
 
 
 def test_what_cannot_be_told_has_none():
     def made(by: float) -> Callable[[float], float]:
         return lambda x: x * by
 
-    for value in (made(2.0), object(), (1, {"a": lambda x: x})):
+    for value in (made(2.0), object(), (1, {"a": lambda x: x}), _Counter(2).times):
+        with pytest.raises(UnknownError):
+            digest_of(value, HERE)
+
+
+def test_code_whose_source_is_not_read_has_none():
+    for value in (_Module, _Module(1.0), test_what_differs_has_another_digest):
         with pytest.raises(UnknownError):
             digest_of(value, ())
 

@@ -20,8 +20,9 @@ from sim_jax.environment import Environment
 from sim_jax.numeric import Array as JaxArray
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
+from sim_jax.terms import total
 from sim_jax.terms.air import Air
-from sim_jax.terms.total import TERMS, wrench_of_each_term
+from sim_jax.terms.total import wrench_of_each_term
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Vehicle
 from tuner.objective.flown import CODE
@@ -105,7 +106,7 @@ def acting(
 @lru_cache(maxsize=16)
 def _program(arguments: tuple[Argument, ...], structure: Any) -> Program:
     tree = jax.tree.unflatten(structure, arguments)
-    return Program(_acting, tree, name="forces", made_of=(), packages=CODE)
+    return Program(_acting, tree, name="forces", made_of=total.TERMS, packages=CODE)
 
 
 def _acting(given: Any, _: Mapping[str, int]) -> dict[str, JaxArray]:
@@ -152,7 +153,7 @@ def forces_of(vehicle: Vehicle, time: Array, signals: Mapping[str, Array]) -> Fo
 
 def in_order(parts: Mapping[str, T]) -> dict[str, T]:
     """Return term -> what belongs to it, in the order of the simulator's terms, gravity last."""
-    names = (*(term.__name__ for term in TERMS), WEIGHT)
+    names = (*(term.__name__ for term in total.TERMS), WEIGHT)
     return {name: parts[name] for name in names if name in parts}
 
 

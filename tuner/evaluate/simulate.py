@@ -23,6 +23,7 @@ from sim_jax.precision import Precision
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import State, hover
+from sim_jax.terms import total
 from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError, did_you_mean
@@ -380,7 +381,7 @@ def _program(
         fly,
         jax.tree.unflatten(structure, leaves),
         name="simulated flight",
-        made_of=(schedule, precision),
+        made_of=(schedule, precision, total.TERMS),
         packages=CODE,
     )
 

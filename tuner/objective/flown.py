@@ -27,6 +27,7 @@ from sim_jax.inlet import Inlet
 from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
+from sim_jax.terms import total
 from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import Model, with_coefficients
@@ -243,7 +244,7 @@ def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> P
         arguments,
         at_once=AT_ONCE,
         name="flight of a segment",
-        made_of=static,
+        made_of=(static, total.TERMS),
         packages=CODE,
     )
 

@@ -153,6 +153,12 @@ class Flight:
         """Whether it is a yaw spin in which nothing holds position, roll and pitch."""
         return self.yaw_rate_setpoint is not None and not self.level_held
 
+    @property
+    def tells_speeds(self) -> bool:
+        """Whether every rotor has a tachometer."""
+        speeds = self.series.get("rotor_speed")
+        return speeds is not None and bool(np.isfinite(speeds.values).any(axis=0).all())
+
     def until(self, seconds: float) -> Flight:
         """Return the flight up to a time in s since its start."""
         inside = self.time <= seconds

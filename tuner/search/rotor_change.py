@@ -95,7 +95,7 @@ def change_of(flight: Flight, vehicle: VehicleFile) -> Change | None:
     vehicle
         Gives the curve from command to speed, where only commands were recorded.
     """
-    source: Source = "rotor_speed" if _all_rotors(flight) else "command"
+    source: Source = "rotor_speed" if flight.tells_speeds else "command"
     known = {"position", "attitude", "body_rate", source} <= set(flight.series)
     if not known or len(vehicle.rotors) != 4 or flight.duration < 2.0 * SHORTEST:
         return None
@@ -107,12 +107,6 @@ def change_of(flight: Flight, vehicle: VehicleFile) -> Change | None:
     if whole.sum() < max(2 * least, 2 * motion.shape[1]):
         return None
     return _step(shares[whole], motion[whole], edges[:-1][whole], flight.duration)
-
-
-def _all_rotors(flight: Flight) -> bool:
-    """Return whether every rotor has a tachometer."""
-    speeds = flight.series.get("rotor_speed")
-    return speeds is not None and bool(np.isfinite(speeds.values).any(axis=0).all())
 
 
 def _shares(flight: Flight, vehicle: VehicleFile, source: Source, edges: Array) -> Array:

@@ -89,7 +89,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         for row, name in enumerate(objective.conditions)
     }
     environment = environment_of(model, segments, conditions)
-    driven = [not _tells_speeds(flight) for flight in flights]
+    driven = [not flight.tells_speeds for flight in flights]
     commands = {
         number: flight.series["command"]
         for number, flight in enumerate(flights)
@@ -170,12 +170,6 @@ def _recorded(
         flight = replace(flight, series={**flight.series, **_of_body(flight.series, model)})
     steps = measured(flight)
     return None if steps is None else _through_air(steps, conditions, number)
-
-
-def _tells_speeds(flight: Flight) -> bool:
-    """Return whether every rotor has a tachometer."""
-    speeds = flight.series.get("rotor_speed")
-    return speeds is not None and bool(np.isfinite(speeds.values).any(axis=0).all())
 
 
 def _of_body(series: Mapping[str, Series], model: Model) -> dict[str, Series]:

@@ -1,8 +1,12 @@
 import math
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from sim_jax.rigid_body import Wrench
+from sim_jax.terms import total
+from sim_jax.vector import Vec3
 from tuner.config import TrajectorySettings
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
@@ -153,3 +157,22 @@ def test_a_grid_in_single_precision_is_the_grid(vehicle):
         np.testing.assert_allclose(
             quick_flight.signals["position"], exact_flight.signals["position"], atol=1e-4
         )
+
+
+def pushed_east(_vehicle, _motion, _rotor_speed, air):
+    return Wrench(Vec3.of(jnp.asarray([PUSH["newton"], 0.0, 0.0])), Vec3.zeros(air.velocity.x))
+
+
+PUSH = {"newton": 0.0}
+
+
+def test_a_force_that_is_defined_elsewhere_is_never_taken_from_what_is_kept(vehicle, monkeypatch):
+    monkeypatch.setattr(total, "TERMS", (*total.TERMS, pushed_east))
+    east = []
+    for newton in (0.0, 1.0):
+        monkeypatch.setitem(PUSH, "newton", newton)
+        module._program.cache_clear()  # as in another process
+        (hover,) = fly(vehicle, "hover")
+        east.append(hover.signals["position"][-1, 0])
+    module._program.cache_clear()
+    assert east[1] - east[0] > 0.01
