@@ -2,7 +2,9 @@
 
 ``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes. With
 ``TUNE_LAB_WORKERS`` so many processes take a seed each. Two laboratories of three have an effect
-that a fit may not know (`benchmarks.lab_effects`); ``TUNE_LAB_EFFECT`` names it for all.
+that a fit may not know (`benchmarks.lab_effects`); ``TUNE_LAB_EFFECT`` names it for all, ``none``
+the right model for all, which has a section of its own. ``TUNE_LAB_KEPT`` names a file that keeps
+each laboratory as soon as it is fitted, and from which the next run with the same effect goes on.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from pydantic import BaseModel, ConfigDict
 
-from benchmarks.lab_effects import KNOWN, effect_of
+from benchmarks.lab_effects import CHOICE, KNOWN, effect_of
 from benchmarks.lab_flights import METER, SECONDS, TRAJECTORIES, VOLTS, Lab, drawn, write
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
@@ -39,12 +42,14 @@ from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
 from tuner.terms.shown import terms_shown
 from tuner.uncertainty.estimates import Estimate, Uncertainty
+from tuner.uncertainty.lacking import laws_lacking
 from tuner.vehicle import COEFFICIENTS, values_of
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
 CONFIDENT = 3.0
 """Quoted errors beyond which a number is wrong that was said to be known."""
 WORKERS = int(os.environ.get("TUNE_LAB_WORKERS", "0")) or None
+KEPT = os.environ.get("TUNE_LAB_KEPT")
 
 
 @dataclass(frozen=True)
@@ -86,14 +91,43 @@ class Trial:
         return float(value * (self.voltage / VOLTS) ** known.get("battery_exponent", 0.0))
 
 
+class Kept(BaseModel):
+    """A trial in a line of a file."""
+
+    model_config = ConfigDict(ser_json_inf_nan="constants")
+
+    seed: int
+    effect: str
+    trial: Trial
+
+
 def measure() -> Section:
     """Fly, fit and compare every seed."""
-    trials = []
+    file = None if KEPT is None else Path(KEPT)
+    trials = {} if file is None else kept(file, CHOICE)
+    for seed in trials:
+        print(_line(seed, trials[seed]), flush=True)
+    rest = [seed for seed in SEEDS if seed not in trials]
     with engine_for(WORKERS) as engine:
-        for seed, trial in zip(SEEDS, engine.stream(_task, SEEDS), strict=True):
-            trials.append(trial)
+        for seed, trial in zip(rest, engine.stream(_task, rest), strict=True):
+            trials[seed] = trial
             print(_line(seed, trial), flush=True)
-    return section(trials)
+            if file is not None:
+                keep(file, Kept(seed=seed, effect=CHOICE, trial=trial))
+    return section([trials[seed] for seed in SEEDS])
+
+
+def keep(file: Path, one: Kept) -> None:
+    """Append a trial to a file."""
+    with file.open("a", encoding="utf-8") as lines:
+        lines.write(one.model_dump_json() + "\n")
+
+
+def kept(file: Path, effect: str) -> dict[int, Trial]:
+    """Return seed -> trial of those that a file keeps for an effect; none if there is no file."""
+    lines = file.read_bytes().splitlines() if file.exists() else []
+    every = [Kept.model_validate_json(line) for line in lines]
+    return {one.seed: one.trial for one in every if one.effect == effect}
 
 
 def section(trials: Sequence[Trial]) -> Section:
@@ -115,10 +149,14 @@ def section(trials: Sequence[Trial]) -> Section:
         "quotes how far linear fits to those flights scatter; beside it the median of how many "
         "times as wide the quoted interval is. It knows nothing of terms that a fit lacks, or has "
         f"in vain. {_held_of_all(trials)}"
-        f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit. Two "
-        "laboratories of three have an effect beside these terms, some of which no coefficient "
-        f"describes:\n\n{_by_effect(trials)}\n\nAnd by coefficient:"
+        f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
     )
+    effects = any(trial.lab.effect.name for trial in trials)
+    if effects:
+        text += (
+            " Two laboratories of three have an effect beside these terms, some of which no "
+            f"coefficient describes:\n\n{_by_effect(trials)}\n\nAnd by coefficient:"
+        )
     head = [
         "coefficient",
         "fits",
@@ -129,7 +167,8 @@ def section(trials: Sequence[Trial]) -> Section:
         "of an oracle's",
         "hold the truth",
     ]
-    return Section("Simulated lab flights", text, head, list(_rows(trials)))
+    title = f"Simulated lab flights{' with effects' if effects else ''}"
+    return Section(title, text, head, list(_rows(trials)))
 
 
 def _held_of_all(trials: Sequence[Trial]) -> str:
@@ -252,6 +291,7 @@ def trial_of(seed: int) -> Trial:
         *said,
         *fitted.findings,
         *explanation.findings,
+        *laws_lacking(examination.laws, examination.uncertainty),
         *terms_shown(fitted, examination.uncertainty),
     )
     trial = Trial(lab, found, free, {}, seconds, reference, said)

@@ -1,7 +1,8 @@
 """The drawn laboratories are ones that fly, and the table of their fits counts right."""
 
+import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,14 +10,17 @@ import pytest
 
 from benchmarks import lab as laboratory
 from benchmarks import lab_effects, lab_flights
-from benchmarks.lab import Trial, _rows, _voltages, section
-from benchmarks.lab_effects import KNOWN, UNKNOWN, effect_of
+from benchmarks.lab import Kept, Trial, _rows, _voltages, keep, kept, section
+from benchmarks.lab_effects import KNOWN, UNKNOWN, Effect, effect_of
 from benchmarks.lab_flights import METER, SECONDS, drawn
 from sim_jax.constants import GRAVITY
 from sim_jax.schedule import Schedule
+from tuner.findings.findings import Code, Finding
 from tuner.objective.battery import VOLTAGE
 from tuner.recordings.flight import Series
+from tuner.uncertainty.estimates import Estimate
 from tuner.uncertainty.records import ErrorParts
+from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
 from tuner.vehicle import COEFFICIENTS, term_groups, values_of
 
 SEEDS = range(8)
@@ -103,8 +107,43 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     )
     assert "1 of 2 that are twice the oracle's" in part.text
     assert "In gusts" not in part.text
-    by_effect = "| none |  | 2 |  | 1 of 2 | 1 (motor_constant) | motor_constant +8.0 |  |"
-    assert by_effect in part.text.splitlines()
+    assert part.title == "Simulated lab flights"
+    assert "effect |" not in part.text
+    loss = Effect("rotor_damage", size=0.05)
+    with_effect = replace(trials[1], lab=replace(lab, effect=loss))
+    effects = section([trials[0], with_effect])
+    assert effects.title == "Simulated lab flights with effects"
+    by_effect = "| rotor damage |  | 1 |  | 0 of 1 | 1 (motor_constant) | motor_constant +8.0 |  |"
+    assert by_effect in effects.text.splitlines()
+
+
+def test_a_run_goes_on_from_the_laboratories_that_a_file_keeps(tmp_path, monkeypatch):
+    parts = ErrorParts(noise=1.0, residuals=2.0, lack=math.inf)
+    reason = Reason(code=ReasonCode.INTERVAL)
+    known = Estimate(1.0, 0.1, (0.8, 1.2), Verdict.WELL_KNOWN, reason, parts)
+    said = (Finding(Code.LAW_LACKING, "warning", "model", {"share": 0.1}, ("force_z",)),)
+    oracle = {"motor_constant": math.inf}
+    trial = Trial(drawn(0), ("battery",), {"motor_constant": known}, oracle, 1.0, 16.0, said)
+    file = tmp_path / "kept"
+    assert kept(file, "drawn") == {}
+    keep(file, Kept(seed=0, effect="drawn", trial=trial))
+    keep(file, Kept(seed=1, effect="none", trial=trial))
+    fitted = []
+
+    def fit(seed, _):
+        fitted.append(seed)
+        return trial
+
+    monkeypatch.setattr(laboratory, "_task", fit)
+    monkeypatch.setattr(laboratory, "SEEDS", (0, 1))
+    monkeypatch.setattr(laboratory, "KEPT", str(file))
+    laboratory.measure()
+    assert fitted == [1]
+    read = kept(file, "drawn")
+    assert list(read) == [0, 1]
+    assert all(replace(one, estimates={}) == replace(trial, estimates={}) for one in read.values())
+    (estimate,) = read[1].estimates.values()
+    assert (estimate.ci95, estimate.parts.noise) == (known.ci95, 1.0)
 
 
 @dataclass(frozen=True)
