@@ -70,8 +70,12 @@ def _named(code: Any, packages: tuple[str, ...]) -> str:
     where, name = (getattr(code, key, None) or "<>" for key in ("__module__", "__qualname__"))
     top = where.partition(".")[0]
     known = top in (*packages, *TRACED_BY) or top in sys.stdlib_module_names
-    of_object = not isinstance(getattr(code, "__self__", None), type(None) | types.ModuleType)
-    if not known or "<" in name or of_object or getattr(code, "__closure__", None):
+    # of a class, these are descriptors of its objects
+    of_object = not isinstance(code, type) and (
+        not isinstance(getattr(code, "__self__", None), type(None) | types.ModuleType)
+        or getattr(code, "__closure__", None)
+    )
+    if not known or "<" in name or of_object:
         raise UnknownError(f"{where}.{name}")
     return f"{where}.{name}"
 

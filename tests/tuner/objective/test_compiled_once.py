@@ -8,6 +8,8 @@ import jax
 import numpy as np
 import pytest
 
+from lanes.digest import digest_of
+from sim_jax.terms import total
 from tests.tuner.uncertainty.making import criterion_of, problem
 from tuner.config import Options, settle
 from tuner.objective import flown
@@ -54,6 +56,10 @@ def test_a_flight_of_another_length_is_the_same_program(flight, updated):
     assert whole.samples != part.samples
     built(whole)
     assert built(part) == 0
+
+
+def test_what_flies_is_kept_for_other_processes():
+    assert digest_of((flown._Static, total.TERMS), flown.CODE)
 
 
 def test_columns_do_not_depend_on_what_else_is_free():
