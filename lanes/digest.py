@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import inspect
 import sys
 import types
 from functools import cache
@@ -19,10 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jaxtyping
 import numpy as np
 
 TRACED_BY = ("jax", "jaxlib", "equinox", "numpy")
 """Libraries whose versions decide what is traced."""
+_CHECKS_SHAPES = inspect.getsourcefile(jaxtyping.jaxtyped)
+"""Where functions are wrapped that do what they did, their arguments' shapes checked."""
 
 
 class UnknownError(TypeError):
@@ -67,6 +71,8 @@ def _encoded(value: Any, packages: tuple[str, ...]) -> str:
 
 def _named(code: Any, packages: tuple[str, ...]) -> str:
     """Return the name of a class or function, whose source is part of the digest."""
+    if isinstance(code, types.FunctionType) and code.__code__.co_filename == _CHECKS_SHAPES:
+        code = inspect.unwrap(code)
     where, name = (getattr(code, key, None) or "<>" for key in ("__module__", "__qualname__"))
     top = where.partition(".")[0]
     known = top in (*packages, *TRACED_BY) or top in sys.stdlib_module_names
