@@ -94,7 +94,7 @@ def _ranked(
     arena: Arena,
     seconds: float,
 ) -> Proposals:
-    names = examination.sensitivity.names
+    names = tuple(examination.sensitivity.steps)
     fitted = examination.uncertainty
     count = len(fitted.names)
     verdicts = {name: fitted.estimates[name].verdict for name in fitted.names}

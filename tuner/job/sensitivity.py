@@ -244,7 +244,7 @@ def _uncertainty_with(examination: Examination, name: str) -> Uncertainty:
         return examination.uncertainty
     if name in examination.freed:
         return examination.freed[name]
-    names = examination.sensitivity.names
+    names = tuple(examination.sensitivity.steps)
     raise InputError("--profile", f"no coefficient '{name}'", did_you_mean(name, names))
 
 
@@ -253,15 +253,14 @@ def _ranges(job: Job, examination: Examination, span: float) -> dict[str, tuple[
 
     The search's own bounds are guards: most vehicles between them cannot fly.
     """
-    sensitivity = examination.sensitivity
-    steps = dict(zip(sensitivity.names, sensitivity.step, strict=True))
+    steps = examination.sensitivity.steps
     ranges = {}
     for parameter in job.space.parameters:
         value = examination.uncertainty.estimates[parameter.name].value
         if parameter.scale == "log":
             low, high = value / (1.0 + span), value * (1.0 + span)
         else:
-            low, high = (value + side * span * float(steps[parameter.name]) for side in (-1, 1))
+            low, high = (value + side * span * steps[parameter.name] for side in (-1, 1))
         settings = job.settings.job.coefficients.get(parameter.name)
         lower, upper = (None, None) if settings is None else (settings.lower, settings.upper)
         ranges[parameter.name] = (

@@ -17,9 +17,9 @@ from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
 from tuner.uncertainty.directions import Direction, weakest
-from tuner.uncertainty.parts import Spread, spread_of
+from tuner.uncertainty.parts import parts_of, quoted
 from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import Precision, Reason, Verdict, judge
+from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict, judge
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter
 
@@ -137,8 +137,9 @@ def uncertainty_at(
     scaled = space.scaled(vector)
     reference = references(space, vector)
     of_residuals = covariance_of(information)
-    spread = spread_of(information, of_residuals.error, _lags(space, scaled))
-    covariance = of_residuals.widened(spread.quoted)
+    parts = parts_of(information, of_residuals.error, _lags(space, scaled))
+    error = quoted(parts)
+    covariance = of_residuals.widened(error)
     shares, prior_share = _shares(information, len(flights))
     directions = weakest(covariance.shape, reference, space.names)
     estimates: dict[str, Estimate] = {}
@@ -146,24 +147,28 @@ def uncertainty_at(
         partner, correlation = _partner(covariance.correlation[index], index, space.names)
         channel, flight = _source(shares[..., index], information.channels, flights)
         half_width = float(Z95 * covariance.error[index])
-        precision = Precision(
-            name=parameter.name,
+        known = Reason(
+            code=ReasonCode.INTERVAL,
             half_width=half_width,
             unit=None if parameter.scale == "log" else COEFFICIENTS[parameter.name].unit,
-            relative_half_width=half_width / reference[index],
-            data_error=float(covariance.data_error[index] / reference[index]),
             prior_share=float(prior_share[index]),
             prior_given=parameter.prior_given,
-            inflation=float(covariance.inflation[index]),
-            partner=partner,
+            noise_inflation=float(covariance.inflation[index]),
+            correlated_with=partner,
             correlation=correlation,
             channel=channel,
             flight=flight,
             bound=_bound(parameter, scaled[index]),
         )
-        judgement = judge(precision, directions)
-        known = scaled[index], spread.quoted[index]
-        estimates |= _estimates(space, index, known, judgement=judgement, spread=spread)
+        judgement = judge(
+            parameter.name,
+            known,
+            directions,
+            relative_half_width=half_width / reference[index],
+            data_error=float(covariance.data_error[index] / reference[index]),
+        )
+        at = float(scaled[index]), float(error[index])
+        estimates |= _estimates(space, index, at, judgement=judgement, parts=parts)
     return Uncertainty(
         estimates=estimates,
         names=space.names,
@@ -180,13 +185,13 @@ def uncertainty_at(
 def _estimates(
     space: Space,
     index: int,
-    known: tuple[float, float],
+    at: tuple[float, float],
     *,
     judgement: tuple[Verdict, Reason],
-    spread: Spread,
+    parts: Mapping[str, Array],
 ) -> dict[str, Estimate]:
     """Return the estimates of one parameter's coefficients: the first and those tied to it."""
-    parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, known
+    parameter, (verdict, reason), (scaled, error) = space.parameters[index], judgement, at
     low, high = (
         space.from_scaled(index, float(np.clip(scaled + side * error, *_limits(parameter))))
         for side in (-Z95, Z95)
@@ -201,7 +206,7 @@ def _estimates(
             ci95=(low * ratio, high * ratio),
             verdict=verdict if name == parameter.name else Verdict.TIED,
             reason=reason if name == parameter.name else tied,
-            parts=spread.of(index, slope * ratio),
+            parts=ErrorParts(**{n: abs(slope * ratio) * float(p[index]) for n, p in parts.items()}),
         )
         for name, ratio in parameter.ratios.items()
     }

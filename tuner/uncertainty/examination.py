@@ -27,9 +27,7 @@ from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitiv
 from tuner.uncertainty.records import Residual
 from tuner.uncertainty.sensitivity_json import (
     CoefficientKnowledge,
-    EffectOverTime,
     Knowledge,
-    OutputSensitivity,
 )
 from tuner.uncertainty.whiteness import whiteness
 from tuner.vehicle import COEFFICIENTS
@@ -206,8 +204,8 @@ def knowledge_of(examination: Examination, space: Space, point: Point) -> Knowle
         coefficients=_coefficients(examination, space),
         flights=list(uncertainty.flights),
         channels=list(uncertainty.channels),
-        outputs=_outputs(examination),
-        effects_over_time=_effects_over_time(examination),
+        outputs=examination.sensitivity.outputs,
+        effects_over_time=examination.sensitivity.effects_over_time,
         residuals=list(examination.residuals),
         directions=list(uncertainty.directions),
         names=list(uncertainty.names),
@@ -230,16 +228,16 @@ def _units(space: Space, point: Point) -> Array:
 
 def _coefficients(examination: Examination, space: Space) -> dict[str, CoefficientKnowledge]:
     uncertainty = examination.uncertainty
-    steps = dict(zip(examination.sensitivity.names, examination.sensitivity.step, strict=True))
+    steps = examination.sensitivity.steps
     known = {}
     for index, parameter in enumerate(space.parameters):
         for name, ratio in parameter.ratios.items():
-            step = float(steps[parameter.name] * abs(ratio))
+            step = steps[parameter.name] * abs(ratio)
             known[name] = _coefficient(name, uncertainty, index, step, fitted=True, bias={})
     for row, (name, freed) in enumerate(examination.freed.items()):
         bias = dict(zip(uncertainty.names, examination.bias[row].tolist(), strict=True))
         known[name] = _coefficient(
-            name, freed, len(freed.names) - 1, float(steps[name]), fitted=False, bias=bias
+            name, freed, len(freed.names) - 1, steps[name], fitted=False, bias=bias
         )
     return known
 
@@ -270,49 +268,3 @@ def _coefficient(
         prior_share=float(uncertainty.prior_share[index]),
         bias=dict(bias),
     )
-
-
-def _outputs(examination: Examination) -> list[OutputSensitivity]:
-    sensitivity = examination.sensitivity
-    names = sensitivity.names
-    return [
-        OutputSensitivity(
-            **vars(output),
-            change=dict(zip(names, sensitivity.change[:, row].tolist(), strict=True)),
-            rmse_up=dict(zip(names, sensitivity.rmse_up[:, row].tolist(), strict=True)),
-            rmse_down=dict(zip(names, sensitivity.rmse_down[:, row].tolist(), strict=True)),
-        )
-        for row, output in enumerate(sensitivity.outputs)
-    ]
-
-
-def _effects_over_time(examination: Examination) -> list[EffectOverTime]:
-    sensitivity = examination.sensitivity
-    return [
-        EffectOverTime(
-            flight=flight,
-            windowed=sensitivity.windowed,
-            time=sensitivity.time[row].round(3).tolist(),
-            change={
-                name: sensitivity.effect[index, row].tolist()
-                for index, name in enumerate(sensitivity.names)
-            },
-            span={
-                name: shortest_half(sensitivity.time[row], sensitivity.effect[index, row])
-                for index, name in enumerate(sensitivity.names)
-            },
-        )
-        for row, flight in enumerate(sensitivity.flights)
-    ]
-
-
-def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
-    """Return the shortest stretch, from and to in s, with half of the squared effect."""
-    width = float(time[1] - time[0])
-    cumulative = np.concatenate([[0.0], np.cumsum(np.square(effect))])
-    if cumulative[-1] <= 0.0:
-        return 0.0, float(time[-1] + width / 2)
-    ends = np.searchsorted(cumulative, cumulative[:-1] + cumulative[-1] / 2)
-    lengths = np.where(ends < len(cumulative), ends - np.arange(len(effect)), len(cumulative))
-    first = int(np.argmin(lengths))
-    return round(first * width, 3), round(int(ends[first]) * width, 3)

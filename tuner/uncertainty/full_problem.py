@@ -36,21 +36,12 @@ class FullProblem:
     fixed: tuple[str, ...]
     fit_space: Space
 
-    @property
-    def columns(self) -> int:
-        """Number of parameters to differentiate by at a time.
-
-        It is that of the search if two passes then suffice, for which its program is compiled.
-        """
-        fitted, total = len(self.fit_space), len(self.objective.space)
-        return fitted if 2 * fitted >= total else total
-
     def subspace(self, names: tuple[str, ...]) -> tuple[Space, NDArray[np.intp]]:
         """Return the space of some parameters, and their indices among all."""
         space = self.objective.space
         indices = np.array([space.names.index(name) for name in names])
         if names == self.fitted:
-            return self.fit_space, indices  # for which programs are compiled already
+            return self.fit_space, indices
         return Space([space.parameters[index] for index in indices], {}), indices
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
+from tuner.uncertainty.sensitivity_json import EffectOverTime, OutputSensitivity
 
 Array = NDArray[np.float64]
 
@@ -33,83 +35,30 @@ AXES = {
 
 
 @dataclass(frozen=True)
-class Output:
-    """One recorded signal: an axis of a channel of a flight.
-
-    Attributes
-    ----------
-    flight, channel, axis
-        Names. Attitude's axes are small rotations about the body's.
-    unit
-        Of its values and changes.
-    rmse
-        Simulated minus recorded.
-    """
-
-    flight: str
-    channel: str
-    axis: str
-    unit: str
-    rmse: float
-
-
-@dataclass(frozen=True)
 class LocalSensitivity:
-    """Effects of K coefficients on R outputs of F flights.
+    """Effects of K coefficients on recorded signals.
 
     Attributes
     ----------
-    names
-        K coefficients; of a tie, the first of the group.
-    outputs
-        R outputs.
-    step
-        (K,) change that counts as one hundred percent, in the coefficient's unit: the value, or,
-        on a linear scale, the larger of the value and the standard deviation of its prior.
-    change
-        (K, R) RMS change of an output for +1 %, in its unit.
-    rmse_up, rmse_down
-        (K, R) RMSE for +10 % and −10 %, the others unchanged; NaN where the simulation crashed.
-    flights
-        F names.
-    windowed
-        Whether flights were cut into windows, so that ``time`` counts from a window's start.
-    time
-        (F, B) s, middles of the stretches of time.
-    effect
-        (K, F, B) RMS change of all channels for +1 % in each stretch, in standard deviations.
+    steps
+        Coefficient -> change that counts as one hundred percent, in its unit: the value, or, on a
+        linear scale, the larger of the value and the standard deviation of its prior; of a tie,
+        the first of the group.
+    outputs, effects_over_time
+        Of every signal that holds data, and of every flight.
     """
 
-    names: tuple[str, ...]
-    outputs: tuple[Output, ...]
-    step: Array
-    change: Array
-    rmse_up: Array
-    rmse_down: Array
-    flights: tuple[str, ...]
-    windowed: bool
-    time: Array
-    effect: Array
+    steps: Mapping[str, float]
+    outputs: list[OutputSensitivity]
+    effects_over_time: list[EffectOverTime]
 
     @staticmethod
     def joined(parts: Sequence[LocalSensitivity]) -> LocalSensitivity:
         """Return the sensitivity of all flights from that of consecutive groups of them."""
-        first = parts[0]
-
-        def concatenated(name: str, axis: int = -1) -> Array:
-            return np.concatenate([getattr(part, name) for part in parts], axis=axis)
-
         return LocalSensitivity(
-            names=first.names,
-            outputs=tuple(output for part in parts for output in part.outputs),
-            step=first.step,
-            change=concatenated("change"),
-            rmse_up=concatenated("rmse_up"),
-            rmse_down=concatenated("rmse_down"),
-            flights=tuple(name for part in parts for name in part.flights),
-            windowed=any(part.windowed for part in parts),
-            time=concatenated("time", 0),
-            effect=concatenated("effect", 1),
+            parts[0].steps,
+            [output for part in parts for output in part.outputs],
+            [effect for part in parts for effect in part.effects_over_time],
         )
 
 
@@ -157,28 +106,37 @@ def local_sensitivity(
         ]
     )
     rmse = np.where(failed, np.nan, rmse)
-    count = len(space)
-    time, effect = _over_time(objective, jacobian, criterion, moved, outputs)
+    names, count = space.names, len(space)
+
+    def by_name(column: Array) -> dict[str, Any]:
+        return dict(zip(names, column.tolist(), strict=True))
+
     return LocalSensitivity(
-        names=space.names,
-        outputs=tuple(
-            Output(
-                flights[flight],
-                channel,
-                AXES[channel][0][axis],
-                AXES[channel][1],
-                float(rmse[0, row]),
+        steps=by_name(values),
+        outputs=[
+            OutputSensitivity(
+                flight=flights[flight],
+                channel=channel,
+                axis=AXES[channel][0][axis],
+                unit=AXES[channel][1],
+                rmse=float(rmse[0, row]),
+                change=by_name(change[row]),
+                rmse_up=by_name(rmse[1 : 1 + count, row]),
+                rmse_down=by_name(rmse[1 + count :, row]),
             )
             for row, (channel, flight, axis) in enumerate(outputs.places)
-        ),
-        step=values,
-        change=np.stack(change, axis=-1),
-        rmse_up=rmse[1 : 1 + count],
-        rmse_down=rmse[1 + count :],
-        flights=tuple(flights),
-        windowed=objective.segments.count > len(flights),
-        time=time,
-        effect=effect,
+        ],
+        effects_over_time=[
+            EffectOverTime(
+                flight=flights[number],
+                windowed=objective.segments.count > len(flights),
+                time=time.round(3).tolist(),
+                change={name: row.tolist() for name, row in zip(names, effect, strict=True)},
+                span={n: shortest_half(time, row) for n, row in zip(names, effect, strict=True)},
+            )
+            for number in range(len(flights))
+            for time, effect in [_over_time(objective, jacobian, criterion, moved, number)]
+        ],
     )
 
 
@@ -250,33 +208,37 @@ class _Outputs:
 
 
 def _over_time(
-    objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, outputs: _Outputs
+    objective: Objective, jacobian: Jacobian, criterion: Criterion, moved: Array, flight: int
 ) -> tuple[Array, Array]:
-    """Return the middles (F, B) of the stretches in s and the effects in them (K, F, B)."""
-    flights = int(np.asarray(objective.segments.flight).max()) + 1
-    squares = np.zeros((len(moved), flights, BINS))
-    counts = np.zeros((flights, BINS))
-    middles = np.zeros((flights, BINS))
-    begins = objective.segments.begins
-    for flight in range(flights):
-        segments = outputs.segments(flight)
-        end = max(
-            float(np.max(np.asarray(m.time)[:, segments] + begins[segments], initial=0.0))
-            for m in objective.segments.measured.values()
-        )
-        middles[flight] = (np.arange(BINS) + 0.5) * end / BINS
-        for channel, measured in objective.segments.measured.items():
-            scale = np.asarray(criterion.scale[channel])
-            for segment in segments:
-                time = np.asarray(measured.time)[:, segment] + begins[segment]
-                weight = np.asarray(measured.weight)[..., segment]
-                stretch = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
-                rows = (
-                    np.asarray(jacobian.columns[channel])[: len(moved), ..., segment]
-                    / scale[flight]
-                )
-                power = (rows**2).sum(axis=2)
-                for index in range(len(moved)):
-                    squares[index, flight] += np.bincount(stretch, power[index], minlength=BINS)
-                counts[flight] += np.bincount(stretch, (weight > 0).sum(axis=1), minlength=BINS)
-    return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None, None]
+    """Return the middles (B,) of a flight's stretches in s and the effects in them (K, B)."""
+    segments = np.flatnonzero(np.asarray(objective.segments.flight) == flight)
+    begins, measured = objective.segments.begins, objective.segments.measured
+    squares, counts = np.zeros((len(moved), BINS)), np.zeros(BINS)
+    end = max(
+        float(np.max(np.asarray(m.time)[:, segments] + begins[segments], initial=0.0))
+        for m in measured.values()
+    )
+    for channel, recorded in measured.items():
+        scale = np.asarray(criterion.scale[channel])[flight]
+        for segment in segments:
+            time = np.asarray(recorded.time)[:, segment] + begins[segment]
+            stretch = np.clip((time / end * BINS).astype(int), 0, BINS - 1)
+            rows = np.asarray(jacobian.columns[channel])[: len(moved), ..., segment] / scale
+            for index, power in enumerate((rows**2).sum(axis=2)):
+                squares[index] += np.bincount(stretch, power, minlength=BINS)
+            seen = (np.asarray(recorded.weight)[..., segment] > 0).sum(axis=1)
+            counts += np.bincount(stretch, seen, minlength=BINS)
+    middles = (np.arange(BINS) + 0.5) * end / BINS
+    return middles, np.sqrt(squares / np.maximum(counts, 1.0)) * moved[:, None]
+
+
+def shortest_half(time: Array, effect: Array) -> tuple[float, float]:
+    """Return the shortest stretch, from and to in s, with half of the squared effect."""
+    width = float(time[1] - time[0])
+    cumulative = np.concatenate([[0.0], np.cumsum(np.square(effect))])
+    if cumulative[-1] <= 0.0:
+        return 0.0, float(time[-1] + width / 2)
+    ends = np.searchsorted(cumulative, cumulative[:-1] + cumulative[-1] / 2)
+    lengths = np.where(ends < len(cumulative), ends - np.arange(len(effect)), len(cumulative))
+    first = int(np.argmin(lengths))
+    return round(first * width, 3), round(int(ends[first]) * width, 3)

@@ -221,7 +221,7 @@ def stretches_of(information: FisherInformation) -> Stretches:
     return _cut(information, float(np.clip(total / FEWEST_STRETCHES, BLOCK, STRETCH)))
 
 
-def parts_of(information: FisherInformation) -> Stretches:
+def flights_apart(information: FisherInformation) -> Stretches:
     """Return the flights as they can be left out in turn: whole, or a few parts of each."""
     ends = _ends(information)
     longest = float(ends.max())

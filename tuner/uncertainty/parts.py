@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,7 @@ from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to 
 from tuner.core.numerics import Z95, Inverse
 from tuner.objective.alternatives import DRAWS, LACK, READINGS, STEP
 from tuner.objective.information import FisherInformation
-from tuner.uncertainty.overdispersion import IndependentErrors, parts_of
-from tuner.uncertainty.records import ErrorParts
+from tuner.uncertainty.overdispersion import IndependentErrors, flights_apart
 
 Array = NDArray[np.float64]
 
@@ -22,58 +21,30 @@ step shorter than its time constant says: ln(1 - h/τ) = -h/(τ - h/2) to second
 the standard error of what is only known to lie within limits is their half-width over √3."""
 WIDER = float(stdtrit(DRAWS, 0.975) / Z95)
 """Times the root mean square of so many draws: Student's t, whose errors are as large by chance."""
+SAME_ERRORS = ("noise", "residuals", "left_out")
+"""Parts that show the same errors, each in its way."""
 FEWEST = 3
 """Flights, or parts of them, that can disagree: of two, one degree of freedom is left."""
 TELLS = 1e-3
 """Share of a variance by which it must grow without a flight that tells of the coefficient."""
 
 
-@dataclass(frozen=True)
-class Spread:
-    """The parts of K standard errors in the scaled coordinates, each (K,); None where unknown.
+def quoted(parts: Mapping[str, Array]) -> Array:
+    """Return the honest standard error (K,) from its parts, as of `parts_of`.
 
-    See `ErrorParts`.
+    Noise, residuals and left-out flights show the same errors in three ways, of which the largest
+    counts. On top comes what terms would move that were left out: a fit without them does not
+    depend on what the flights say of them, and their effect stands in no residual as long as
+    coefficients take it up. And what steps do, those of the simulation and those that the search
+    did not take, what inputs do that were read with errors, and what the model is seen to lack.
     """
-
-    noise: Array
-    residuals: Array
-    left_out: Array | None
-    terms: Array | None
-    step: Array | None
-    readings: Array | None
-    lack: Array | None
-    search: Array
-
-    @property
-    def quoted(self) -> Array:
-        """The honest standard error (K,).
-
-        Noise, residuals and left-out flights show the same errors in three ways, of which the
-        largest counts. On top comes what terms would move that were left out: a fit without them
-        does not depend on what the flights say of them, and their effect stands in no residual as
-        long as coefficients take it up. And what steps do, those of the simulation and those that
-        the search did not take, what inputs do that were read with errors, and what the model is
-        seen to lack.
-        """
-        error = np.maximum(self.noise, self.residuals)
-        if self.left_out is not None:
-            error = np.maximum(error, self.left_out)
-        for part in (self.terms, self.search, self.step, self.readings, self.lack):
-            if part is not None:
-                error = np.hypot(error, part)
-        return np.asarray(error)
-
-    def of(self, index: int, slope: float) -> ErrorParts:
-        """Return the parts of one parameter's coefficient, which changes by a slope with it."""
-        parts = {
-            name: None if part is None else float(abs(slope) * part[index])
-            for name, part in vars(self).items()
-        }
-        return ErrorParts(**parts)
+    same = [parts[name] for name in SAME_ERRORS if name in parts]
+    others = [np.square(part) for name, part in parts.items() if name not in SAME_ERRORS]
+    return np.asarray(np.sqrt(np.max(same, axis=0) ** 2 + sum(others)))
 
 
-def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> Spread:
-    """Return the parts of the errors.
+def parts_of(information: FisherInformation, residuals: Array, lags: Array) -> dict[str, Array]:
+    """Return the known `ErrorParts`, each (K,) in the scaled coordinates.
 
     Parameters
     ----------
@@ -92,16 +63,17 @@ def spread_of(information: FisherInformation, residuals: Array, lags: Array) -> 
     if STEP in moved:
         moved[STEP] = np.hypot(moved[STEP], lags * SIMULATORS_STEP / 2.0 / np.sqrt(3.0))
     drawn = [moves for name, moves in moved.items() if name.startswith(READINGS)]
-    return Spread(
-        noise=noise_alone(information),
-        residuals=residuals,
-        left_out=left_out(information),
-        terms=information.in_doubt,
-        step=moved.get(STEP),
-        readings=WIDER * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
-        lack=moved.get(LACK),
-        search=np.abs(inverse.matrix @ information.slope),
-    )
+    parts = {
+        "noise": noise_alone(information),
+        "residuals": residuals,
+        "left_out": left_out(information),
+        "terms": information.in_doubt,
+        "step": moved.get(STEP),
+        "readings": WIDER * np.sqrt(np.mean(np.square(drawn), axis=0)) if drawn else None,
+        "lack": moved.get(LACK),
+        "search": np.abs(inverse.matrix @ information.slope),
+    }
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def noise_alone(information: FisherInformation) -> Array:
@@ -123,7 +95,7 @@ def left_out(information: FisherInformation) -> Array | None:
     one that contradicts the others.) Errors that last for a whole flight show here alone; few
     flights leave open how large they are (`allowed_for`).
     """
-    parts = parts_of(information)
+    parts = flights_apart(information)
     if parts.count < FEWEST:
         return None
     total, independent = information.total, IndependentErrors.of(information)

@@ -6,9 +6,8 @@ Sentences are made from them in `tuner.uncertainty.verdict_texts`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal
 
 from tuner.core.files import Part
 from tuner.core.numerics import Z95
@@ -132,84 +131,55 @@ NOT_EXAMINED = Reason(code=ReasonCode.NOT_EXAMINED)
 """Why a coefficient is `Verdict.NOT_EXAMINED`."""
 
 
-@dataclass(frozen=True)
-class Precision:
-    """What is known about one coefficient, and from where.
+def judge(
+    name: str,
+    known: Reason,
+    directions: Sequence[Direction],
+    *,
+    relative_half_width: float,
+    data_error: float,
+) -> tuple[Verdict, Reason]:
+    """Return the verdict on a fitted coefficient, and its reason.
 
-    Attributes
+    Parameters
     ----------
     name
         The coefficient.
-    half_width, unit
-        Half the 95 % interval, as in `Reason`.
-    relative_half_width
-        The same over the coefficient's reference.
-    data_error
-        Standard error from the flights alone over the reference.
-    prior_share, prior_given
-        As in `Reason`.
-    inflation
-        Factor on the standard error for residuals that are correlated in time.
-    partner, correlation
-        The coefficient that it is correlated with most.
-    channel, flight
-        As in `Reason`.
-    bound
-        At which bound the fit ended.
+    known
+        All that a reason may hold; the one returned keeps what bears on the verdict.
+    directions
+        Worst-determined combinations.
+    relative_half_width, data_error
+        Half the 95 % interval, and the standard error from the flights alone, over the
+        coefficient's reference.
     """
 
-    name: str
-    half_width: float
-    unit: str | None
-    relative_half_width: float
-    data_error: float
-    prior_share: float
-    prior_given: bool
-    inflation: float
-    partner: str | None
-    correlation: float
-    channel: str | None
-    flight: str | None
-    bound: Literal["lower", "upper"] | None
+    def reason(code: ReasonCode, *kept: str, **more: Any) -> Reason:
+        return Reason(code=code, **{n: getattr(known, n) for n in (*kept, "bound")}, **more)
 
-
-def judge(precision: Precision, directions: Sequence[Direction]) -> tuple[Verdict, Reason]:
-    """Return the verdict on a fitted coefficient, and its reason."""
-    if precision.data_error > IDENTIFIABLE_ERROR or precision.prior_share > PRIOR_SHARE:
-        return Verdict.NOT_IDENTIFIABLE, _not_identifiable(precision, directions)
-    well = precision.relative_half_width < WELL_KNOWN and precision.bound is None
-    confused = not well and precision.partner and abs(precision.correlation) > CONFUSED
-    return Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN, Reason(
-        code=ReasonCode.INTERVAL,
-        half_width=precision.half_width,
-        unit=precision.unit,
-        channel=precision.channel,
-        flight=precision.flight,
-        correlated_with=precision.partner if confused else None,
-        correlation=precision.correlation if confused else None,
-        noise_inflation=precision.inflation if precision.inflation > INFLATED else None,
-        bound=precision.bound,
-    )
-
-
-def _not_identifiable(precision: Precision, directions: Sequence[Direction]) -> Reason:
-    given, bound = precision.prior_given, precision.bound
-    for direction in directions:
-        if direction.null and precision.name in direction.moves and len(direction.moves) > 1:
-            code = ReasonCode.NULL_DIRECTION
-            return Reason(code=code, direction=direction, prior_given=given, bound=bound)
-    if precision.data_error >= NO_INFORMATION_ERROR:
-        return Reason(code=ReasonCode.NO_INFORMATION, prior_given=given, bound=bound)
-    if precision.data_error > IDENTIFIABLE_ERROR:
-        half_width = Z95 * precision.data_error
-        code = ReasonCode.WIDE_INTERVAL
-        return Reason(code=code, half_width=half_width, prior_given=given, bound=bound)
-    return Reason(
-        code=ReasonCode.PRIOR_DOMINATES,
-        prior_share=precision.prior_share,
-        prior_given=given,
-        bound=bound,
-    )
+    prior_share = known.prior_share or 0.0
+    if data_error > IDENTIFIABLE_ERROR or prior_share > PRIOR_SHARE:
+        for direction in directions:
+            if direction.null and name in direction.moves and len(direction.moves) > 1:
+                why = reason(ReasonCode.NULL_DIRECTION, "prior_given", direction=direction)
+                break
+        else:
+            if data_error >= NO_INFORMATION_ERROR:
+                why = reason(ReasonCode.NO_INFORMATION, "prior_given")
+            elif data_error > IDENTIFIABLE_ERROR:
+                half_width = Z95 * data_error
+                why = reason(ReasonCode.WIDE_INTERVAL, "prior_given", half_width=half_width)
+            else:
+                why = reason(ReasonCode.PRIOR_DOMINATES, "prior_share", "prior_given")
+        return Verdict.NOT_IDENTIFIABLE, why
+    well = relative_half_width < WELL_KNOWN and known.bound is None
+    kept = ["half_width", "unit", "channel", "flight"]
+    if not well and known.correlated_with and abs(known.correlation or 0.0) > CONFUSED:
+        kept += ["correlated_with", "correlation"]
+    if (known.noise_inflation or 1.0) > INFLATED:
+        kept.append("noise_inflation")
+    verdict = Verdict.WELL_KNOWN if well else Verdict.WEAKLY_KNOWN
+    return verdict, reason(ReasonCode.INTERVAL, *kept)
 
 
 def judge_after_holding(

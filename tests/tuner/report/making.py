@@ -36,7 +36,7 @@ from tuner.uncertainty.sensitivity_json import (
     OutputSensitivity,
     write_files,
 )
-from tuner.uncertainty.verdict import NOT_FITTED, Precision, Verdict, judge
+from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict, judge
 from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
@@ -159,23 +159,22 @@ def _known(
 ) -> CoefficientKnowledge:
     open_ended = name in undetermined.moves
     error = 0.01 * (abs(value) or 1.0)
-    precision = Precision(
-        name=name,
+    prior_share = 0.98 if open_ended else 0.02
+    known = Reason(
+        code=ReasonCode.INTERVAL,
         half_width=0.02,
-        unit=None,
+        prior_share=prior_share,
+        prior_given=False,
+        channel="position",
+    )
+    verdict, reason = judge(
+        name,
+        known,
+        [undetermined],
         relative_half_width=0.02,
         data_error=undetermined.error if open_ended else 0.01,
-        prior_share=0.98 if open_ended else 0.02,
-        prior_given=False,
-        inflation=1.0,
-        partner=None,
-        correlation=0.0,
-        channel="position",
-        flight=None,
-        bound=None,
     )
-    verdict, reason = judge(precision, [undetermined])
-    share = (1.0 - precision.prior_share) / (len(CHANNELS) * len(FLIGHTS))
+    share = (1.0 - prior_share) / (len(CHANNELS) * len(FLIGHTS))
     return CoefficientKnowledge(
         unit=COEFFICIENTS[name].unit,
         fitted=fitted,
@@ -186,7 +185,7 @@ def _known(
         reason=reason,
         step=abs(value) or 1.0,
         shares={channel: dict.fromkeys(FLIGHTS, share) for channel in CHANNELS},
-        prior_share=precision.prior_share,
+        prior_share=prior_share,
         bias={} if fitted else {"motor_constant": 0.2},
     )
 

@@ -12,7 +12,7 @@ from tuner.core.numerics import scaled_solve
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import covariance_of
 from tuner.uncertainty.estimates import _shares
-from tuner.uncertainty.parts import left_out, spread_of
+from tuner.uncertainty.parts import left_out, parts_of, quoted
 
 
 @dataclass(frozen=True)
@@ -93,8 +93,8 @@ def test_every_error_is_a_number(fit: Fit) -> None:
     information = information_of(fit)
     covariance = covariance_of(information)
     size = len(fit.decades)
-    spread = spread_of(information, covariance.error, np.zeros(size))
-    for errors in (covariance.error, covariance.data_error, spread.quoted):
+    parts = parts_of(information, covariance.error, np.zeros(size))
+    for errors in (covariance.error, covariance.data_error, quoted(parts)):
         assert np.isfinite(errors).all()
         assert (errors > 0.0).all()
     shares, of_priors = _shares(information, len(fit.tells))

@@ -7,13 +7,15 @@ import io
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.objective.flight_batches import portions
 from tuner.objective.normal import Objective
-from tuner.uncertainty.examination import Examination, examine, knowledge_of, shortest_half
+from tuner.uncertainty.examination import Examination, examine, knowledge_of
+from tuner.uncertainty.local_sensitivity import shortest_half
 from tuner.uncertainty.sensitivity_json import Knowledge, write_files
 
 FREE = ("inertia_xx", "input_scaling", "motor_constant", "moment_constant", "estimate_latency")
@@ -45,19 +47,18 @@ def test_flights_that_do_not_fit_the_memory_take_turns(
     turns = examine(fitted)
     assert turns.residuals[0].flight != turns.residuals[-1].flight
     assert [r.flight for r in turns.residuals] == [r.flight for r in examination.residuals]
-    for in_turns, at_once in (
-        (turns.information, examination.information),
-        (turns.sensitivity, examination.sensitivity),
-    ):
-        for name, value in vars(at_once).items():
-            if isinstance(value, np.ndarray):
-                size = np.abs(np.nan_to_num(value)).max()
-                np.testing.assert_allclose(getattr(in_turns, name), value, atol=1e-9 * size)
-            elif name != "outputs":
-                assert getattr(in_turns, name) == value
-    assert [o.rmse for o in turns.sensitivity.outputs] == pytest.approx(
-        [o.rmse for o in examination.sensitivity.outputs]
-    )
+    for name, value in vars(examination.information).items():
+        if isinstance(value, np.ndarray):
+            size = np.abs(np.nan_to_num(value)).max()
+            np.testing.assert_allclose(getattr(turns.information, name), value, atol=1e-9 * size)
+        else:
+            assert getattr(turns.information, name) == value
+    assert turns.sensitivity.steps == pytest.approx(examination.sensitivity.steps)
+    in_turns, at_once = (vars(e.sensitivity) for e in (turns, examination))
+    for kind in ("outputs", "effects_over_time"):
+        one, other = ([leaf.model_dump() for leaf in e[kind]] for e in (in_turns, at_once))
+        for here, there in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            assert here == (there if isinstance(there, str) else pytest.approx(there, rel=1e-6))
 
 
 def flown(objective: Objective, name: str, factor: float) -> dict[str, np.ndarray]:

@@ -11,7 +11,7 @@ from scipy import stats
 from tuner.objective.alternatives import DRAWS, READINGS
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.overdispersion import allowed_for
-from tuner.uncertainty.parts import left_out, noise_alone, spread_of
+from tuner.uncertainty.parts import left_out, noise_alone, parts_of, quoted
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
 ONE, ALIKE = np.ones((1, 1)), np.ones(1)
@@ -97,10 +97,10 @@ def test_flights_do_not_disagree_because_the_search_stopped_short(one_tells):
     (_, exact), (_, short) = (errors(information) for information in made)
     assert short == pytest.approx(exact, rel=1e-6)
     lags = np.zeros(COUNT)
-    at_minimum, off = (spread_of(each, exact, lags) for each in made)
-    assert at_minimum.search == pytest.approx(0.0, abs=1e-9)
-    assert off.search == pytest.approx(0.02)
-    assert off.quoted == pytest.approx(np.hypot(at_minimum.quoted, 0.02))
+    at_minimum, off = (parts_of(each, exact, lags) for each in made)
+    assert at_minimum["search"] == pytest.approx(0.0, abs=1e-9)
+    assert off["search"] == pytest.approx(0.02)
+    assert quoted(off) == pytest.approx(np.hypot(quoted(at_minimum), 0.02))
     where = np.array([True, False, False])
     assert made[1].resting(where).slope[0] == pytest.approx(0.0, abs=1e-9)
     assert made[1].resting(where).slope[1:] == pytest.approx(made[1].slope[1:])
@@ -123,35 +123,30 @@ def test_the_quoted_error_holds_every_part():
     information, _ = regression(np.random.default_rng(4), apart=0.5)
     total = information.total
     step = np.array([0.3, -0.2, 0.0])
-    spread = spread_of(
+    spread = parts_of(
         replace(information, changes={"step": (total @ step)[None]}),
         np.full(COUNT, 0.01),
         np.zeros(COUNT),
     )
-    assert spread.step == pytest.approx(np.abs(step), abs=1e-9)
-    assert spread.left_out is not None
-    assert spread.quoted == pytest.approx(np.hypot(spread.left_out, np.abs(step)), rel=1e-6)
-    doubt = 10.0 * spread.left_out
-    doubted = spread_of(replace(information, in_doubt=doubt), np.full(COUNT, 0.01), np.zeros(COUNT))
-    assert doubted.quoted == pytest.approx(np.hypot(spread.left_out, doubt))
-    parts = spread.of(0, -2.0)
-    assert parts.step == pytest.approx(0.6)
-    assert parts.noise == pytest.approx(2.0 * spread.noise[0])
+    assert spread["step"] == pytest.approx(np.abs(step), abs=1e-9)
+    assert quoted(spread) == pytest.approx(np.hypot(spread["left_out"], np.abs(step)), rel=1e-6)
+    doubt = 10.0 * spread["left_out"]
+    doubted = parts_of(replace(information, in_doubt=doubt), np.full(COUNT, 0.01), np.zeros(COUNT))
+    assert quoted(doubted) == pytest.approx(np.hypot(spread["left_out"], doubt))
 
 
 def test_a_lag_is_known_no_better_than_half_a_simulators_step():
     """Stepped by Euler's rule, a lag acts as if it were shorter by that much, and never by more."""
     information, _ = regression(np.random.default_rng(5), apart=0.0)
-    spread = spread_of(
+    spread = parts_of(
         replace(information, changes={"step": np.zeros((1, COUNT))}),
         np.full(COUNT, 1e-6),
         np.array([1.0, 0.0, 0.0]),
     )
     steps, time_constant = 4000.0, 0.02
     as_if = -1.0 / steps / np.log(1.0 - 1.0 / steps / time_constant)
-    assert spread.step is not None
-    assert spread.step[0] == pytest.approx((time_constant - as_if) / np.sqrt(3.0), rel=0.01)
-    assert spread.step[1:] == pytest.approx(0.0)
+    assert spread["step"][0] == pytest.approx((time_constant - as_if) / np.sqrt(3.0), rel=0.01)
+    assert spread["step"][1:] == pytest.approx(0.0)
 
 
 def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
@@ -161,15 +156,15 @@ def test_readings_drawn_again_count_as_far_as_they_scatter_the_estimates():
     for _ in range(400):
         moves = random.normal(size=(DRAWS + 1, COUNT))
         changes = {f"{READINGS} {i}": (total @ moves[i])[None] for i in range(DRAWS)}
-        spread = spread_of(
+        spread = parts_of(
             replace(information, changes=changes), np.full(COUNT, 1e-9), np.zeros(COUNT)
         )
-        assert spread.step is None
-        held.append(np.abs(moves[-1]) < 1.96 * spread.readings)
+        assert "step" not in spread
+        held.append(np.abs(moves[-1]) < 1.96 * spread["readings"])
     assert np.mean(held) == pytest.approx(0.95, abs=0.015)
-    without = spread_of(replace(information, changes={}), np.full(COUNT, 1e-9), np.zeros(COUNT))
-    assert without.readings is None
-    assert spread.quoted == pytest.approx(np.hypot(without.quoted, spread.readings))
+    without = parts_of(replace(information, changes={}), np.full(COUNT, 1e-9), np.zeros(COUNT))
+    assert "readings" not in without
+    assert quoted(spread) == pytest.approx(np.hypot(quoted(without), spread["readings"]))
 
 
 @pytest.mark.parametrize("excess", [0.0, 1.0, 5.0, 1e4])

@@ -85,7 +85,7 @@ def test_what_is_not_identifiable_has_an_open_profile(
 
 
 def test_an_unknown_coefficient_is_named(uncertainty: Uncertainty) -> None:
-    sensitivity = SimpleNamespace(names=uncertainty.names)
+    sensitivity = SimpleNamespace(steps=dict.fromkeys(uncertainty.names, 1.0))
     examined: Any = SimpleNamespace(uncertainty=uncertainty, freed={}, sensitivity=sensitivity)
     with pytest.raises(InputError, match="did you mean 'moment_constant'"):
         _uncertainty_with(examined, "moment_constand")

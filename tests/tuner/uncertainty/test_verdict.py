@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import (
-    Precision,
     Reason,
     ReasonCode,
     Verdict,
@@ -14,59 +13,67 @@ from tuner.uncertainty.verdict import (
     judge_after_holding,
 )
 
-GOOD = Precision(
-    name="inertia_xx",
+KNOWN = Reason(
+    code=ReasonCode.INTERVAL,
     half_width=0.012,
-    unit=None,
-    relative_half_width=0.012,
-    data_error=0.006,
     prior_share=0.001,
     prior_given=False,
-    inflation=1.1,
-    partner="estimate_latency",
+    noise_inflation=1.1,
+    correlated_with="estimate_latency",
     correlation=0.95,
     channel="attitude",
     flight="circle",
-    bound=None,
 )
 INTERVAL = Reason(code=ReasonCode.INTERVAL, half_width=0.012, channel="attitude", flight="circle")
 
 
+def judged(
+    *directions: Direction, half: float = 0.012, error: float = 0.006, **known: Any
+) -> tuple[Verdict, Reason]:
+    return judge(
+        "inertia_xx",
+        KNOWN.model_copy(update=known),
+        directions,
+        relative_half_width=half,
+        data_error=error,
+    )
+
+
 def test_well_known() -> None:
-    assert judge(GOOD, ()) == (Verdict.WELL_KNOWN, INTERVAL)
+    assert judged() == (Verdict.WELL_KNOWN, INTERVAL)
 
 
 def test_weakly_known_names_what_it_is_confused_with() -> None:
-    verdict, reason = judge(replace(GOOD, relative_half_width=0.2, data_error=0.1), ())
+    verdict, reason = judged(half=0.2, error=0.1)
     assert verdict is Verdict.WEAKLY_KNOWN
     assert (reason.correlated_with, reason.correlation) == ("estimate_latency", 0.95)
 
 
 def test_an_interval_that_the_prior_made_is_not_identifiable() -> None:
-    verdict, reason = judge(replace(GOOD, data_error=0.8, relative_half_width=0.03), ())
+    verdict, reason = judged(half=0.03, error=0.8)
     assert verdict is Verdict.NOT_IDENTIFIABLE
     assert reason.code is ReasonCode.WIDE_INTERVAL
     assert f"{reason.half_width:.2f}" == "1.57"
-    verdict, reason = judge(replace(GOOD, prior_share=0.7, prior_given=True), ())
+    verdict, reason = judged(prior_share=0.7, prior_given=True)
     assert verdict is Verdict.NOT_IDENTIFIABLE
     assert reason == Reason(code=ReasonCode.PRIOR_DOMINATES, prior_share=0.7, prior_given=True)
 
 
 def test_a_coefficient_without_information() -> None:
-    _, reason = judge(replace(GOOD, data_error=50.0), ())
+    _, reason = judged(error=50.0)
     assert reason.code is ReasonCode.NO_INFORMATION
 
 
 def test_a_null_direction_is_the_reason() -> None:
     moves = {"mass": 1.0, "inertia_xx": 1.0}
     null = Direction(moves=moves, error=30.0, null=True, common_scale=True)
-    verdict, reason = judge(replace(GOOD, data_error=30.0), (null,))
+    verdict, reason = judged(null, error=30.0)
     assert verdict is Verdict.NOT_IDENTIFIABLE
     assert reason == Reason(code=ReasonCode.NULL_DIRECTION, direction=null, prior_given=False)
 
 
 def test_a_bound_and_model_error_are_reported() -> None:
-    verdict, reason = judge(replace(GOOD, bound="lower", inflation=5.0), ())
+    verdict, reason = judged(bound="lower", noise_inflation=5.0)
     assert verdict is Verdict.WEAKLY_KNOWN
     assert (reason.bound, reason.noise_inflation) == ("lower", 5.0)
 
@@ -89,5 +96,5 @@ def test_a_tied_coefficient_stays_tied_when_its_group_is_held() -> None:
 
 
 def test_a_reason_survives_json() -> None:
-    _, reason = judge(replace(GOOD, bound="upper", inflation=3.0), ())
+    _, reason = judged(bound="upper", noise_inflation=3.0)
     assert Reason.model_validate_json(reason.model_dump_json()) == reason
