@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+import webbrowser
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import tuner
-from tests.docs.pages import DOCS, ROOT, TUTORIALS, blocks, commands, figures
+from tests.docs.pages import DOCS, PAGES, ROOT, TUTORIALS, blocks, commands, figures
 from tests.docs.px4_logs import write_logs
 from tuner.cli import main
 from tuner.cli.results import print_run
@@ -111,6 +112,42 @@ def test_the_python_of_the_reference_runs(place: Path, request: pytest.FixtureRe
     (place / "runs" / "first").symlink_to(request.getfixturevalue("demo")[0])
     (block,) = blocks(DOCS / "reference" / "python.md", "python")
     exec(compile(block, "python.md", "exec"), {})
+
+
+TO_A_SERVER = ("submit", "jobs", "watch", "fetch", "cancel", "watch-folder")
+"""Commands that `tests.docs.test_service_tutorial` runs against one."""
+IN_MINUTES = (
+    *("tune --flights", "tune sensitivity", "tune serve --"),
+    "tune export runs/x --format isaaclab",  # flies a hundred draws
+)
+BESIDE = [page for page in PAGES if page not in TUTORIALS and commands(page)]
+"""Pages beside the tutorials that show commands."""
+
+
+@pytest.fixture
+def workplace(place: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder with a lab's flights, models, bench and finished runs, under their names."""
+    monkeypatch.setattr(webbrowser, "open", lambda _: True)
+    for name in ("x", "demo"):
+        shutil.copytree(request.getfixturevalue("demo")[0], place / "runs" / name)
+    (place / "lab").mkdir()
+    (place / "lab" / "circle.bag").symlink_to(ROOT / "reference_flights" / "circle_3mps.bag")
+    for model in ("model.sdf", "models/quad.sdf", "models/x500/model.sdf"):
+        (place / model).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / "examples" / "models" / "quad_x_gz.sdf", place / model)
+    for file in (ROOT / "examples" / "bench").iterdir():
+        shutil.copy(file, place)
+    shutil.copy(ROOT / "configs" / "vehicles" / "hovergames_updated.yaml", place / "quad.yaml")
+    for name in ("quad", "x500"):
+        (place / f"{name}.params").write_text("1\t1\tMC_ROLLRATE_P\t0.15\t9\n", "utf-8")
+    return place
+
+
+@pytest.mark.parametrize("page", BESIDE, ids=lambda page: page.stem)
+def test_commands_beside_the_tutorials_run(page: Path, workplace: Path) -> None:
+    for line in commands(page):
+        if not line.startswith(IN_MINUTES) and line.split()[1] not in TO_A_SERVER:
+            assert main(words_of(line.replace("/srv", str(workplace)))) == 0, line
 
 
 @pytest.mark.long

@@ -219,6 +219,8 @@ class JobFile(Section):
         Prefix of the recorded topics that the topic map does not have, as ``uav1``.
     mass
         kg, as weighed; instead of the vehicle file's.
+    simulated
+        Whether a simulator flew the recordings; the report says so.
     holdout
         Flights that are evaluated, never fitted.
     free
@@ -259,6 +261,7 @@ class JobFile(Section):
     topics: Path | None = None
     namespace: str = ""
     mass: Positive | None = None
+    simulated: Flag = False
     holdout: tuple[str, ...] = ()
     free: Annotated[tuple[CoefficientName, ...], Len(min_length=1)] | None = None
     fixed: tuple[CoefficientName, ...] = ()

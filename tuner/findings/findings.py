@@ -258,16 +258,16 @@ class Code(Worded):
     SATURATION_FEEDBACK = (
         "saturation_feedback",  # feedback: 1 if the integrator stops, else 0
         (
-            "The mixer was another: the recordings agree with one that {mixer} at the rotors' "
-            "lower limit, other than the controller file has it. It was simulated so."
+            "The recordings agree with a mixer that {mixer} at the rotors' lower limit, not with "
+            "the controller file's. The fit simulated the one that agrees."
         ),
         "Set mixer.saturation_feedback: {flag} (in the controller file).",
     )
     SEES_MARKERS = (
         "sees_markers",  # seen: 1 if position and attitude control see them, else 0
         (
-            "The controllers see another frame: the recordings agree with ones that see {frame}, "
-            "other than the controller file has it. It was simulated so."
+            "The recordings agree with controllers that see {frame}, not with the controller "
+            "file's. The fit simulated the ones that agree."
         ),
         "Set sensing.sees_markers: {seen_flag} (in the controller file).",
     )
@@ -378,10 +378,10 @@ class Code(Worded):
     FINER_THAN_STEPS = (
         "finer_than_steps",  # seconds
         (
-            "Simulators differ by {milliseconds:g} ms: their physics steps do, which the 95 % "
-            "intervals of these lags leave out."
+            "The step of a simulator shifts these lags by about {milliseconds:g} ms, which their "
+            "95 % intervals leave out."
         ),
-        "Take these values as known to {twice:g} ms.",
+        "Take them as known to twice that shift, ±{twice:g} ms, in any simulator.",
     )
     REFERENCE_VOLTAGE = (
         "reference_voltage",  # volts

@@ -1,4 +1,4 @@
-"""What a figure shows, apart from how it is drawn: by plotly for the page, else by matplotlib."""
+"""What a figure shows, apart from how it is drawn: by Plot on the page, else by matplotlib."""
 
 from __future__ import annotations
 

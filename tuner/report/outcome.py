@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from tuner.core.phrases import listed
+from tuner.core.phrases import listed, listed_within
 from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding, remedy, sentence
 from tuner.ground.bench_json import BenchRecord, bench_in_words
@@ -21,6 +21,8 @@ from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
 
+NAMES = 90
+"""Letters within which flights are named in a sentence."""
 AT_NOISE = 1.5
 """Times the noise up to which what remains of a flight is called noise."""
 UNCHANGED = 0.8
@@ -283,8 +285,11 @@ def _what(result: RunResult) -> str:
     free = sum(row.fitted for row in result.coefficients.values())
     text = f"{free} coefficient{'s were' if free != 1 else ' was'} fitted"
     if result.flights:
+        job = result.settings.get("job")
+        simulated = isinstance(job, dict) and job.get("simulated")
         text += f" to {fitted} flight{'s' if fitted != 1 else ''}"
         text += f"; {held} {'was' if held == 1 else 'were'} held out to check them" if held else ""
+        text += ". The flights are simulated, as the job file says" if simulated else ""
     return text + "."
 
 
@@ -293,10 +298,12 @@ def _uses(result: RunResult, standing: Standing) -> tuple[str, ...]:
     if standing is Standing.UNUSABLE:
         return ("Do not use these numbers: see the warnings for what to do first.",)
     sentences = []
+    fitted = [flight.name for flight in result.flights if flight.split == "fit"]
+    like = f"Simulating flights like the fitted ones ({listed_within(fitted, NAMES)})"
     if result.effective is not None:
-        sentences.append(f"Simulating such flights: {simulator_lacks(result.effective)}")
+        sentences.append(f"{like}: {simulator_lacks(result.effective)}")
     elif result.flights:
-        sentences.append("Simulating such flights, in Gazebo too: it has every term in this model.")
+        sentences.append(f"{like}: Gazebo has every term of this model.")
     else:
         sentences.append("Starting a fit of flights that hold position and attitude.")
     by_verdict: dict[Verdict, list[str]] = {}

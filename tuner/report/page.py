@@ -7,6 +7,7 @@ import gzip
 import hashlib
 import json
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -15,7 +16,6 @@ from markupsafe import Markup
 from tuner.core.disk import write_text
 from tuner.design.proposals import proposals_in_words
 from tuner.report.contents import Contents, read_contents
-from tuner.report.interactive import figure_of
 from tuner.report.outcome import (
     flights_table,
     next_step,
@@ -28,6 +28,8 @@ from tuner.report.section import Section
 from tuner.report.sections import sections_of
 
 REPORT_FILE = "report.html"
+LIBRARIES = ("d3.min.js", "plot.umd.min.js")
+"""Observable Plot and what it draws with."""
 
 
 def render(folder: str | Path, *, plots: bool = False) -> Path:
@@ -48,16 +50,15 @@ def render(folder: str | Path, *, plots: bool = False) -> Path:
     contents = read_contents(folder)
     sections = sections_of(contents)
     charts = [chart for section in sections for chart in section.charts]
-    figures = json.dumps([figure_of(chart) for chart in charts], allow_nan=False)
-    library = _plotly()
+    figures = json.dumps(charts, default=vars, allow_nan=False)
     if plots:
         write_plots(charts, contents.folder)
     path = contents.folder / REPORT_FILE
-    write_text(path, _page(contents, sections, figures, library))
+    write_text(path, _page(contents, sections, figures))
     return path
 
 
-def _page(contents: Contents, sections: Sequence[Section], figures: str, library: str) -> str:
+def _page(contents: Contents, sections: Sequence[Section], figures: str) -> str:
     environment = Environment(
         loader=PackageLoader("tuner.report"),
         autoescape=True,
@@ -66,6 +67,9 @@ def _page(contents: Contents, sections: Sequence[Section], figures: str, library
         lstrip_blocks=True,
     )
     script = _source(environment, "page.js")
+    library = "\n".join(
+        (files("tuner.report") / "assets" / name).read_text("utf-8") for name in LIBRARIES
+    )
     run = contents.run
     found = None if run is None else outcome(run.result, contents.bench)
     return environment.get_template("page.html.jinja").render(
@@ -95,7 +99,7 @@ def _policy(*scripts: str) -> str:
     """Return the content-security policy that the page carries and works under.
 
     It runs its own two scripts, known by their hashes, evaluates no text and opens no connection.
-    The plotting library sets style attributes, and saves a figure by way of a blob.
+    The plotting library sets style attributes; a figure is saved by way of a blob.
     """
     hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts)
     allowed = " ".join(f"'sha256-{digest}'" for digest in hashes)
@@ -113,10 +117,3 @@ def _source(environment: Environment, name: str) -> str:
 def _packed(text: str) -> str:
     """Compress text, and write it so that it cannot end the element that it stands in."""
     return base64.b64encode(gzip.compress(text.encode(), mtime=0)).decode()
-
-
-def _plotly() -> str:
-    """Return the plotting library: plain it would fill the page's five megabytes."""
-    from plotly.offline import get_plotlyjs  # noqa: PLC0415 (a second to import)
-
-    return str(get_plotlyjs())

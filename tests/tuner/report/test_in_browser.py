@@ -18,9 +18,9 @@ pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium or Chro
 
 FIGURES = 8 + 2 + 1 + 1 + 2 + 3 + 1 + 2
 #: What the plotting library has put into its axes.
-MARKS = ".scatterlayer .trace path, .barlayer .point path, .heatmaplayer image"
+MARKS = ":is([aria-label=line], [aria-label=dot], [aria-label=bar], [aria-label=cell]) > *"
 OPEN = "document.querySelectorAll('details').forEach((place) => { place.open = true; })"
-TITLE_COLOUR = "getComputedStyle(document.querySelector('.gtitle, .xtitle')).fill"
+TITLE_COLOUR = "getComputedStyle(document.querySelector('[aria-label=\"x-axis label\"]')).fill"
 WIDTH = "document.documentElement.scrollWidth"
 LIGHT, DARK = "rgb(29, 31, 33)", "rgb(230, 230, 230)"
 
@@ -43,7 +43,7 @@ def draw_everything(opened: Reading) -> None:
     opened.page.evaluate(OPEN)
     for figure in opened.page.locator("figure").all():
         figure.scroll_into_view_if_needed()
-        figure.locator(".main-svg").first.wait_for(timeout=PATIENCE)
+        figure.locator(MARKS).first.wait_for(state="attached", timeout=PATIENCE)
     opened.page.wait_for_function(f"document.querySelectorAll('[data-drawn]').length == {FIGURES}")
 
 
@@ -96,12 +96,39 @@ def test_charts_of_one_flight_share_their_time(browser: Browser, report: Path) -
     with reading(browser, report) as opened:
         opened.wait_until_drawn()
         draw_everything(opened)
-        change = "place => Plotly.relayout(place, {'xaxis.range': [1, 2]})"
-        opened.page.locator("[data-chart=swing_position] .plot").evaluate(change)
-        of = "document.querySelector('[data-chart={}] .plot').layout.xaxis.range.join()"
-        shown = f"{of.format('swing_attitude')} == '1,2' && {of.format('swing_error')} == '1,2'"
-        opened.page.wait_for_function(shown)
-        assert opened.page.evaluate(of.format("spin_error")) != "1,2"
+        opened.page.locator("[data-chart=swing_position]").scroll_into_view_if_needed()
+        panel = opened.page.locator("[data-chart=swing_position] .plot > svg .overlay").first
+        box = panel.bounding_box()
+        assert box is not None
+        opened.page.mouse.move(box["x"] + 0.2 * box["width"], box["y"] + 20)
+        opened.page.mouse.down()
+        opened.page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 20, steps=4)
+        opened.page.mouse.up()
+        assert seconds(opened, "swing_position")[-1] < 3.0
+        assert seconds(opened, "swing_attitude") == seconds(opened, "swing_position")
+        assert seconds(opened, "swing_error") == seconds(opened, "swing_position")
+        assert seconds(opened, "spin_error")[-1] > 5.0
+        opened.page.locator("[data-chart=swing_error] .overlay").first.dblclick()
+        assert seconds(opened, "swing_position") == seconds(opened, "spin_error")
+
+
+def seconds(opened: Reading, chart: str) -> list[float]:
+    """Return what a figure's time axis is labelled with."""
+    ticks = opened.page.locator(f"[data-chart={chart}] [aria-label='x-axis tick label'] text")
+    return [float(text) for text in ticks.all_text_contents()]
+
+
+def test_a_name_in_the_legend_hides_its_curve(browser: Browser, report: Path) -> None:
+    with reading(browser, report) as opened:
+        opened.wait_until_drawn()
+        draw_everything(opened)
+        curves = opened.page.locator("[data-chart=swing_error] [aria-label=line] path")
+        name = opened.page.locator("[data-chart=swing_error] .legend button", has_text="initial")
+        assert curves.count() == 4
+        name.click()
+        assert curves.count() == 2
+        name.click()
+        assert curves.count() == 4
 
 
 def test_the_page_asks_the_network_for_nothing(desktop: Reading) -> None:
@@ -111,7 +138,7 @@ def test_the_page_asks_the_network_for_nothing(desktop: Reading) -> None:
 def test_the_colours_of_the_figures_follow_the_scheme(desktop: Reading) -> None:
     for scheme, ink in (("dark", DARK), ("light", LIGHT)):
         desktop.page.emulate_media(color_scheme=scheme)
-        desktop.page.locator(f".xtitle[style*='{ink}']").first.wait_for()
+        desktop.page.wait_for_function(f"{TITLE_COLOUR} == '{ink}'")
 
 
 @pytest.mark.parametrize("width", [1280, 390], ids=["desktop", "phone"])
@@ -151,7 +178,7 @@ def test_the_keyboard_reaches_what_can_be_operated(desktop: Reading) -> None:
 
 def test_a_figure_can_be_saved(desktop: Reading) -> None:
     with desktop.page.expect_download() as download:
-        desktop.page.locator("[data-title*=Download]").first.click()
+        desktop.page.locator(".save").first.click()
     assert download.value.path().read_bytes().startswith(b"<svg")
     assert desktop.complaints == []
 

@@ -50,6 +50,13 @@ def test_a_held_out_flight_met_to_its_noise_makes_a_fit_usable(result):
     assert "position error from 17 cm to 1.7 mm" in found.reasons[0]
 
 
+def test_that_flights_are_simulated_is_said_where_the_job_file_says_so(result):
+    assert "simulated" not in outcome(result).what
+    settings = result.settings | {"job": {"simulated": True}}
+    said = outcome(result.model_copy(update={"settings": settings})).what
+    assert said.endswith("The flights are simulated, as the job file says.")
+
+
 @pytest.mark.parametrize(
     ("after", "word", "standing"),
     [
