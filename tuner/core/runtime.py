@@ -1,10 +1,10 @@
 """Set-up of jax: threads, precision, compiled code.
 
-A job's flights run as kernels of `lanes`, which have threads of their own. What XLA computes in a
-job is small, and its thread pool makes it slower: it is turned off. Flights that do run through XLA
-(reverse mode, one's own programs with `sim_jax`) want two things of it: loops compiled as one
-function, ten times faster for one vehicle, and fusions of several outputs prepared, without which
-each number of a step is computed anew, 3.7 times as many operations.
+A job's flights run as kernels of `lanes`, which have threads of their own. What XLA and NumPy's
+linear algebra compute in a job is small, and thread pools make it slower: they are turned off.
+Flights that do run through XLA (reverse mode, one's own programs with `sim_jax`) want two things of
+it: loops compiled as one function, ten times faster for one vehicle, and fusions of several outputs
+prepared, without which each number of a step is computed anew, 3.7 times as many operations.
 
 Whatever the user has set in the environment stays.
 """
@@ -38,12 +38,25 @@ that jax traces is hundreds of thousands of objects that stay, which Python's ow
 again and again."""
 
 
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""How many threads linear algebra has, by library."""
+
+
 def cores() -> int:
     """Return how many processor cores this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
         return os.cpu_count() or 1
+
+
+def use_one_thread_for_algebra() -> None:
+    """Keep NumPy's linear algebra on the thread that asks for it; call it before NumPy's import.
+
+    A job's matrices are small: threads that wait for the next one take most of the processor.
+    """
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
 
 
 def set_environment() -> None:

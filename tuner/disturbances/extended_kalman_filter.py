@@ -26,7 +26,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from lanes import Argument, Program, Run
+from sim_jax.schedule import Schedule
 from sim_jax.state import State
+from sim_jax.terms import total
 from sim_jax.trees import row_of
 from tuner.disturbances.covariance import (
     Samples,
@@ -46,8 +48,7 @@ from tuner.disturbances.observer import (
     first_errors,
 )
 from tuner.objective.criterion import Either
-from tuner.objective.flown import flown_part, laid_out
-from tuner.objective.simulator import Simulator
+from tuner.objective.flown import CODE, flown_part, laid_out
 from tuner.vehicle.model import with_coefficients
 
 GATE = 4.0
@@ -127,33 +128,30 @@ class Filtered(eqx.Module):
     gains: Gains | None
 
 
-def _undelayed(simulator: Simulator) -> Simulator:
-    """Return a simulator without the delay line of estimates, which rate control does not see."""
-    schedule = replace(simulator.schedule, longest_estimate_latency=0.0, pose_rate=None)
-    return replace(simulator, schedule=schedule)
+def _undelayed(schedule: Schedule) -> Schedule:
+    """Return a schedule without the delay line of estimates, which rate control does not see."""
+    return replace(schedule, longest_estimate_latency=0.0, pose_rate=None)
 
 
-def _shortly_delayed(simulator: Simulator, expected: Expected) -> tuple[Simulator, int]:
-    """Return a simulator whose delay line of commands is no longer than needed.
+def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, int]:
+    """Return a schedule whose delay line of commands is no longer than needed.
 
     And how many commands are on their way to the motors when a step begins: to correct each of them
     costs as much as a rotor's speed.
     """
-    schedule = simulator.schedule
     if schedule.longest_actuator_latency == 0.0:
-        return simulator, 0
+        return schedule, 0
     latency = float(expected.tunable.at(expected.coefficients).vehicle.setup.actuator_latency)
     count = max(int(np.ceil(latency / schedule.step - 1e-9)), 1)
-    short = replace(schedule, longest_actuator_latency=count * schedule.step)
-    return replace(simulator, schedule=short), count
+    return replace(schedule, longest_actuator_latency=count * schedule.step), count
 
 
-def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) -> Gains:
-    """Return the gains of a simulator for the same in so many times finer steps of physics.
+def stepped(gains: Gains, schedule: Schedule, expected: Expected, times: int) -> Gains:
+    """Return the gains of a schedule for the same in so many times finer steps of physics.
 
     Then so many times as many commands are on their way to the motors.
     """
-    in_flight = _shortly_delayed(simulator, expected)[1]
+    in_flight = _shortly_delayed(schedule, expected)[1]
     size, rotors = gains.gain.shape[-1], len(expected.tunable.model.vehicle.rotors)
     first = size - COUNT - in_flight * rotors
     commands = np.arange(first, size - COUNT).reshape(in_flight, rotors).repeat(times, axis=0)
@@ -161,20 +159,18 @@ def stepped(gains: Gains, simulator: Simulator, expected: Expected, times: int) 
     return replace(gains, gain=gains.gain[..., rows])
 
 
-def filtered(
-    simulator: Simulator, feed: Feed, expected: Expected, *, gains: bool = True
-) -> Filtered:
+def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool = True) -> Filtered:
     """Return the Kalman gains, the innovations, and how likely they are.
 
     Parameters
     ----------
-    simulator, feed, expected
-        What flies, the recordings, and what is taken for true.
+    schedule, feed, expected
+        Of the simulation, the recordings, and what is taken for true.
     gains
         Whether gains are kept, which take most of the memory.
     """
-    short, in_flight = _shortly_delayed(_undelayed(simulator), expected)
-    static = _Static("filter", short, in_flight, moves=False)
+    short, in_flight = _shortly_delayed(_undelayed(schedule), expected)
+    static = _Static("filter", short, feed.conditions, in_flight, moves=False)
     wanted = (*[True] * 3, *[gains] * 2)
     *rows, gain, factors = _run(_given(feed, expected), static, wanted=wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
@@ -182,20 +178,21 @@ def filtered(
 
 
 def innovations(
-    simulator: Simulator, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike | None
+    schedule: Schedule, feed: Feed, gains: Gains, expected: Expected, directions: ArrayLike | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return whitened innovations (T, m, F) with given gains, and derivatives (N, T, m, F).
 
     Parameters
     ----------
-    simulator, feed, expected
+    schedule, feed, expected
         As of `filtered`.
     gains
         Of the observer.
     directions
         (N, K + offsets): along which is differentiated; None for nothing.
     """
-    static = _Static("innovations", _undelayed(simulator), 0, moves=directions is not None)
+    moves = directions is not None
+    static = _Static("innovations", _undelayed(schedule), feed.conditions, 0, moves=moves)
     moved = None if directions is None else _tangents(expected, np.asarray(directions, float))
     wanted = (True, False) if moved is None else ((True, False), (False, True))
     run = _run(_given(feed, expected, gains), static, moved, wanted)
@@ -225,7 +222,8 @@ class _Static:
     """What a program belongs to, besides the structure of what it is given."""
 
     kind: Literal["filter", "innovations"]
-    simulator: Simulator
+    schedule: Schedule
+    conditions: tuple[str, ...]
     in_flight: int
     moves: bool
 
@@ -315,14 +313,19 @@ def _program(leaves: tuple[Argument, ...], structure: Any, static: _Static) -> P
         return flown(given, static, lengths["turns"])
 
     return Program(
-        function, jax.tree.unflatten(structure, leaves), name=static.kind, at_once=AT_ONCE
+        function,
+        jax.tree.unflatten(structure, leaves),
+        name=static.kind,
+        at_once=AT_ONCE,
+        made_of=(static, total.TERMS),
+        packages=CODE,
     )
 
 
 def _observer(given: _Given, static: _Static) -> tuple[Observer, State]:
     model = with_coefficients(given.model, given.coefficients)
-    feed = Feed(given.segments, given.offsets, given.samples)
-    return Observer.of(static.simulator, feed, model, given.strengths)
+    feed = Feed(given.segments, given.offsets, given.samples, static.conditions)
+    return Observer.of(static.schedule, feed, model, given.strengths)
 
 
 def _sampled(given: _Given, tick: Array) -> tuple[Callable[[Array], Array], Array]:

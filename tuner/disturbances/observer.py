@@ -23,6 +23,7 @@ from sim_jax.plant import Plant
 from sim_jax.rigid_body import Motion
 from sim_jax.rollout import begun
 from sim_jax.rotation import Quaternion
+from sim_jax.schedule import Schedule
 from sim_jax.sensing import GyroMemory
 from sim_jax.state import State
 from sim_jax.trees import replaced, row_of
@@ -36,7 +37,6 @@ from tuner.disturbances.recorded import Sampled
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.flight import beginning_of
 from tuner.objective.segments import CLOCK_OF, CLOCKS, OFFSETS, Segments
-from tuner.objective.simulator import Simulator
 from tuner.objective.tunable import Tunable
 from tuner.vehicle.model import Model
 
@@ -55,11 +55,14 @@ class Feed(eqx.Module):
         (offsets, F) of the point.
     samples
         Channel -> its samples on ticks.
+    conditions
+        What surrounds each flight and moves, in the last rows of ``offsets``.
     """
 
     segments: Segments
     offsets: Float[Array, "O F"]
     samples: dict[str, Sampled]
+    conditions: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def widths(self) -> dict[str, int]:
@@ -101,16 +104,16 @@ class Observer(eqx.Module):
 
     @staticmethod
     def of(
-        simulator: Simulator, feed: Feed, model: Model, strengths: Float[Array, "7 *F"]
+        schedule: Schedule, feed: Feed, model: Model, strengths: Float[Array, "7 *F"]
     ) -> tuple[Observer, State]:
         """Return the observer of a model, and the state in which the segments begin.
 
         ``strengths`` of the disturbances, each segment's own.
         """
-        schedule, units = simulator.schedule, units_of(simulator.conditions)
+        units = units_of(feed.conditions)
         conditions = {
             name: feed.offsets[len(OFFSETS) + row] * units[row]
-            for row, name in enumerate(simulator.conditions)
+            for row, name in enumerate(feed.conditions)
         }
         start, inlet, environment = beginning_of(
             model, feed.segments, schedule, conditions=conditions

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_jax.inlet import ReferenceInlet
+from sim_jax.schedule import Schedule
 from tuner.core.numerics import robust_sd
 from tuner.disturbances.disturbances import COMMAND_NOISE, STRENGTHS, USUAL
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations, stepped
@@ -30,7 +31,6 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
-from tuner.objective.simulator import Simulator
 from tuner.recordings.flight import Flight
 
 Array = NDArray[np.float64]
@@ -55,8 +55,8 @@ class Predictor:
 
     Attributes
     ----------
-    simulator
-        Flies.
+    schedule
+        Of the simulation.
     feed
         The recordings, and the offsets at which they are met best.
     rows
@@ -69,7 +69,7 @@ class Predictor:
         What the filter makes of the recordings: None before it has run.
     """
 
-    simulator: Simulator
+    schedule: Schedule
     feed: Feed
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
@@ -108,11 +108,12 @@ class Predictor:
             for name in channels
         }
         return Predictor(
-            simulator=objective.simulator,
+            schedule=schedule,
             feed=Feed(
                 segments=replace(segments, inlet=inlet, measured={}),
                 offsets=jnp.asarray(offsets),
                 samples={name: samples for name, (samples, _) in laid.items()},
+                conditions=objective.conditions,
             ),
             rows={name: rows for name, (_, rows) in laid.items()},
             strengths=USUAL,
@@ -165,7 +166,7 @@ class Predictor:
                 replace(feed, samples=samples),
             )
             expected = self._expected(objective, point, np.repeat(some, count, axis=-1))
-            found = filtered(self.simulator, tiled, expected, gains=False)
+            found = filtered(self.schedule, tiled, expected, gains=False)
             for number in range(some.shape[1]):
                 segments = slice(number * count, (number + 1) * count)
                 yield likelihood_of(found, ticks, segments)
@@ -205,7 +206,7 @@ class Predictor:
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
         feed = self._fed(point)
-        found = filtered(self.simulator, feed, self._expected(objective, point))
+        found = filtered(self.schedule, feed, self._expected(objective, point))
         return replace(self, feed=feed, found=found)
 
     @property
@@ -286,12 +287,12 @@ class Predictor:
         segments, found = self.feed.segments, self.found
         assert found is not None
         assert found.gains is not None
-        times = other.schedule.physics_rate // self.simulator.schedule.physics_rate
+        times = other.schedule.physics_rate // self.schedule.physics_rate
         inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
-        gains = stepped(found.gains, self.simulator, self._expected(other, point), times)
+        gains = stepped(found.gains, self.schedule, self._expected(other, point), times)
         return replace(
             self,
-            simulator=other.simulator,
+            schedule=other.schedule,
             feed=replace(
                 self.feed,
                 segments=replace(segments, inlet=inlet, disturbance=other.segments.disturbance),
@@ -315,7 +316,7 @@ class Predictor:
             some = list(moved[first : first + AT_ONCE])
             directions = np.eye(size)[some] if some else None
             errors, derivatives = innovations(
-                self.simulator, feed, self.found.gains, expected, directions
+                self.schedule, feed, self.found.gains, expected, directions
             )
             residuals = gathered(errors, feed.widths, self.rows)
             for name, part in gathered(derivatives[: len(some)], feed.widths, self.rows).items():

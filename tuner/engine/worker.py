@@ -16,11 +16,8 @@ from distributed import Event, Status, Worker, WorkerPlugin, get_worker
 
 from tuner.core.content_store import ContentStore
 from tuner.core.errors import EngineError
-from tuner.core.runtime import configure
+from tuner.core.runtime import configure, use_one_thread_for_algebra
 from tuner.engine.engine import HERE, using
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Of linear algebra beside XLA: one, for every worker has its cores for itself."""
 
 
 class Stopped(Exception):  # noqa: N818 (no error: it was asked for)
@@ -52,8 +49,7 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
             pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
         if self.gpus:
             os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
-        for name in THREADS:
-            os.environ.setdefault(name, "1")
+        use_one_thread_for_algebra()
         configure()
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tuner.core.errors import RecordingError
+from tuner.core.runtime import THREADS
 from tuner.service.settings import Limits, limit_process, size_in_words
 
 SMALLER = "split the recording, or leave topics out that are not needed (images, point clouds)"
@@ -35,7 +36,7 @@ def inspect(file: Path, limits: Limits) -> dict[str, Any]:
         int(limits.inspection_seconds) + 1,
     )
     command = [sys.executable, "-m", "tuner.service.inspection", str(file), *map(str, numbers)]
-    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    single = dict.fromkeys(THREADS, "1")
     try:
         done = subprocess.run(
             command,

@@ -73,7 +73,7 @@ class Innovations:
         """Return what the innovations of a predictor say at a fit, gains as they are."""
         names = [name for group in _outside(selected).values() for name in group]
         _, wide = with_free(selected.job, fitted, names)
-        beside = replace(predictor, simulator=wide.objective.simulator)
+        beside = replace(predictor, schedule=wide.objective.schedule)
         information = beside.information(wide.objective, wide.point, fitted.criterion)
         space, vector = wide.objective.space, np.asarray(wide.point.coefficients)
         scaled = space.scaled(vector)

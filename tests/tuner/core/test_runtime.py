@@ -95,3 +95,16 @@ def test_what_is_imported_before_jax_is_set_up_does_without_it(module: str) -> N
     code = f"import sys, {module}; print('jax' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+def test_the_command_keeps_algebra_on_one_thread_before_numpy_is_there() -> None:
+    code = (
+        "import sys, os; from tuner.cli import main; print('numpy' in sys.modules); "
+        "main(['--version']); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    clean = {k: v for k, v in os.environ.items() if k not in runtime.THREADS}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean, capture_output=True, text=True, check=True
+    )
+    words = done.stdout.split()
+    assert (words[0], words[-1]) == ("False", "1")

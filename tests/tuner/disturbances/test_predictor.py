@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sim_jax.crash import Limits
 from sim_jax.disturbance import Disturbance
 from sim_jax.rollout import rollout
 from sim_jax.vector import Vec3
@@ -296,10 +295,11 @@ def test_what_was_not_sampled_is_as_likely_with_any_noise(fitted) -> None:
 def test_a_height_that_no_sample_corrects_may_drift_below_the_ground(fitted) -> None:
     """A simulation would end there: the state frozen, and all samples that follow lost."""
     problem, predictor, point = fitted
-    strict = replace(predictor.simulator, limits=Limits(floor=5.0))  # above what is flown
     expected = predictor._expected(problem, point)
     model = expected.tunable.at(expected.coefficients)
-    observer, state = Observer.of(strict, predictor.feed, model, expected.strengths)
+    observer, state = Observer.of(predictor.schedule, predictor.feed, model, expected.strengths)
+    height = state.motion.position.z
+    state = eqx.tree_at(lambda s: s.motion.position.z, state, height - 2.0 * jnp.max(height) - 5.0)
     after = observer.next(state, jnp.zeros((COUNT, 2)), jnp.asarray(0))
     assert float(jnp.abs(after.motion.velocity.z - state.motion.velocity.z).max()) > 0.0
 
@@ -326,7 +326,7 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
         lambda o: o.model.vehicle.setup.actuator_latency, problem, jnp.asarray(0.007)
     )  # two commands on their way, three in finer steps
     finer = alternatives_of(late, point)[STEP]
-    predictor = replace(predictor, simulator=late.simulator).at(late, point)
+    predictor = replace(predictor, schedule=late.schedule).at(late, point)
     own = Predictor.of(finer, point, gusty(problem, 1)[1])
     assert own is not None
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)

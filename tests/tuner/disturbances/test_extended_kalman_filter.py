@@ -1,0 +1,169 @@
+"""The filter's kernel against matrices of a textbook, and kept for the next process."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lanes import keep_code_in
+from sim_jax.inlet import BodyRateInlet
+from sim_jax.state import hover
+from sim_jax.vector import Vec3
+from tests.tuner.uncertainty.making import controller_file, vehicle_file
+from tuner.config import JobFile
+from tuner.core.disk import cache_folder
+from tuner.disturbances import extended_kalman_filter as ekf
+from tuner.disturbances.disturbances import COUNT, USUAL
+from tuner.disturbances.observer import Expected, Feed, first_errors
+from tuner.disturbances.recorded import Sampled
+from tuner.objective.segments import Segments
+from tuner.objective.space import space_of
+from tuner.objective.tunable import tunable_of
+from tuner.vehicle.model import model_of, schedule_of
+
+TICKS = 6
+ROOT = Path(__file__).parents[3]
+SD = {"position": 1e-3, "attitude": 2e-3, "body_rate": 0.02, "rotor_speed": 100.0}
+SECOND = """
+import sys
+from pathlib import Path
+import numpy as np
+from lanes import keep_code_in
+from tests.tuner.disturbances import test_extended_kalman_filter as test
+from tuner.disturbances import extended_kalman_filter as ekf
+
+def traced(*_):
+    raise AssertionError("traced")
+
+ekf._filter = ekf._innovations = traced
+keep_code_in(Path(sys.argv[1]))
+print(*(float(np.sum(each)).hex() for each in test.told(*test.hovering())))
+"""
+
+
+def hovering() -> tuple[ekf.Schedule, Feed, Expected]:
+    """Return a hover whose samples, at some of the ticks, scatter by their noise."""
+    vehicle, controller = vehicle_file(), controller_file()
+    space = space_of(vehicle, controller, JobFile(free=("inertia_xx", "motor_constant")))
+    model, schedule = model_of(vehicle, controller), schedule_of(controller)
+    at = Vec3(*(jnp.full(1, number) for number in (0.1, -0.2, 1.0)))
+    start = jax.tree.map(
+        lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, float), (1,)), hover(model.vehicle, at)
+    )
+    rows = np.zeros((TICKS * schedule.physics_rate // schedule.log_rate + 2, 1))
+    inlet = BodyRateInlet(Vec3(rows + 0.1, rows, rows - 0.05), rows + 0.4)
+    rng, samples = np.random.default_rng(0), {}
+    for number, (name, sd) in enumerate(SD.items()):
+        read = 4 if name in ("attitude", "rotor_speed") else 3
+        motion = start.motion
+        seen = {
+            "position": motion.position.stacked(),
+            "attitude": motion.attitude.stacked(),
+            "rotor_speed": start.rotor_speed,
+        }
+        values = np.tile(np.asarray(seen.get(name, np.zeros((3, 1)))), (TICKS, 1, 1))
+        values += sd / 4.0 * rng.standard_normal(values.shape)
+        weight = np.zeros((TICKS, 3 if name == "attitude" else read, 1))
+        weight[number % 2 :: 2] = 1.0 / sd
+        samples[name] = Sampled(values, weight, np.ones((TICKS, 1)))
+    feed = Feed(Segments(inlet, start, {}, jnp.arange(1)), np.zeros((6, 1)), samples)
+    wide = sum(feed.widths.values())
+    return (
+        schedule,
+        feed,
+        Expected(tunable_of(model, space), space.initial, USUAL[:, None] + 1.0, np.ones((wide, 1))),
+    )
+
+
+def told(schedule: ekf.Schedule, feed: Feed, expected: Expected) -> tuple[np.ndarray, ...]:
+    """Return whitened innovations of the filter, its loss, and derivatives with its gains."""
+    found = ekf.filtered(schedule, feed, expected)
+    assert found.gains is not None
+    directions = np.eye(2 + len(feed.offsets))[:2]
+    _, moved = ekf.innovations(schedule, feed, found.gains, expected, directions)
+    return found.white, found.loss, moved
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An empty folder of kernels."""
+    path = tmp_path_factory.mktemp("kernels")
+    keep_code_in(path)
+    ekf._program.cache_clear()
+    yield path
+    ekf._program.cache_clear()
+    keep_code_in(cache_folder() / "kernels_of_tests")
+
+
+@pytest.mark.usefixtures("folder")
+def test_innovations_are_those_of_a_filter_in_matrices() -> None:
+    schedule, feed, expected = hovering()
+    white = told(schedule, feed, expected)[0][..., 0]
+    short, in_flight = ekf._shortly_delayed(ekf._undelayed(schedule), expected)
+    static = ekf._Static("filter", short, (), in_flight, moves=False)
+    given = ekf._given(feed, expected)
+    one = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf[..., 0]),
+        given._replace(order=None, model=None, coefficients={}),
+    )
+    one = one._replace(model=given.model, coefficients=given.coefficients)
+    observer, state = ekf._observer(one, static)
+    size = len(first_errors(state, in_flight)) + COUNT
+
+    def errors(change, state, number):
+        read = jax.tree.map(lambda leaf: leaf[number], one.samples)
+        now = observer.seen(observer.corrected(state, change, number, in_flight), number)
+        return jnp.concatenate(observer.errors(now, now, read)), observer.sampled(read)
+
+    def later(change, state, pushed, number):
+        moved = observer.corrected(state, change[:-COUNT], number, in_flight)
+        after = observer.next(moved, pushed + change[-COUNT:], number)
+        kept = observer.processes.keeps * (pushed + change[-COUNT:])
+        numbers = observer.numbers(after, number + 1, in_flight)
+        return jnp.concatenate([numbers, kept]), after
+
+    told_by = jax.jit(lambda *args: (*errors(*args), jax.jacfwd(errors, has_aux=True)(*args)[0]))
+    moved_by = jax.jit(jax.jacfwd(later, has_aux=True))
+    processes, pushed = observer.processes, jnp.zeros(COUNT)
+    sd = np.concatenate([first_errors(state, in_flight), processes.sd])
+    covariance, fresh = np.diag(sd**2), np.diag([*np.zeros(size - COUNT), *processes.added])
+    for number in range(TICKS):
+        error, sampled, slopes = map(
+            np.asarray, told_by(jnp.zeros(size - COUNT), state, jnp.asarray(number))
+        )
+        along = np.hstack([slopes, np.zeros((len(slopes), COUNT))])[sampled]
+        root = np.linalg.cholesky(along @ covariance @ along.T + np.eye(len(along)))
+        gain = np.linalg.solve(root, along @ covariance)
+        alone = np.linalg.solve(root, error[sampled])
+        assert 0.1 < np.abs(alone).max() < ekf.GATE
+        np.testing.assert_allclose(white[number][sampled], alone, rtol=1e-6, atol=1e-9)
+        assert (white[number][~sampled] == 0.0).all()
+        change = jnp.asarray(-alone @ gain)
+        state = observer.corrected(state, change[:-COUNT], jnp.asarray(number), in_flight)
+        pushed = pushed + change[-COUNT:]
+        follow, state = moved_by(jnp.zeros(size), state, pushed, jnp.asarray(number))
+        pushed = pushed * processes.keeps
+        covariance = follow @ (covariance - gain.T @ gain) @ follow.T + fresh
+
+
+def test_another_process_traces_nothing_again(folder) -> None:
+    sums = [float(np.sum(each)).hex() for each in told(*hovering())]
+    assert len(list(folder.glob("*.o"))) >= 2
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", SECOND, str(folder)],
+        capture_output=True,
+        text=True,
+        check=False,
+        cwd=ROOT,
+        timeout=300,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == sums
