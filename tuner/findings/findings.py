@@ -258,8 +258,8 @@ class Code(Worded):
     SATURATION_FEEDBACK = (
         "saturation_feedback",  # feedback: 1 if the integrator stops, else 0
         (
-            "The recordings agree with a mixer that {mixer} at the rotors' lower limit, not with "
-            "the controller file's. The fit simulated the one that agrees."
+            "The flown mixer is not the file's: the recordings agree with one that {mixer} at the "
+            "rotors' lower limit. The fit simulated that one."
         ),
         "Set mixer.saturation_feedback: {flag} (in the controller file).",
     )
@@ -378,10 +378,10 @@ class Code(Worded):
     FINER_THAN_STEPS = (
         "finer_than_steps",  # seconds
         (
-            "The step of a simulator shifts these lags by about {milliseconds:g} ms, which their "
-            "95 % intervals leave out."
+            "Simulators' steps shift them {milliseconds:g} ms: that lies between simulators of "
+            "other steps, and the 95 % intervals leave it out."
         ),
-        "Take them as known to twice that shift, ±{twice:g} ms, in any simulator.",
+        "Take them as known to ±{twice:g} ms: twice as much, in any simulator.",
     )
     REFERENCE_VOLTAGE = (
         "reference_voltage",  # volts

@@ -286,10 +286,9 @@ def _what(result: RunResult) -> str:
     text = f"{free} coefficient{'s were' if free != 1 else ' was'} fitted"
     if result.flights:
         job = result.settings.get("job")
-        simulated = isinstance(job, dict) and job.get("simulated")
-        text += f" to {fitted} flight{'s' if fitted != 1 else ''}"
+        kind = "simulated flight" if isinstance(job, dict) and job.get("simulated") else "flight"
+        text += f" to {fitted} {kind}{'s' if fitted != 1 else ''}"
         text += f"; {held} {'was' if held == 1 else 'were'} held out to check them" if held else ""
-        text += ". The flights are simulated, as the job file says" if simulated else ""
     return text + "."
 
 
