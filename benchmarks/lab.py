@@ -42,7 +42,7 @@ from tuner.terms.search_with_terms import search_with_terms
 from tuner.terms.selection_state import Selected
 from tuner.terms.shown import terms_shown
 from tuner.uncertainty.estimates import Estimate, Uncertainty
-from tuner.uncertainty.lacking import laws_lacking
+from tuner.uncertainty.lacking import lack_found
 from tuner.vehicle import COEFFICIENTS, values_of
 
 SEEDS = tuple(int(seed) for seed in os.environ.get("TUNE_LAB_SEEDS", "0,1,2").split(","))
@@ -291,7 +291,7 @@ def trial_of(seed: int) -> Trial:
         *said,
         *fitted.findings,
         *explanation.findings,
-        *laws_lacking(examination.laws, examination.uncertainty),
+        *lack_found(examination.lack, examination.uncertainty),
         *terms_shown(fitted, examination.uncertainty),
     )
     trial = Trial(lab, found, free, {}, seconds, reference, said)

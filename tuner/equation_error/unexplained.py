@@ -49,7 +49,7 @@ MOST = 5
 AXES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z")
 
 
-class Flown(NamedTuple):
+class Pair(NamedTuple):
     """The steps of a flight as they were recorded, and as the fit flies them.
 
     ``driven``: whether the recorded rotor speeds are those that the fit makes of commands; what
@@ -167,7 +167,7 @@ def unexplained(
     model: Model,
     parameters: Sequence[Parameter],
     point: Array,
-    flights: Sequence[Flown],
+    flights: Sequence[Pair],
 ) -> Unexplained:
     """Return what recorded accelerations hold that no fitted coefficient explains.
 

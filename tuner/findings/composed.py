@@ -230,6 +230,26 @@ def law_remedy(finding: Finding) -> str:
     return f"Of that kind are {listed(terms)}: name what the vehicle has under terms in the job."
 
 
+def controller_answers(finding: Finding) -> str:
+    """Return which gain the rate controller's answers have, and whose intervals hold that."""
+    part, *axes = finding.names
+    numbers = finding.numbers
+    if part == "late":
+        parts = [
+            f"{axis} answers its gyro {1e3 * abs(numbers[axis]):.2g} ± "
+            f"{1e3 * numbers[f'{axis}_error']:.1g} ms "
+            f"{'later' if numbers[axis] > 0.0 else 'earlier'}"
+            for axis in axes
+        ]
+        than = "than the controller file's filters and D let it"
+    else:
+        parts = [f"{axis} reacts as if its {part} were {_more(numbers, axis)}" for axis in axes]
+        than = "than in the controller file"
+    return as_sentence(
+        f"{listed(parts)} {than}, by the recorded commands; intervals hold what that moves"
+    )
+
+
 def rotor_changed(finding: Finding) -> str:
     """Return which rotor changed within a flight, when, and by how much."""
     loss, (place,) = finding.numbers["loss"], finding.names

@@ -339,6 +339,11 @@ class Code(Worded):
         composed.law_lacking,
         composed.law_remedy,
     )
+    CONTROLLER_ANSWERS = (
+        "controller_answers",  # AXIS, AXIS_error; names: P, I or late, the AXES
+        composed.controller_answers,
+        "Compare the controller file with the autopilot's parameters, as they are now.",
+    )
     ROTOR_CHANGED = (
         "rotor_changed",  # seconds, rotor (from 1), loss (share); names: its place
         composed.rotor_changed,

@@ -61,7 +61,7 @@ from tuner.terms.shown import terms_shown
 from tuner.uncertainty.estimates import finer_than_steps
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.ground import ground_conflicts, sources_of
-from tuner.uncertainty.lacking import laws_lacking
+from tuner.uncertainty.lacking import lack_found
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.refits import bootstrap, cross_validate, jackknife_errors
 from tuner.vehicle import VehicleFile, with_values, write_vehicle
@@ -315,7 +315,7 @@ def _known(
         return {}
     uncertainty, known = examination.uncertainty, examination.known
     explanation.notice(finer_than_steps(uncertainty))
-    explanation.notice(laws_lacking(examination.laws, uncertainty))
+    explanation.notice(lack_found(examination.lack, uncertainty))
     explanation.notice(terms_shown(fitted, uncertainty))
     sources: dict[str, Sources] = explanation.part(
         "ground measurements", partial(sources_of, fitted, uncertainty, known), {}

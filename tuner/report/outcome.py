@@ -37,6 +37,7 @@ DOUBTS = frozenset(
         Code.FLIGHT_WORSE,
         Code.FLIGHT_NOT_FLOWN,
         Code.LAW_LACKING,
+        Code.CONTROLLER_ANSWERS,
         Code.HOLDING_BETTER,
         Code.GROUND_CONFLICT,
         Code.BENCH_CONFLICT,

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.disturbances.information import with_hidden, with_strengths
 from tuner.disturbances.predictor import Predictor
-from tuner.equation_error.unexplained import Law
 from tuner.objective.alternatives import LACK
 from tuner.objective.criterion import Point
 from tuner.objective.flight_batches import portion, portions
@@ -55,8 +54,8 @@ class Examination:
         Of every flight and channel.
     full_problem, information
         The problem in all coefficients, the fitted first, and the information about them.
-    laws
-        That recorded accelerations follow beside the model's.
+    lack
+        What the model is known to lack.
     """
 
     uncertainty: Uncertainty
@@ -66,7 +65,7 @@ class Examination:
     residuals: tuple[Residual, ...]
     full_problem: FullProblem
     information: FisherInformation
-    laws: tuple[Law, ...] = ()
+    lack: Lack | None = None
 
     @property
     def known(self) -> Array:
@@ -163,7 +162,7 @@ def examine(
         residuals=tuple(residuals),
         full_problem=full_problem,
         information=information,
-        laws=() if lack is None else lack.laws,
+        lack=lack,
     )
 
 

@@ -1,8 +1,9 @@
-"""What a fit's flights hold that its model does not, as a disturbance that may be simulated.
+"""What a fit's flights hold that its model does not, as another model that may be simulated.
 
 The laws that `tuner.equation_error.unexplained` finds push the simulated flights, each along its
-recording: by how much coefficients then have to move is how far the model's lack may have moved
-them, and a part of their standard errors.
+recording, and a rate controller that answers otherwise than its file
+(`tuner.equation_error.rate_controller`) flies them so: by how much coefficients then have to move
+is how far the model's lack may have moved them, and a part of their standard errors.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim_jax.control.gains import MixerSettings, RateGains
+from sim_jax.control.mixer import torque_of
 from sim_jax.disturbance import Disturbance
 from sim_jax.environment import Environment
 from sim_jax.inlet import ReferenceInlet
@@ -26,12 +29,13 @@ from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
 from sim_jax.vector import Vec3
 from sim_jax.vehicle import Motor
-from tuner.equation_error.measured import Measured, measured
-from tuner.equation_error.unexplained import Flown, Law, unexplained
+from tuner.equation_error.measured import FEWEST, Measured, measured
+from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, answers
+from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import units_of
-from tuner.objective.flight import MOTION, TURNED, environment_of
-from tuner.objective.flown import fly
+from tuner.objective.flight import MOTION, SETPOINTS, TURNED, environment_of
+from tuner.objective.flown import Flown, fly
 from tuner.objective.normal import Objective
 from tuner.objective.segments import OFFSETS
 from tuner.recordings.flight import Array, Flight, Series
@@ -41,6 +45,7 @@ from tuner.vehicle.model import Model
 
 MATTERS = 0.5
 """Standard errors without it, from which the move of a coefficient is said."""
+_CHANNELS = ("position", "attitude", "rotor_speed", "body_rate", "command")
 SMALLEST = 0.03
 """Share of what varies along an axis below which a law is none to speak of."""
 
@@ -54,16 +59,25 @@ class Lack:
     laws
         The likeliest first.
     disturbance
-        What all of them make, in every segment.
+        What all of them make, in every segment; None for no laws.
+    answers
+        Which of the rate controller's gains are not the file's.
     """
 
     laws: tuple[Law, ...]
-    disturbance: Disturbance
+    disturbance: Disturbance | None
+    answers: tuple[Answer, ...] = ()
 
     def acting_on(self, objective: Objective) -> Objective:
-        """Return a problem whose simulated flights it pushes."""
+        """Return a problem whose simulated flights it pushes, and whose gains are those found."""
+        segments, model = objective.segments, objective.model
+        rate = model.controller.rate
+        for answer in self.answers:
+            rate = _answering(rate, answer)
         return replace(
-            objective, segments=replace(objective.segments, disturbance=self.disturbance)
+            objective,
+            segments=replace(segments, disturbance=self.disturbance),
+            model=eqx.tree_at(lambda m: m.controller.rate, model, rate),
         )
 
 
@@ -110,21 +124,22 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         limits=objective.limits,
         coefficients=objective.tunable.values(vector),
         conditions=conditions,
-        channels=("position", "attitude", "rotor_speed", MOTION, TURNED),
+        channels=(*_CHANNELS, MOTION, TURNED, SETPOINTS),
     )
     rate = float(schedule.log_rate)
+    heard = _heard(flights, flown, model.controller.mixer, rate)
     pairs = {
-        number: Flown(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
+        number: Pair(one, _simulated(one, flown.channels, conditions, number, rate), by_command)
         for number, (one, by_command) in enumerate(zip(read, driven, strict=True))
         if one is not None and not np.isfinite(flown.crash_time[number])
     }
     if not pairs:
-        return None
+        return Lack((), None, heard) if heard else None
     scaled = np.asarray(objective.space.scaled(point.coefficients))
     parameters = objective.space.parameters
     found = unexplained(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
-        return None
+        return Lack((), None, heard) if heard else None
     body = model.vehicle.body
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
@@ -137,18 +152,20 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         for axis, column in enumerate(acting.T):
             pushes[axis, :, number] = np.interp(ticks, one.time, column)
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
-    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate))
+    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate), heard)
 
 
-def laws_lacking(laws: Sequence[Law], uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Return the laws that the model lacks, where they may have moved coefficients."""
+def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ...]:
+    """Return how the rate controller answers, and the laws that may have moved coefficients."""
+    if lack is None:
+        return ()
     moved = [
         name
         for name, estimate in uncertainty.estimates.items()
         if (move := estimate.parts.lack)
         and move**2 > MATTERS**2 * (estimate.std_error**2 - move**2)
     ]
-    return tuple(
+    laws = [
         Finding(
             Code.LAW_LACKING,
             "warning",
@@ -156,8 +173,81 @@ def laws_lacking(laws: Sequence[Law], uncertainty: Uncertainty) -> tuple[Finding
             {"share": law.share},
             (law.axis, law.feature, *moved),
         )
-        for law in laws
+        for law in lack.laws
         if moved and abs(law.share) > SMALLEST
+    ]
+    parts = {part: [one for one in lack.answers if one.part == part] for part in PARTS}
+    controller = [
+        Finding(
+            Code.CONTROLLER_ANSWERS,
+            "warning",
+            "controller file",
+            {
+                name: number
+                for one in those
+                for name, number in ((one.axis, one.value), (f"{one.axis}_error", one.sd))
+            },
+            (part, *(one.axis for one in those)),
+        )
+        for part, those in parts.items()
+        if those
+    ]
+    return (*controller, *laws)
+
+
+def _answering(gains: RateGains, answer: Answer) -> RateGains:
+    """Return the gains of which one is as it was found; D is as good as a lag of the gyro."""
+    axis = "xyz"[AXES.index(answer.axis)]
+    name = {"P": "p", "I": "i", "late": "d"}[answer.part]
+    before = getattr(gains, name)
+    value = getattr(before, axis)
+    if answer.part == "late":
+        value = value - answer.value * getattr(gains.p, axis)
+    else:
+        value = value * answer.value
+    return replace(gains, **{name: replace(before, **{axis: value})})
+
+
+def _heard(
+    flights: Sequence[Flight], flown: Flown, mixer: MixerSettings, rate: float
+) -> tuple[Answer, ...]:
+    """Return how the rate controllers of recorded flights answer otherwise than the fit's."""
+    recorded, simulated = [], []
+    for number, flight in enumerate(flights):
+        series = flight.series
+        known = {"command", "body_rate", "rate_setpoint"} <= set(series)
+        if not known or np.isfinite(flown.crash_time[number]):
+            continue
+        clock = np.arange(flown.channels["command"].shape[1]) / rate
+        time = series["command"].time
+        time = time[(time >= 0.0) & (time <= clock[-1])]
+        if len(time) < FEWEST or not all(
+            np.isfinite(series[name].values).all()
+            for name in ("command", "body_rate", "rate_setpoint")
+        ):
+            continue
+        even = np.linspace(time[0], time[-1], len(time))
+        recorded.append(
+            _signals([series[n] for n in ("rate_setpoint", "body_rate", "command")], mixer, even)
+        )
+        made = [
+            Series(clock, flown.channels[name][number])
+            for name in (SETPOINTS, "body_rate", "command")
+        ]
+        simulated.append(_signals(made, mixer, even))
+    return answers(recorded, simulated) if recorded else ()
+
+
+def _signals(parts: Sequence[Series], mixer: MixerSettings, time: Array) -> Signals:
+    """Return what a rate controller hears and says from set-points, gyro and commands."""
+    wanted, rate, commands = (_at(part, time) for part in parts)
+    torque = torque_of(mixer, tuple(commands.T))
+    turned = np.array([1.0, -1.0, -1.0])  # FRD
+    return Signals(
+        step=float(time[1] - time[0]),
+        error=(wanted[:, :3] - rate) * turned,
+        rate=rate * turned,
+        torque=np.column_stack([torque.x, torque.y, torque.z]),
     )
 
 

@@ -178,6 +178,13 @@ MADE = {
         {"share": -0.09},
         ("force_z", "rotor_speed", "motor_constant", "input_scaling"),
     ),
+    Code.CONTROLLER_ANSWERS: Finding(
+        Code.CONTROLLER_ANSWERS,
+        "warning",
+        "controller file",
+        {"roll": 1.05, "roll_error": 0.004},
+        ("P", "roll"),
+    ),
     Code.TERM_SHOWS: Finding(
         Code.TERM_SHOWS,
         "warning",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,14 +19,16 @@ from sim_jax.state import hover
 from sim_jax.vector import Vec3
 from tests.tuner.uncertainty import making
 from tuner.config import JobFile
+from tuner.equation_error.rate_controller import Answer
 from tuner.equation_error.unexplained import _likeliest
 from tuner.findings.findings import Code
+from tuner.objective.flight import SETPOINTS
 from tuner.objective.normal import Objective
 from tuner.objective.segments import Measured, Segments
 from tuner.objective.space import space_of
 from tuner.recordings.flight import Flight, InitialState, Series
 from tuner.uncertainty.examination import examine
-from tuner.uncertainty.lacking import lack_of, laws_lacking
+from tuner.uncertainty.lacking import Lack, lack_found, lack_of
 from tuner.vehicle import with_values
 from tuner.vehicle.model import model_of, schedule_of
 
@@ -93,11 +96,18 @@ def problem(
     return Objective(model, segments, space, schedule, samples, AIRBORNE)
 
 
-def flown(truth: Objective, seed: int) -> tuple[dict[str, Measured], list[Flight]]:
-    """Return what is measured of flights of a truth, at every sample, and the recordings."""
+def flown(
+    truth: Objective, seed: int, *, loop: bool = False
+) -> tuple[dict[str, Measured], list[Flight]]:
+    """Return what is measured of flights of a truth, at every sample, and the recordings.
+
+    ``loop``: whether those hold commands and set-points, too.
+    """
     random, time = np.random.default_rng(seed), np.arange(truth.samples) / RATE
+    within = ("command", SETPOINTS) if loop else ()
     channels = {
-        name: Measured(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None) for name in NOISE
+        name: Measured(jnp.zeros((1, FLIGHTS)), jnp.zeros((1, 3, FLIGHTS)), None)
+        for name in (*NOISE, *within)
     }
     segments = replace(truth.segments, measured=channels)
     trace = making.fly_at(replace(truth, segments=segments), making.truth(truth))
@@ -118,6 +128,9 @@ def flown(truth: Objective, seed: int) -> tuple[dict[str, Measured], list[Flight
         measured[name] = Measured(stamps, jnp.asarray(values), weight)
         for number, series in enumerate(recorded):
             series[name] = Series(time, values[..., number])
+    for number, series in enumerate(recorded if loop else ()):
+        series["command"] = Series(time, np.array(trace["command"])[..., number])
+        series["rate_setpoint"] = Series(time, np.array(trace[SETPOINTS])[:, :3, number])
     nothing = InitialState(*[np.zeros(3)] * 6)
     flights = [
         Flight(f"swing {n}", "", "", RATE, time, {}, series, nothing)
@@ -174,11 +187,11 @@ def test_the_intervals_of_what_it_moves_hold_it():
         assert parts.lack == pytest.approx(parts.search, rel=0.25)
         alone = without.uncertainty.estimates[name].std_error
         assert estimate.std_error == pytest.approx(np.hypot(alone, parts.lack))
-    findings = laws_lacking(held.laws, held.uncertainty)
+    findings = lack_found(held.lack, held.uncertainty)
     assert findings
     assert all(finding.code is Code.LAW_LACKING for finding in findings)
     assert "rotor_drag_coefficient" in findings[0].names
-    assert laws_lacking(without.laws, without.uncertainty) == ()
+    assert lack_found(without.lack, without.uncertainty) == ()
 
 
 @pytest.mark.parametrize("sees", [False, True])
@@ -203,3 +216,53 @@ def test_commands_stand_in_for_tachometers():
         for flight in flights
     ]
     assert lack_of(fitted, blind) is None
+
+
+def test_gains_that_were_found_fly_the_other_model():
+    objective = problem({})
+    found = (Answer("roll", "P", 1.05, 0.01), Answer("yaw", "I", 0.7, 0.01))
+    late = Answer("pitch", "late", 2e-3, 1e-4)
+    before = objective.model.controller.rate
+    other = Lack((), None, (*found, late)).acting_on(objective)
+    rate = other.model.controller.rate
+    assert float(rate.p.x) == pytest.approx(1.05 * float(before.p.x))
+    assert float(rate.i.z) == pytest.approx(0.7 * float(before.i.z))
+    assert float(rate.d.y) == pytest.approx(float(before.d.y) - 2e-3 * float(before.p.y))
+    assert (rate.p.y, rate.p.z, rate.i.x, rate.d.x) == (
+        before.p.y,
+        before.p.z,
+        before.i.x,
+        before.d.x,
+    )
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.06])
+def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
+    """Flights of a P that is not the file's, whose set-points and commands were recorded."""
+    truth, fitted_to = problem({}), problem({})
+    rate = truth.model.controller.rate
+    p = replace(rate.p, x=factor * rate.p.x, y=factor * rate.p.y)
+    model = eqx.tree_at(lambda m: m.controller.rate.p, truth.model, p)
+    measured, flights = flown(replace(truth, model=model), 0, loop=True)
+    objective = replace(fitted_to, segments=replace(fitted_to.segments, measured=measured))
+    fitted = making.fitted_of(objective, making.truth(objective))
+    criterion = replace(fitted.criterion, scale={name: jnp.ones(FLIGHTS) for name in NOISE})
+    fitted = replace(
+        fitted,
+        criterion=criterion,
+        scales={flight.name: dict.fromkeys(NOISE, 1.0) for flight in flights},
+    )
+    lack = lack_of(fitted, flights)
+    if factor == 1.0:
+        assert lack is None
+        return
+    known = {(one.axis, one.part): one for one in lack.answers}
+    assert {("roll", "P"), ("pitch", "P")} <= set(known)
+    assert known["roll", "P"].value == pytest.approx(factor, abs=0.01)
+    examination = examine(fitted, lack=Lack((), None, lack.answers))
+    for name in ("inertia_xx", "inertia_yy"):
+        parts = examination.uncertainty.estimates[name].parts
+        assert parts.lack == pytest.approx(parts.search, abs=4.0 * parts.noise)
+        assert parts.lack > parts.noise
+    said = lack_found(examination.lack, examination.uncertainty)
+    assert said[0].code is Code.CONTROLLER_ANSWERS

@@ -1,0 +1,84 @@
+"""Gains of a rate controller are told apart from its file's, through a noisy gyro and gusts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tuner.equation_error.rate_controller import AXES, Signals, answers
+
+RATE, SECONDS = 100.0, 40.0
+P_GAIN, I_GAIN, D_GAIN = 0.15, 0.2, 0.003
+
+
+def flight(random, *, p=P_GAIN, i=I_GAIN, d=D_GAIN, late=0.0, gusts=0.0, noise=0.0) -> Signals:
+    """Return what a loop hears and says whose rate follows its set-point and is pushed."""
+    time = np.arange(round(RATE * SECONDS)) / RATE
+    wanted = np.random.default_rng(7).normal(size=(len(time), 3))  # what is asked for is the same
+    for _ in range(3):
+        wanted = lfilter([0.1], [1.0, -0.9], wanted, axis=0)
+    wanted /= wanted.std(axis=0)
+    follow = 1.0 - np.exp(-16.0 / RATE)
+    pushed = lfilter([0.1], [1.0, -0.9], gusts * random.normal(size=wanted.shape), axis=0)
+    rate = wanted
+    for _ in range(2):
+        rate = lfilter([follow], [1.0, follow - 1.0], rate, axis=0)
+    rate = rate + pushed
+    heard = np.column_stack([np.interp(time - late, time, column) for column in rate.T])
+    error = wanted - heard
+    integral = np.cumsum(error, axis=0) / RATE
+    torque = p * error + i * integral - p / P_GAIN * d * np.gradient(heard, 1.0 / RATE, axis=0)
+    read = rate + noise * random.normal(size=rate.shape)
+    return Signals(1.0 / RATE, wanted - read, read, torque)
+
+
+def told(seed, d=D_GAIN, **changed):
+    random = np.random.default_rng(seed)
+    simulated = [flight(random, d=d)]
+    return answers([flight(random, d=d, gusts=0.2, noise=0.01, **changed)], simulated)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"), [("P", {"p": 1.05 * P_GAIN}), ("I", {"i": 0.7 * I_GAIN})]
+)
+def test_a_gain_is_told_of_every_axis(part, change):
+    found = {answer.axis: answer for answer in told(1, **change) if answer.part == part}
+    assert set(found) == set(AXES)
+    true = next(iter(change.values())) / {"P": P_GAIN, "I": I_GAIN}[part]
+    for answer in found.values():
+        assert answer.value == pytest.approx(true, abs=4.0 * answer.sd)
+        assert answer.sd < 0.25 * abs(true - 1.0)
+    assert {answer.part for answer in told(1, **change)} == {part}
+
+
+def test_a_slower_filter_is_told_of_roll_and_pitch_together():
+    found = told(1, d=0.0, late=3e-3)  # without D, which answers late, too
+    assert {(answer.axis, answer.part) for answer in found} == {("roll", "late"), ("pitch", "late")}
+    assert found[0].value == pytest.approx(3e-3, abs=4.0 * found[0].sd)
+    assert (found[0].value, found[0].sd) == (found[1].value, found[1].sd)
+
+
+def test_the_file_that_flew_is_not_doubted():
+    assert sum(bool(told(seed)) for seed in range(60)) <= 1
+
+
+def test_one_step_of_a_set_point_tells_nothing():
+    """However exactly it seems to: what filters make of it is no gain."""
+    random, time = np.random.default_rng(0), np.arange(2000) / RATE
+    wanted = np.zeros((2000, 3))
+    wanted[1005:] = 2.0
+
+    def flown(share):
+        rate = lfilter([share], [1.0, share - 1.0], wanted, axis=0)
+        error = wanted - rate
+        torque = P_GAIN * error + I_GAIN * np.cumsum(error, axis=0) / RATE
+        read = rate + 1e-4 * random.normal(size=rate.shape)
+        return Signals(
+            1.0 / RATE,
+            wanted - read,
+            read,
+            np.interp(time - 0.004, time, torque[:, 0])[:, None].repeat(3, 1),
+        )
+
+    assert answers([flown(0.1)], [flown(0.12)]) == ()

@@ -1,0 +1,181 @@
+"""A rate controller as recorded, against the one of its file: gains and lag of each axis.
+
+Each axis's torque set-point, as the mixer has it, is regressed on the error of the body rate, its
+integral, and the angular acceleration, of recorded flights and of the fit's own. Simulated signals
+are the instruments of both (Ljung, System Identification, 7.6): they know nothing of a gyro's noise
+and of gusts, and a loop that answers both biases nothing. What sampling and filters make of such a
+regression they make of both, so that the ratio of its coefficients is that of the gains (indirect
+inference; Gourieroux, Monfort and Renault 1993).
+
+How far coefficients scatter is what is left of the regression, taken for stationary (Newey and West
+1987). What filters make of the step of a set-point is not: so scores of stretches of `STRETCH` have
+to speak against chance, too, by as many degrees of freedom as there are stretches that tell most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import ndtri, stdtrit  # scipy.stats takes a quarter of a second to import
+
+from tuner.recordings.flight import Array
+
+STRETCH = 1.0
+"""s whose scores are summed up."""
+MEMORY = 0.3
+"""s over which what is left is correlated."""
+LEVEL = 0.005
+"""Probability of a false alarm among all axes and parts."""
+AT_LEAST = 0.05
+"""That for each of them by the scores of stretches."""
+AXES = ("roll", "pitch", "yaw")
+PARTS = ("P", "I", "late")
+SMALLEST = {"P": 0.02, "I": 0.1, "late": 5e-4}
+"""Change of a gain as a share of it, and s, below which nothing is said."""
+APART = 1e-6
+"""Inverse condition from which columns are told apart."""
+
+
+class Signals(NamedTuple):
+    """What a rate controller hears and says, (N, 3) roll, pitch, yaw in FRD, every ``step`` s.
+
+    ``error`` is set-point minus gyro and ``rate`` the gyro, rad/s; ``torque`` is normalised.
+    """
+
+    step: float
+    error: Array
+    rate: Array
+    torque: Array
+
+
+class Answer(NamedTuple):
+    """How a gain differs from the file's.
+
+    ``part`` is of `PARTS`; ``value`` the gain over the file's, or s by which an axis answers its
+    gyro later than the file's filters and D let it; ``sd`` its standard error.
+    """
+
+    axis: str
+    part: str
+    value: float
+    sd: float
+
+
+def answers(recorded: Sequence[Signals], simulated: Sequence[Signals]) -> tuple[Answer, ...]:
+    """Return which gains differ by more than chance.
+
+    Parameters
+    ----------
+    recorded, simulated
+        Of each flight, at the same times.
+    """
+    known = [_of_axis(recorded, simulated, axis) for axis in range(3)]
+    _share_lateness(known)
+    told = sum(len(parts) for parts in known)
+    return tuple(
+        Answer(name, part, one.value, one.sd)
+        for name, parts in zip(AXES, known, strict=True)
+        for part, one in parts.items()
+        if one.is_sure(LEVEL / told) and abs(one.value - one.neutral) > SMALLEST[part]
+    )
+
+
+class _Part(NamedTuple):
+    """A part's value, its standard error, what the file says, and how stretches (S,) move it."""
+
+    value: float
+    neutral: float
+    sd: float
+    moves: Array
+
+    def is_sure(self, level: float) -> bool:
+        """Return whether it is not neutral, by what is left and by the stretches."""
+        square = self.moves**2
+        count = float(square.sum() ** 2 / max((square**2).sum(), 1e-300))
+        off, scatter = abs(self.value - self.neutral), float(np.sqrt(square.sum()))
+        return (
+            count > 2.0
+            and off > float(ndtri(1.0 - 0.5 * level)) * self.sd
+            and off > float(stdtrit(count - 1.0, 1.0 - 0.5 * AT_LEAST)) * scatter
+        )
+
+
+def _of_axis(
+    recorded: Sequence[Signals], simulated: Sequence[Signals], axis: int
+) -> dict[str, _Part]:
+    """Return the parts of one axis; none where its flights do not tell them apart."""
+    real = [_regression(signals, axis) for signals in recorded]
+    made = [_regression(signals, axis) for signals in simulated]
+    own = sum(z.T @ z for z, _ in made)
+    total = sum(z.T @ x for (z, _), (x, _) in zip(made, real, strict=True))
+    if min(map(_condition, (own, total))) < APART:
+        return {}
+    of_file = np.linalg.solve(own, sum(z.T @ torque for z, torque in made))
+    gains = np.linalg.solve(
+        total, sum(z.T @ torque for (z, _), (_, torque) in zip(made, real, strict=True))
+    )
+    scores, square = [], np.zeros((3, 3))
+    for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
+        left = torque - x @ gains
+        square += _square_of_sum(z, left, max(1, round(MEMORY / signals.step)))
+        many = max(round(len(left) * signals.step / STRETCH), 1)
+        scores += [z[rows].T @ left[rows] for rows in np.array_split(np.arange(len(left)), many)]
+    inverse = np.linalg.inv(total)
+    late, of_filters = gains[2] / gains[0], of_file[2] / of_file[0]
+    along = {
+        "P": (gains[0] / of_file[0], 1.0, np.array([1.0, 0.0, 0.0]) / of_file[0]),
+        "I": (gains[1] / of_file[1], 1.0, np.array([0.0, 1.0, 0.0]) / of_file[1]),
+        "late": (late - of_filters, 0.0, np.array([-late, 0.0, 1.0]) / gains[0]),
+    }
+    parts = {}
+    for name, (value, neutral, direction) in along.items():
+        weights = inverse.T @ direction
+        sd = float(np.sqrt(max(weights @ square @ weights, 0.0)))
+        parts[name] = _Part(float(value), neutral, sd, np.array(scores) @ weights)
+    return parts
+
+
+def _square_of_sum(instruments: Array, left: Array, memory: int) -> Array:
+    """Return the mean square (3, 3) of the sum of instruments (N, 3) times what is left (N,)."""
+    count = len(left)
+    square = np.mean(left**2) * instruments.T @ instruments
+    for apart in range(1, min(memory, count - 1) + 1):
+        alike = left[apart:] @ left[:-apart] / count * (1.0 - apart / (memory + 1.0))
+        across = instruments[apart:].T @ instruments[:-apart]
+        square = square + alike * (across + across.T)
+    return np.asarray(square)
+
+
+def _share_lateness(known: list[dict[str, _Part]]) -> None:
+    """Give roll and pitch the mean of their latenesses, and yaw none: they share their filters.
+
+    What yaw answers late it answers to few steps.
+    """
+    late = [parts.pop("late") for parts in known if parts]
+    if not all(known[:2]):
+        return
+    weights = np.array([1.0 / max(one.sd**2, 1e-300) for one in late[:2]])
+    weights /= weights.sum()
+    value = sum(float(w) * one.value for w, one in zip(weights, late, strict=False))
+    moves = sum(w * one.moves for w, one in zip(weights, late, strict=False))
+    sd = np.hypot(*(w * one.sd for w, one in zip(weights, late, strict=False)))
+    for parts in known[:2]:
+        parts["late"] = _Part(value, 0.0, float(sd), np.asarray(moves))
+
+
+def _regression(signals: Signals, axis: int) -> tuple[Array, Array]:
+    """Return columns (N, 3) and torque (N,), about their means."""
+    error, step = signals.error[:, axis], signals.step
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (error[1:] + error[:-1]))]) * step
+    faster = np.gradient(signals.rate[:, axis], step)
+    columns = np.column_stack([error, integral, faster])
+    torque = signals.torque[:, axis]
+    return columns - columns.mean(axis=0), torque - torque.mean()
+
+
+def _condition(square: Array) -> float:
+    """Return the inverse condition of a matrix of unit diagonal."""
+    size = np.sqrt(np.maximum(np.abs(np.diag(square)), 1e-300))
+    return float(1.0 / np.linalg.cond(square / np.outer(size, size)))
