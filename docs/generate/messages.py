@@ -100,9 +100,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.LAW_LACKING: "Recorded accelerations hold a force or moment that the model does not; the "
     "line says along which axis, what it goes with, which coefficients it may have moved, whose "
     "intervals hold that, and which terms are of that kind.",
-    Code.CONTROLLER_ANSWERS: "Recorded commands follow from rate set-points and gyro with another P "
-    "or I than the controller file's, or later or earlier than its filters and D let them. Compare "
-    "it with the autopilot's parameters; intervals hold what the difference moves.",
+    Code.CONTROLLER_ANSWERS: "Recorded commands follow from rate set-points and gyro with another "
+    "P or I than the controller file's, or later or earlier than its filters and D let them. "
+    "Compare it with the autopilot's parameters; intervals hold what the difference moves.",
     Code.TERM_SHOWS: "A term that was found says something of the vehicle or its files: thrust "
     "grows with another power of the rotor speed than the second, the rate controller's gains are "
     "not those of the file, the autopilot sits askew, or its gyro's scale is off.",

@@ -108,14 +108,13 @@ def _of_axis(
     """Return the parts of one axis; none where its flights do not tell them apart."""
     real = [_regression(signals, axis) for signals in recorded]
     made = [_regression(signals, axis) for signals in simulated]
-    own = sum(z.T @ z for z, _ in made)
-    total = sum(z.T @ x for (z, _), (x, _) in zip(made, real, strict=True))
+    own = np.sum([z.T @ z for z, _ in made], axis=0)
+    both = list(zip(made, real, strict=True))
+    total = np.sum([z.T @ x for (z, _), (x, _) in both], axis=0)
     if min(map(_condition, (own, total))) < APART:
         return {}
-    of_file = np.linalg.solve(own, sum(z.T @ torque for z, torque in made))
-    gains = np.linalg.solve(
-        total, sum(z.T @ torque for (z, _), (_, torque) in zip(made, real, strict=True))
-    )
+    of_file = np.linalg.solve(own, np.sum([z.T @ torque for z, torque in made], axis=0))
+    gains = np.linalg.solve(total, np.sum([z.T @ torque for (z, _), (_, torque) in both], axis=0))
     scores, square = [], np.zeros((3, 3))
     for (z, _), (x, torque), signals in zip(made, real, recorded, strict=True):
         left = torque - x @ gains

@@ -196,16 +196,21 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
 
 
 def _answering(gains: RateGains, answer: Answer) -> RateGains:
-    """Return the gains of which one is as it was found; D is as good as a lag of the gyro."""
+    """Return the gains of which one is as it was found, P before the lateness of its axis.
+
+    A lag of the gyro is as good as less D; a lateness is that beside a D that grows with P.
+    """
     axis = "xyz"[AXES.index(answer.axis)]
-    name = {"P": "p", "I": "i", "late": "d"}[answer.part]
-    before = getattr(gains, name)
-    value = getattr(before, axis)
-    if answer.part == "late":
-        value = value - answer.value * getattr(gains.p, axis)
-    else:
-        value = value * answer.value
-    return replace(gains, **{name: replace(before, **{axis: value})})
+
+    def scaled(gain: Vec3) -> Vec3:
+        return replace(gain, **{axis: answer.value * getattr(gain, axis)})
+
+    if answer.part == "P":
+        return replace(gains, p=scaled(gains.p), d=scaled(gains.d))
+    if answer.part == "I":
+        return replace(gains, i=scaled(gains.i))
+    late = getattr(gains.d, axis) - answer.value * getattr(gains.p, axis)
+    return replace(gains, d=replace(gains.d, **{axis: late}))
 
 
 def _heard(

@@ -226,14 +226,10 @@ def test_gains_that_were_found_fly_the_other_model():
     other = Lack((), None, (*found, late)).acting_on(objective)
     rate = other.model.controller.rate
     assert float(rate.p.x) == pytest.approx(1.05 * float(before.p.x))
+    assert float(rate.d.x) == pytest.approx(1.05 * float(before.d.x))  # K of all but I
     assert float(rate.i.z) == pytest.approx(0.7 * float(before.i.z))
     assert float(rate.d.y) == pytest.approx(float(before.d.y) - 2e-3 * float(before.p.y))
-    assert (rate.p.y, rate.p.z, rate.i.x, rate.d.x) == (
-        before.p.y,
-        before.p.z,
-        before.i.x,
-        before.d.x,
-    )
+    assert (rate.p.y, rate.p.z, rate.i.x) == (before.p.y, before.p.z, before.i.x)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.06])
@@ -262,7 +258,7 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
     examination = examine(fitted, lack=Lack((), None, lack.answers))
     for name in ("inertia_xx", "inertia_yy"):
         parts = examination.uncertainty.estimates[name].parts
-        assert parts.lack == pytest.approx(parts.search, abs=4.0 * parts.noise)
+        assert parts.lack == pytest.approx(parts.search, rel=0.25)
         assert parts.lack > parts.noise
     said = lack_found(examination.lack, examination.uncertainty)
     assert said[0].code is Code.CONTROLLER_ANSWERS
