@@ -24,12 +24,12 @@ import pytest
 
 os.environ.setdefault("JAX_ENABLE_X64", "true")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if not os.environ.get("TUNE_TESTS_OPTIMISED"):
     cheap = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
     os.environ["XLA_FLAGS"] = f"{cheap} {os.environ.get('XLA_FLAGS', '')}".strip()
 
 from hypothesis import settings
+from threadpoolctl import threadpool_limits
 
 from lanes.machine import keep_code_in
 from tests import memory
@@ -42,6 +42,7 @@ __all__ = ["demo"]
 
 set_environment()
 collect_rarely()
+threadpool_limits(1, user_api="blas")
 keep_code_in(cache_folder() / "kernels_of_tests")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from threadpoolctl import threadpool_limits
 
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
@@ -31,7 +33,13 @@ __all__ = [
 ]
 
 
+F = TypeVar("F", bound=Callable[..., Any])
+ONE_THREAD: Callable[[F], F] = threadpool_limits.wrap(limits=1, user_api="blas")
+"""While a job runs, as for the command: matrices are small, and sums the same on any machine."""
+
+
 @taking(Options)
+@ONE_THREAD
 def fit(flights: Sequence[Named], **options: Any) -> Run:
     """Fit the coefficients of a vehicle to recordings, as ``tune --flights`` does.
 
@@ -110,6 +118,7 @@ def compare(
 
 
 @taking(ExaminationOptions)
+@ONE_THREAD
 def sensitivity(
     flights: Sequence[Named],
     *,

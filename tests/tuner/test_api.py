@@ -6,6 +6,7 @@ from typing import get_type_hints
 
 import numpy as np
 import pytest
+import threadpoolctl
 
 import tuner
 from tuner import api
@@ -104,3 +105,23 @@ def test_wrong_input_is_the_same_one_line(tmp_path):
         tuner.compare([tmp_path / "gone.bag"], ["hovergames"])
     with pytest.raises(InputError, match="shipped vehicles"):
         tuner.simulate("circle", vehicle="nope")
+
+
+def test_a_fit_keeps_algebra_on_one_thread_and_gives_the_others_back(bag, monkeypatch):
+    during = []
+
+    def run(*_: object, **__: object) -> None:
+        during.append(blas_threads())
+        raise InputError("a job", "is not run", "do not")
+
+    def blas_threads() -> set[int]:
+        infos = threadpoolctl.threadpool_info()
+        return {info["num_threads"] for info in infos if info["user_api"] == "blas"}
+
+    monkeypatch.setattr("tuner.job.run.run", run)
+    with threadpoolctl.threadpool_limits(2, user_api="blas"):
+        before = blas_threads()
+        with pytest.raises(InputError):
+            tuner.fit([bag])
+        assert blas_threads() == before
+    assert during == [{1}]
