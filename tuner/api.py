@@ -199,6 +199,5 @@ def connect(url: str | None = None, *, token: str | None = None) -> Client:
         The address is none, or the extra ``service`` is not installed.
     """
     from tuner.client.client import Client  # noqa: PLC0415 (an extra)
-    from tuner.client.connection import Connection  # noqa: PLC0415
 
-    return Client(Connection(url, token))
+    return Client(url, token)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, field_serializer
 
@@ -16,6 +16,7 @@ from tuner.evaluate.records import AxesRmse, PredictedErrors
 from tuner.findings.findings import Finding
 from tuner.uncertainty.records import ErrorParts, Sources
 from tuner.uncertainty.verdict import Reason, Verdict
+from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle
 from tuner.vehicle.selection_table import SelectionRow
 
@@ -83,6 +84,18 @@ class CoefficientResult(Part):
     verdict: Verdict
     reason: Reason
     note: str = ""
+
+    @classmethod
+    def judged(
+        cls, name: str, initial: float, best: float, verdict: Verdict, reason: Reason, **more: Any
+    ) -> Self:
+        """Return a coefficient with a verdict on it, and what follows from that."""
+        given: dict[str, Any] = {
+            "unit": COEFFICIENTS[name].unit,
+            "fitted": verdict is not Verdict.FIXED,
+            "note": judgement_in_words(verdict, reason),
+        }
+        return cls(initial=initial, best=best, verdict=verdict, reason=reason, **given | more)
 
     @field_serializer("reason")
     def _without_nulls(self, reason: Reason) -> dict[str, JsonValue]:

@@ -10,10 +10,10 @@ import threadpoolctl
 
 import tuner
 from tuner import api
-from tuner.cli.compare import compare as compare_command
-from tuner.cli.export import export as export_command
-from tuner.cli.sensitivity import sensitivity as sensitivity_command
-from tuner.cli.simulate import simulate as simulate_command
+from tuner.cli.commands import compare as compare_command
+from tuner.cli.commands import export as export_command
+from tuner.cli.commands import sensitivity as sensitivity_command
+from tuner.cli.commands import simulate as simulate_command
 from tuner.cli.tune import tune as tune_command
 from tuner.core.errors import InputError
 from tuner.vehicle import ControllerFile, with_values

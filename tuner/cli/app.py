@@ -112,15 +112,16 @@ COMMANDS = {
         "tune simulate --trajectory circle --sweep motor_constant=1.2e-5:1.6e-5:9 --out g.csv",
     ),
 }
-OF_A_SERVER = ("submit", "jobs", "watch", "fetch", "cancel", "watch-folder")
-"""Commands in `tuner.cli.remote`; each of the others has a module of its name."""
+MODULES = {"new-vehicle": "new_vehicle"} | dict.fromkeys(
+    ("submit", "jobs", "watch", "fetch", "cancel", "watch-folder"), "remote"
+)
+"""Command -> its module, where that is not `tuner.cli.commands`."""
 for _name, (_summary, *_examples) in COMMANDS.items():
     if _name == "serve":
         app.command("tuner.cli.serve:serve", name=_name, help=_summary)  # has commands of its own
         continue
-    _function = _name.replace("-", "_")
     app.command(
-        f"tuner.cli.{'remote' if _name in OF_A_SERVER else _function}:{_function}",
+        f"tuner.cli.{MODULES.get(_name, 'commands')}:{_name.replace('-', '_')}",
         name=_name,
         help=_summary,
         help_epilogue="\n".join(f"Example: {example}" for example in _examples),

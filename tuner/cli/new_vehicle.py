@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from tuner.cli.options import Quiet
+from tuner.core.errors import InputError
 
 if TYPE_CHECKING:
     from tuner.vehicle.scaling_laws import Airframe
@@ -76,7 +77,6 @@ def new_vehicle(
     like
         Scale from this known vehicle, and take from it what is not given.
     """
-    from tuner.core.errors import InputError
     from tuner.job.new_vehicle import new_vehicle as make
     from tuner.vehicle.scaling_laws import KNOWN
 
@@ -107,7 +107,6 @@ def _airframe(
     given: Mapping[str, float | None], propeller: str | None, known: Airframe | None
 ) -> Airframe:
     """Return what is given, and the rest from a known vehicle, its motors with its propeller."""
-    from tuner.core.errors import InputError
     from tuner.vehicle.scaling_laws import Airframe
 
     numbers = {option: value for option, value in given.items() if value is not None}
@@ -138,8 +137,6 @@ def _airframe(
 
 
 def _answer(option: str, text: str) -> float | None:
-    from tuner.core.errors import InputError
-
     try:
         return float(text) if text.strip() else None
     except ValueError:
@@ -147,8 +144,6 @@ def _answer(option: str, text: str) -> float | None:
 
 
 def _check(option: str, value: float | None) -> None:
-    from tuner.core.errors import InputError
-
     low, high, unit = RANGES[option]
     if value is not None and not low <= value <= high:
         remedy = f"give {low:g} to {high:g} {unit}"
@@ -157,8 +152,6 @@ def _check(option: str, value: float | None) -> None:
 
 def _size(word: str) -> tuple[float, float]:
     """Return diameter and pitch, m, of ``11x4.7``."""
-    from tuner.core.errors import InputError
-
     try:
         diameter, pitch = (float(part) for part in word.lower().split("x"))
     except ValueError:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from tuner.core.errors import InputError
+
 #: The command line as the user typed it, for the record of a run.
 TYPED: ContextVar[str] = ContextVar("TYPED", default="")
 
@@ -27,8 +29,6 @@ def lengths(option: str, word: str) -> tuple[float, ...]:
     InputError
         The word holds anything but numbers above zero.
     """
-    from tuner.core.errors import InputError
-
     try:
         numbers = tuple(float(part) for part in word.split(","))
     except ValueError:

@@ -7,15 +7,13 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.phrases import listed
 from tuner.core.spans import OF_JAX, Recorder, Row, Span, beside_of, recording, table_of
-
-if TYPE_CHECKING:
-    from rich.table import Table
+from tuner.report.section import Table
 
 TABLE_FILE = "profile.csv"
 TRACE_FILE = "profile.json"
@@ -39,7 +37,10 @@ def profiling(wanted: bool, *, quiet: bool) -> Iterator[Callable[[Path], None]]:
     seconds, processor = recorder.now(), time.process_time()
     rows = table_of(recorder.spans, seconds, processor)
     for folder in folders:
-        write_text(folder / TABLE_FILE, csv_text(_HEADER, map(_cells, rows)))
+        cells = (
+            (row.stage, *(f"{value:.3f}" for value in _seconds(row)), row.programs) for row in rows
+        )
+        write_text(folder / TABLE_FILE, csv_text(_HEADER, cells))
         write_text(folder / TRACE_FILE, json.dumps(trace_of(recorder.spans)))
         if not quiet:
             _print(rows, recorder, folder)
@@ -51,10 +52,6 @@ _HEADER = ("stage", *(f"{name} [s]" for name in _COLUMNS), "programs")
 
 def _seconds(row: Row) -> tuple[float, ...]:
     return (row.seconds, row.processor, *row.jax.values(), row.rest)
-
-
-def _cells(row: Row) -> tuple[object, ...]:
-    return (row.stage, *(f"{value:.3f}" for value in _seconds(row)), row.programs)
 
 
 def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
@@ -84,10 +81,10 @@ def trace_of(spans: Sequence[Span]) -> dict[str, Any]:
 
 
 def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
-    from tuner.cli.tables import console
+    from tuner.cli.tables import console, drawn
 
     screen = console()
-    screen.print(_table(rows))
+    screen.print(drawn(_table(rows)))
     beside = {name: f"{spent:.1f}" for name, spent in beside_of(recorder.spans).items()}
     parts = [f"{name} {seconds} s" for name, seconds in beside.items() if float(seconds)]
     if parts:
@@ -98,15 +95,15 @@ def _print(rows: Sequence[Row], recorder: Recorder, folder: Path) -> None:
 
 
 def _table(rows: Sequence[Row]) -> Table:
-    from rich.table import Table
-
-    table = Table(title="Where the seconds went", title_justify="left", box=None)
-    table.add_column("stage")
-    for name in (*_COLUMNS, "programs"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        cells = (f"{value:.1f}" if value >= 0.05 else "" for value in _seconds(row))
-        table.add_row(row.stage, *cells, str(row.programs or ""))
+    columns = ("stage", *_COLUMNS, "programs")
+    cells = [
+        (
+            row.stage,
+            *(f"{value:.1f}" if value >= 0.05 else "" for value in _seconds(row)),
+            str(row.programs or ""),
+        )
+        for row in rows
+    ]
     sums = (f"{sum(column):.1f}" for column in zip(*map(_seconds, rows), strict=True))
-    table.add_row("all", *sums, str(sum(row.programs for row in rows)))
-    return table
+    cells.append(("all", *sums, str(sum(row.programs for row in rows))))
+    return Table(columns, cells, words=("stage",), fold="Where the seconds went")

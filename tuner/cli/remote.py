@@ -44,9 +44,8 @@ def client_of(server: str | None, token: str | None) -> Iterator[Client]:
         The address is none, or an extra is missing.
     """
     from tuner.client.client import Client
-    from tuner.client.connection import Connection
 
-    client = Client(Connection(server, token))
+    client = Client(server, token)
     try:
         yield client
     finally:
@@ -146,7 +145,8 @@ def jobs(
     json
         Print JSON instead of a table.
     """
-    from tuner.cli.tables import columns_of, console
+    from tuner.cli.tables import console, drawn
+    from tuner.report.section import Table
 
     with client_of(server, token) as client:
         page = client.jobs(vehicle=vehicle, state=state, after=after)
@@ -155,25 +155,26 @@ def jobs(
 
         print(dumps(page, indent=2))
         return
-    words = ("job", "state", "vehicle", "name", "submitted")
-    table = columns_of(left=words, right=("RMSE mm",), then=("",))
-    for job in page["jobs"]:
-        rmse = "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}"
-        about = job["error"] or (job["stage"] if job["state"] == "running" else "") or ""
-        submitted = job["submitted"][:16].replace("T", " ")
-        cells = (job["id"], job["state"], job["vehicle"], job["name"], submitted, rmse, about)
-        table.add_row(*(_plain(cell) for cell in cells))
+    rows = [
+        (
+            *(_plain(job[key]) for key in ("id", "state", "vehicle", "name")),
+            _plain(job["submitted"][:16].replace("T", " ")),
+            "" if job["rmse"] is None else f"{1000 * job['rmse']:.2f}",
+            _plain(job["error"] or (job["stage"] if job["state"] == "running" else "") or ""),
+        )
+        for job in page["jobs"]
+    ]
+    columns = ("job", "state", "vehicle", "name", "submitted", "RMSE mm", "")
+    words = tuple(name for name in columns if name != "RMSE mm")
     screen = console()
-    screen.print(table)
+    screen.print(drawn(Table(columns, rows, words=words)))
     if page["next"]:
         screen.print(f"more with --after {page['next']}")
 
 
 def _plain(word: str) -> str:
-    """Return a server's word so that the terminal takes nothing in it for markup or control."""
-    from rich.markup import escape
-
-    return escape("".join(c if c.isprintable() else "?" for c in word))
+    """Return a server's word so that the terminal takes nothing in it for control."""
+    return "".join(c if c.isprintable() else "?" for c in word)
 
 
 def watch(

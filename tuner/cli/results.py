@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from tuner.cli.tables import columns_of, console
+from tuner.cli.tables import STYLES, console, drawn
 from tuner.core.phrases import listed_within, shorten
+from tuner.evaluate.records import RMSE_UNITS
 from tuner.report.section import Cell, Section, Table
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ WIDTH, LINES = 100, 30
 """What a finished job takes of a terminal at most, without --verbose."""
 MOST_FLIGHTS, MOST_WARNINGS, LEAST_COEFFICIENTS = 4, 6, 6
 DEFAULT = "default"
-STYLES = {"well": "green", "weak": "yellow", "not": "red", "worse": "red", "failure": "red"}
 
 
 def print_run(
@@ -51,7 +51,7 @@ def print_run(
     screen = console(WIDTH)
     for line in _summary(folder, result, contents.exports, seconds):
         if isinstance(line, Table):
-            screen.print(_drawn(line))
+            screen.print(drawn(line))
         else:
             screen.print(line, soft_wrap=True)
 
@@ -182,25 +182,9 @@ def _print_section(screen: Console, section: Section) -> None:
     for point in section.points:
         screen.print(Text(f"- {point.text}", STYLES.get(point.look, "")))
     for table in section.tables:
-        screen.print(_drawn(table))
+        screen.print(drawn(table))
     if section.note:
         screen.print(Text(section.note, "dim"))
-
-
-def _drawn(table: Table) -> object:
-    drawn = columns_of(table.fold)
-    for name in table.columns:
-        drawn.add_column(name.strip(), justify="left" if name in table.words else "right")
-    for row in table.rows:
-        drawn.add_row(*(_cell(of) for of in row))
-    return drawn
-
-
-def _cell(of: Cell | str) -> Text:
-    if isinstance(of, str):
-        return Text(of)
-    text = f"{of.text}: {of.small}" if of.look and of.small else of.text
-    return Text(text, STYLES.get(of.look, ""))
 
 
 def print_bench(bench: BenchResult, *, verbose: bool = False) -> None:
@@ -239,13 +223,11 @@ def estimates_table(estimates: Sequence[PointEstimate]) -> object:
     """Return where a search ended, of which nothing is known yet but the values."""
     rows = [(row.name, f"{row.initial:.5g}", f"{row.estimate:.5g}", row.unit) for row in estimates]
     columns = ("coefficient", "initial", "estimate", "unit")
-    return _drawn(Table(columns, rows, words=("coefficient", "unit")))
+    return drawn(Table(columns, rows, words=("coefficient", "unit")))
 
 
 def folds_table(folds: Sequence[Fold]) -> object:
     """Return how well each flight is predicted by the fit to the others."""
-    from tuner.evaluate.records import RMSE_UNITS
-
     rows = [
         (
             fold.left_out,
@@ -262,4 +244,4 @@ def folds_table(folds: Sequence[Fold]) -> object:
     ]
     columns = ("left out", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
     title = "RMSE of each flight with the fit to the others"
-    return _drawn(Table(columns, rows, words=("left out",), fold=title))
+    return drawn(Table(columns, rows, words=("left out",), fold=title))

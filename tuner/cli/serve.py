@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 
 from tuner.cli.options import EVERY
+from tuner.core.errors import InputError
 
 if TYPE_CHECKING:
     from tuner.service.database import Database
@@ -88,7 +89,6 @@ def _serve(
     with _extra():
         from tuner.service.server import LOOPBACK, is_loopback
         from tuner.service.server import serve as run
-    from tuner.core.errors import InputError
     from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
 
     if not 0 <= port < 2**16:
@@ -180,8 +180,6 @@ def _database(data: Path | None, url: str | None) -> Iterator[Database]:
 @contextmanager
 def _extra() -> Iterator[None]:
     """Turn a missing package of the extra, imported inside, into one line."""
-    from tuner.core.errors import InputError
-
     packages = ("fastapi", "uvicorn", "sqlalchemy", "alembic", "fsspec", "python_multipart")
     try:
         yield

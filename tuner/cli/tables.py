@@ -7,7 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Table as DrawnTable
+from rich.text import Text
+
+from tuner.evaluate.records import RMSE_UNITS
+from tuner.report.section import Cell, Table
 
 if TYPE_CHECKING:
     from tuner.config import Settings
@@ -28,38 +32,48 @@ def console(width: int = WIDTH) -> Console:
     return fitting if fitting.width >= width else Console(highlight=False, width=width)
 
 
-def columns_of(
-    title: str = "",
-    *,
-    left: Sequence[str] = (),
-    right: Sequence[str] = (),
-    then: Sequence[str] = (),
-) -> Table:
-    """Return a table without rows: columns of words, then of numbers, then of words again."""
-    table = Table(box=None, title=title or None, title_justify="left", pad_edge=False)
-    for name in left:
-        table.add_column(name)
-    for name in right:
-        table.add_column(name, justify="right")
-    for name in then:
-        table.add_column(name)
-    return table
+STYLES = {
+    "well": "green",
+    "weak": "yellow",
+    "not": "red",
+    "worse": "red",
+    "failure": "red",
+    "best": "bold",
+}
+"""Class of the page's style -> of the terminal's."""
+
+
+def drawn(table: Table) -> DrawnTable:
+    """Return a table as the terminal draws it: words on the left, numbers on the right."""
+    made = DrawnTable(box=None, title=table.fold or None, title_justify="left", pad_edge=False)
+    for name in table.columns:
+        made.add_column(name.strip(), justify="left" if name in table.words else "right")
+    for row in table.rows:
+        made.add_row(*map(_cell, row))
+    return made
+
+
+def _cell(of: Cell | str) -> Text:
+    if isinstance(of, str):
+        return Text(of)
+    text = f"{of.text}: {of.small}" if of.look and of.small else of.text
+    return Text(text, STYLES.get(of.look, ""))
 
 
 def print_flights(summaries: Sequence[Summary], path: Path) -> None:
     """Print one line a simulated flight, and where they were written."""
     measures = ("top speed m/s", "off reference x m", "y", "z", "crashed")
-    table = columns_of(right=(*summaries[0].coefficients, *measures))
-    for summary in summaries:
-        crash = "no" if summary.crash_time is None else f"at {summary.crash_time:.2f} s"
-        table.add_row(
+    rows = [
+        (
             *(f"{value:.6g}" for value in summary.coefficients.values()),
             f"{summary.top_speed:.2f}",
             *(f"{axis:.3f}" for axis in summary.tracking_rmse),
-            crash,
+            "no" if summary.crash_time is None else f"at {summary.crash_time:.2f} s",
         )
+        for summary in summaries
+    ]
     screen = console()
-    screen.print(table)
+    screen.print(drawn(Table((*summaries[0].coefficients, *measures), rows)))
     screen.print(f"written to {path}", markup=False)
 
 
@@ -83,17 +97,13 @@ def print_estimates(estimates: Mapping[str, Estimate], path: Path) -> None:
     """Print a vehicle's coefficients by scaling laws, how crude each is, and where they lie."""
     from tuner.vehicle import COEFFICIENTS
 
-    table = columns_of(left=("coefficient",), right=("value", "±"), then=("unit", "source"))
-    for name, estimate in estimates.items():
-        table.add_row(
-            name,
-            f"{estimate.value:.4g}",
-            f"{estimate.error:.0%}",
-            COEFFICIENTS[name].unit,
-            estimate.source,
-        )
+    rows = [
+        (name, f"{of.value:.4g}", f"{of.error:.0%}", COEFFICIENTS[name].unit, of.source)
+        for name, of in estimates.items()
+    ]
+    columns = ("coefficient", "value", "±", "unit", "source")
     screen = console()
-    screen.print(table)
+    screen.print(drawn(Table(columns, rows, words=("coefficient", "unit", "source"))))
     screen.print(f"written to {path} and {path.stem}.job.yaml", markup=False)
 
 
@@ -103,26 +113,23 @@ def print_comparison(
     """Print the RMSE of every vehicle and flight, the lowest in bold and starred."""
     screen = console()
     screen.print(f"controller: {settings.origin['controller']}", markup=False)
-    axes = ("x m", "y m", "z m", "roll deg", "pitch deg", "yaw deg")
-    table = columns_of(left=("flight", "vehicle"), right=axes)
-    for row in comparison.rows:
-        if laps or row.lap is None:
-            table.add_row(*_cells(row, comparison))
-    screen.print(table)
+    columns = ("flight", "vehicle", *(f"{axis} {unit}" for axis, unit in RMSE_UNITS.items()))
+    rows = [_cells(row, comparison) for row in comparison.rows if laps or row.lap is None]
+    screen.print(drawn(Table(columns, rows, words=("flight", "vehicle"))))
     screen.print(f"best over all flights: {comparison.best or 'none, all of them crashed'}")
     for path in written:
         screen.print(f"written to {path}", markup=False)
 
 
-def _cells(row: Row, comparison: Comparison) -> list[str]:
+def _cells(row: Row, comparison: Comparison) -> list[Cell | str]:
     stretch = "all flights" if row.flight == "all" else row.flight
     first = stretch if row.lap is None else f"{stretch} lap {row.lap}"
     if row.crash_time is not None:
         return [first, row.vehicle, f"crashed at {row.crash_time:.2f} s"]
     winners = comparison.winners(row.flight, row.lap)
-    cells = []
+    cells: list[Cell | str] = []
     for axis, value in row.rmse:
         best = winners.get(axis) == row.vehicle and len(comparison.vehicles) > 1
         text = "-" if value is None else f"{value:.4f}"
-        cells.append(f"[bold]{text}*[/bold]" if best else f"{text} ")
+        cells.append(Cell(f"{text}*", look="best") if best else f"{text} ")
     return [first, row.vehicle, *cells]

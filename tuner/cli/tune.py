@@ -49,10 +49,11 @@ def tune(
 
         with span("reading"):
             bare, left_out = without_pose(settle(options))
+        told = listening(quiet=quiet, verbose=verbose)
         if bare:
             from tuner.job.without_pose import fit_without_pose
 
-            with listening(quiet=quiet, verbose=verbose) as listener:
+            with told as listener:
                 measured = fit_without_pose(
                     settle(options),
                     bare,
@@ -61,24 +62,16 @@ def tune(
                     listener=listener,
                     command=TYPED.get(),
                 )
-            profile_into(measured.folder)
-            if not quiet:
-                print_run(
-                    measured.folder,
-                    measured.result,
-                    seconds=time.perf_counter() - began,
-                    verbose=verbose,
+            folder, result = measured.folder, measured.result
+        else:
+            with engine_for(options.workers, options.cluster), told as listener:
+                folder, result = run(
+                    options,
+                    out=options.out,
+                    resume=options.resume,
+                    listener=listener,
+                    command=TYPED.get(),
                 )
-            return
-        engine = engine_for(options.workers, options.cluster)
-        with engine, listening(quiet=quiet, verbose=verbose) as listener:
-            folder, result = run(
-                options,
-                out=options.out,
-                resume=options.resume,
-                listener=listener,
-                command=TYPED.get(),
-            )
         profile_into(folder)
         if not quiet:
             print_run(folder, result, seconds=time.perf_counter() - began, verbose=verbose)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
+import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
-from tuner.client.connection import Connection
 from tuner.client.job_request import request_of
 from tuner.core.disk import inside, make_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
@@ -19,24 +21,46 @@ from tuner.result import Run, read_run
 
 Named = str | Path
 Event = tuple[str, dict[str, Any]]
+API = "/api/v1"
+DEFAULT_SERVER = "http://127.0.0.1:8000"
+PATIENCE = 60.0
+"""s for which a server that answers no more is waited for while a job is followed"""
 
 
 class Client:
-    """A tuning service.
+    """A tuning service; what its server refuses becomes an `InputError`.
 
     Parameters
     ----------
-    connection
-        To its server.
+    url
+        Its address; None takes ``TUNE_SERVER``, or the one that `tune serve` listens to.
+    token
+        The visitor's; None takes ``TUNE_TOKEN``.
+
+    Raises
+    ------
+    InputError
+        The address is none, or what connects is not installed.
     """
 
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-
-    @property
-    def url(self) -> str:
-        """The server's address."""
-        return self._connection.url
+    def __init__(self, url: str | None = None, token: str | None = None) -> None:
+        try:
+            import httpx  # noqa: PLC0415 (an extra)
+        except ModuleNotFoundError:
+            raise InputError(
+                "--server", "needs httpx", "pip install 'multirotor-tune[service]'"
+            ) from None
+        url = url or os.environ.get("TUNE_SERVER") or DEFAULT_SERVER
+        if urlsplit(url).scheme not in ("http", "https") or not urlsplit(url).hostname:
+            raise InputError("--server", f"'{url}' is no address", f"write {DEFAULT_SERVER}")
+        self.url = url.rstrip("/")
+        token = token or os.environ.get("TUNE_TOKEN")
+        self._errors = httpx.TransportError
+        self._http = httpx.Client(
+            base_url=self.url,
+            headers={"Authorization": f"Bearer {token}"} if token else {},
+            timeout=httpx.Timeout(30.0, read=300.0, write=300.0),
+        )
 
     @taking(FitOptions)
     def fit(
@@ -105,7 +129,7 @@ class Client:
         names = (path.name for path in recordings)
         request["names"] = dict(zip(request["recordings"], names, strict=True))
         headers = {"Idempotency-Key": key or uuid.uuid4().hex}
-        return str(self._connection.post("/jobs", request, headers)["id"])
+        return str(self._json("POST", "/jobs", json=request, headers=headers)["id"])
 
     def upload(self, path: Path, on_upload: Callable[[Path], None] = lambda _: None) -> str:
         """Send a recording unless the server has it, and return its id."""
@@ -114,29 +138,46 @@ class Client:
                 path, "is a folder, and a server takes single files", "give the .db3 or .mcap in it"
             )
         sha256 = digest(path)
-        known = self._connection.find(f"/recordings/{sha256}")
-        if known is not None:
+        if self._json("GET", f"/recordings/{sha256}", may_lack=True):
             return sha256
         on_upload(path)
-        return str(self._connection.upload(path)["id"])
+        with path.open("rb") as stream:
+            answer = self._json("POST", "/recordings", files={"file": (path.name, stream)})
+        return str(answer["id"])
 
     def jobs(
         self, *, vehicle: str | None = None, state: str | None = None, after: str | None = None
     ) -> dict[str, Any]:
         """Return a page of jobs, the newest first, and where the next begins."""
-        page: dict[str, Any] = self._connection.get(
-            "/jobs", vehicle=vehicle, state=state, after=after
-        )
-        return page
+        given = {"vehicle": vehicle, "state": state, "after": after}
+        return self._json("GET", "/jobs", params={k: v for k, v in given.items() if v is not None})
 
     def job(self, job: str) -> dict[str, Any]:
         """Return a job as it stands."""
-        found: dict[str, Any] = self._connection.get(_at(job))
-        return found
+        return self._json("GET", _at(job))
 
     def follow(self, job: str) -> Iterator[Event]:
-        """Yield what happens to a job, from its beginning to its end: kind and content."""
-        return self._connection.events(job)
+        """Yield kind and content of what happens to a job, to its end, over a server's restarts."""
+        last, since = "0", time.monotonic()
+        while True:
+            try:
+                headers = {"Last-Event-ID": last}
+                path = f"{API}{_at(job)}/events"
+                with self._http.stream("GET", path, headers=headers) as answer:
+                    if answer.is_error:
+                        answer.read()
+                        if answer.status_code < 500:
+                            self._check(answer)
+                        raise self._errors("the server is ending")
+                    for number, kind, content in _events(answer.iter_lines()):
+                        last, since = number or last, time.monotonic()
+                        yield kind, content
+                        if kind == "job" and content["ended"] is not None:
+                            return
+            except self._errors as error:
+                if time.monotonic() - since > PATIENCE:
+                    raise self._unreachable(error) from None
+            time.sleep(1.0)
 
     def wait(self, job: str) -> dict[str, Any]:
         """Wait for the end of a job, and return it.
@@ -154,13 +195,11 @@ class Client:
 
     def cancel(self, job: str) -> dict[str, Any]:
         """Let a job end without a result."""
-        ended: dict[str, Any] = self._connection.post(f"{_at(job)}/cancel")
-        return ended
+        return self._json("POST", f"{_at(job)}/cancel")
 
     def retry(self, job: str) -> dict[str, Any]:
         """Let a job that failed or was cancelled go on."""
-        waiting: dict[str, Any] = self._connection.post(f"{_at(job)}/retry")
-        return waiting
+        return self._json("POST", f"{_at(job)}/retry")
 
     def fetch(self, job: str, out: Named | None = None) -> Run:
         """Write a job's result into a folder, and read it.
@@ -178,17 +217,73 @@ class Client:
             target = inside(folder, name)
             make_folder(target.parent)
             with whole_file(target) as unfinished:
-                self._connection.download(f"{_at(job)}/files/{quote(name)}", unfinished)
+                self._download(f"{_at(job)}/files/{quote(name)}", unfinished)
         return read_run(folder)
 
     def history(self, vehicle: str) -> dict[str, Any]:
         """Return each coefficient over a vehicle's jobs."""
-        found: dict[str, Any] = self._connection.get(f"/vehicles/{quote(vehicle, safe='')}/history")
-        return found
+        return self._json("GET", f"/vehicles/{quote(vehicle, safe='')}/history")
 
     def close(self) -> None:
         """Let go of the connection."""
-        self._connection.close()
+        self._http.close()
+
+    def _download(self, path: str, target: Path) -> None:
+        try:
+            with (
+                self._http.stream("GET", API + path) as answer,
+                target.open("wb") as file,
+            ):
+                if answer.is_error:
+                    answer.read()
+                    self._check(answer)
+                for block in answer.iter_bytes():
+                    file.write(block)
+        except self._errors as error:
+            raise self._unreachable(error) from None
+
+    def _json(
+        self, method: str, path: str, *, may_lack: bool = False, **more: Any
+    ) -> dict[str, Any]:
+        try:
+            answer = self._http.request(method, API + path, **more)
+        except self._errors as error:
+            raise self._unreachable(error) from None
+        if may_lack and answer.status_code == 404:
+            return {}
+        self._check(answer)
+        try:
+            found: dict[str, Any] = answer.json()
+        except ValueError:
+            raise self._stranger() from None
+        return found
+
+    def _check(self, answer: Any) -> None:
+        """Raise what a server refuses as if it were refused here."""
+        if not answer.is_error:
+            return
+        try:
+            problem = answer.json()
+            where, what, remedy = (str(problem[key]) for key in ("where", "what", "remedy"))
+        except (ValueError, KeyError, TypeError):
+            raise self._stranger() from None
+        if answer.status_code == 401:
+            raise InputError(
+                "--token", f"is none of {self.url}", "ask who runs it, and set TUNE_TOKEN"
+            )
+        if answer.status_code == 500:
+            raise ServerFaultError(f"{self.url}: {what}; {remedy}")
+        raise InputError(where, what, remedy)
+
+    def _unreachable(self, error: Exception) -> InputError:
+        return InputError(
+            "--server",
+            f"{self.url} cannot be reached ({error})",
+            "check the address, or start a server with: tune serve",
+        )
+
+    def _stranger(self) -> InputError:
+        return InputError("--server", f"{self.url} is no tuning service", "check the address")
 
 
 def ended_well(job: dict[str, Any]) -> dict[str, Any]:
@@ -222,3 +317,21 @@ class JobRefusedError(InputError):
 
 def _at(job: str) -> str:
     return f"/jobs/{quote(job, safe='')}"
+
+
+def _events(lines: Iterator[str]) -> Iterator[tuple[str | None, str, dict[str, Any]]]:
+    """Yield number, kind and content of each event of a stream."""
+    number, kind, data = None, "message", ""
+    for line in lines:
+        if not line:
+            if data:
+                yield number, kind, json.loads(data)
+            number, kind, data = None, "message", ""
+            continue
+        field, _, value = line.partition(": ")
+        if field == "id":
+            number = value
+        elif field == "event":
+            kind = value
+        elif field == "data":
+            data += value

@@ -59,10 +59,13 @@ def _settings(settled: Settings) -> dict[str, Any]:
             "export.into names a file of this machine",
             "leave it out, and use tune export --into on what you fetch",
         )
-    if (named := settings.get("vehicle")) is not None:
-        settings["vehicle"] = _content_of("vehicles", read_vehicle, str(named), base)
-    if (named := settings.get("controller")) is not None:
-        settings["controller"] = _content_of("controllers", read_controller, str(named), base)
+    readers: dict[Kind, Callable[[Path], Section]] = {
+        "vehicles": read_vehicle,
+        "controllers": read_controller,
+    }
+    for kind, read in readers.items():
+        if (named := settings.get(key := kind.removesuffix("s"))) is not None:
+            settings[key] = _content_of(kind, read, str(named), base)
     if (named := settings.get("topics")) is not None:
         settings["topics"] = _topics(find_config("topics", str(named), base))
     return settings

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 from pydantic import ValidationError
 
@@ -96,9 +96,9 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     named = options.vehicle
     if named is None and options.bench is not None:
         named = str(Path(options.bench) / "best_fit.yaml")
-    vehicle, origin["vehicle"] = _choose(VEHICLES, named, job.vehicle, job_path)
+    vehicle, origin["vehicle"] = _choose("vehicles", read_vehicle, named, job.vehicle, job_path)
     controller, origin["controller"] = _choose(
-        CONTROLLERS, options.controller, job.controller, job_path
+        "controllers", read_controller, options.controller, job.controller, job_path
     )
     if job.mass is not None:
         vehicle = with_values(vehicle, {"mass": job.mass})
@@ -140,32 +140,23 @@ def find_job_file(flights: Iterable[Path]) -> Path | None:
 M = TypeVar("M", VehicleFile, ControllerFile)
 
 
-@dataclass(frozen=True)
-class _Choice(Generic[M]):
-    """Something that the command line, the job file or the default can name."""
-
-    kind: Kind
-    option: str
-    read: Callable[[Path], M]
-
-
-VEHICLES = _Choice[VehicleFile]("vehicles", "--vehicle", read_vehicle)
-CONTROLLERS = _Choice[ControllerFile]("controllers", "--controller", read_controller)
-
-
 def _choose(
-    choice: _Choice[M], option: str | M | None, in_job: Path | None, job_path: Path | None
+    kind: Kind,
+    read: Callable[[Path], M],
+    option: str | M | None,
+    in_job: Path | None,
+    job_path: Path | None,
 ) -> tuple[M, str]:
     """Return what is named first, and where it comes from."""
     if isinstance(option, str):
-        path = find_config(choice.kind, option, Path())
-        return choice.read(path), f"{choice.option} {path}"
+        path = find_config(kind, option, Path())
+        return read(path), f"--{kind.removesuffix('s')} {path}"
     if option is not None:
-        return option, f"{choice.option} '{option.name}'"
+        return option, f"--{kind.removesuffix('s')} '{option.name}'"
     if in_job is not None:
-        return choice.read(in_job), f"{in_job} ({job_path})"
-    path = find_config(choice.kind, DEFAULT_NAME, Path("/nonexistent"))
-    return choice.read(path), f"default ({path.name})"
+        return read(in_job), f"{in_job} ({job_path})"
+    path = find_config(kind, DEFAULT_NAME, Path("/nonexistent"))
+    return read(path), f"default ({path.name})"
 
 
 def _from(option: str | None, job_path: Path | None, otherwise: str = "default") -> str:

@@ -95,27 +95,24 @@ def table_of(flown: Mapping[str, Mapping[str, FlightErrors]]) -> Table:
 
 
 def _rows(vehicle: str, flights: Mapping[str, FlightErrors]) -> list[Row]:
+    def row(flight: str, lap: int | None, rmse: AxesRmse, crash_time: float | None) -> Row:
+        return Row(flight=flight, lap=lap, vehicle=vehicle, rmse=rmse, crash_time=crash_time)
+
     rows = []
     for name, errors in flights.items():
-        rows.append(_row(name, None, vehicle, errors.rmse, errors.crash_time))
+        rows.append(row(name, None, errors.rmse, errors.crash_time))
         edges = [0.0, *errors.laps.tolist(), math.inf]
         if len(edges) > 2:
             laps = [errors.between(start, end) for start, end in itertools.pairwise(edges)]
             rows += [
-                _row(name, number, vehicle, lap.rmse, errors.crash_time)
+                row(name, number, lap.rmse, errors.crash_time)
                 for number, lap in enumerate(laps, start=1)
                 if len(lap.position.time) >= FEWEST_POSES
             ]
     crashes = [e.crash_time for e in flights.values() if e.crash_time is not None]
     overall = rmse_of(list(flights.values()))
-    rows.append(_row(OVERALL, None, vehicle, overall, min(crashes, default=None)))
+    rows.append(row(OVERALL, None, overall, min(crashes, default=None)))
     return rows
-
-
-def _row(
-    flight: str, lap: int | None, vehicle: str, rmse: AxesRmse, crash_time: float | None
-) -> Row:
-    return Row(flight=flight, lap=lap, vehicle=vehicle, rmse=rmse, crash_time=crash_time)
 
 
 def _best(rows: Sequence[Row]) -> str | None:

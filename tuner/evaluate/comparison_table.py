@@ -95,7 +95,11 @@ def check_table_file(path: Path) -> None:
 
 
 def _writer(path: Path) -> Callable[[Table], str]:
-    writers = {".csv": _csv, ".json": _json, ".html": _html}
+    writers = {
+        ".csv": _csv,
+        ".json": lambda table: table.model_dump_json(indent=2) + "\n",
+        ".html": _html,
+    }
     if path.suffix not in writers:
         raise InputError(
             path, f"a table cannot be written as '{path.suffix}'", "name a .csv, .json or .html"
@@ -113,10 +117,6 @@ def _csv(table: Table) -> str:
             place = (row.flight, row.lap, row.vehicle, axis, unit)
             rows.append((*place, rmse, first, row.crash_time))
     return csv_text(header, rows)
-
-
-def _json(table: Table) -> str:
-    return table.model_dump_json(indent=2) + "\n"
 
 
 def _html(table: Table) -> str:

@@ -237,28 +237,26 @@ def simulate(
         One, or B of them in the order of the grid.
     """
     check_mixer(vehicle)
-    asked = _Asked(vehicle, controller, trajectory, duration, rate, precision, forces)
-    pieces = ((asked, columns, wanted) for columns, wanted in _chunks(grid or {}))
+    flown = vehicle, controller, trajectory, duration, rate, precision, forces
+    pieces = ((*piece, *flown) for piece in _chunks(grid or {}))
     engine = current()
     here = isinstance(engine, Here)  # flights then need not be in memory all at once
     for flights in map(_flights, pieces) if here else engine.stream(_flown, pieces):
         yield from flights
 
 
-@dataclass(frozen=True)
-class _Asked:
-    """What every vehicle of a grid flies; as of `simulate`."""
-
-    vehicle: VehicleFile
-    controller: ControllerFile
-    trajectory: TrajectorySettings
-    duration: float
-    rate: float
-    precision: Precision
-    forces: bool
-
-
-_Piece = tuple[_Asked, dict[str, Array], int]
+_Piece = tuple[
+    dict[str, Array],
+    int,
+    VehicleFile,
+    ControllerFile,
+    TrajectorySettings,
+    float,
+    float,
+    Precision,
+    bool,
+]
+"""Columns of a grid, how many of its flights are wanted, and the rest as of `simulate`."""
 
 
 def _flown(piece: _Piece, _report: Report) -> list[Simulation]:
@@ -268,19 +266,18 @@ def _flown(piece: _Piece, _report: Report) -> list[Simulation]:
 
 def _flights(piece: _Piece) -> Iterator[Simulation]:
     """Fly a piece of a grid, and yield as many of its flights as are wanted."""
-    asked, columns, wanted = piece
-    controller, rate = asked.controller, asked.rate
-    clock = np.arange(math.floor(asked.duration * rate + 1e-9) + 1) / rate
+    columns, wanted, vehicle, controller, trajectory, duration, rate, precision, forces = piece
+    clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     fits = round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
     control_rate = schedule.position_control_rate
-    reference = published(asked.trajectory, duration=asked.duration, control_rate=control_rate)
+    reference = published(trajectory, duration=duration, control_rate=control_rate)
     sent = _sent(reference, clock, control_rate)
-    samples = math.ceil(asked.duration * schedule.log_rate) + 1
+    samples = math.ceil(duration * schedule.log_rate) + 1
     log_time = np.arange(samples) / schedule.log_rate
-    model = model_of(asked.vehicle, controller)
+    model = model_of(vehicle, controller)
     fed = reference.inlet, reference.start
-    logged, crashes = _logged((columns, model, *fed), schedule, samples, asked.precision)
+    logged, crashes = _logged((columns, model, *fed), schedule, samples, precision)
     for segment in range(wanted):
         signals = {
             name: resample(name, Series(log_time, values[segment]), clock)
@@ -294,7 +291,7 @@ def _flights(piece: _Piece) -> Iterator[Simulation]:
             crash_time=float(crashes[segment]) if np.isfinite(crashes[segment]) else None,
             coefficients=coefficients,
         )
-        yield _with_forces(flight, model) if asked.forces else flight
+        yield _with_forces(flight, model) if forces else flight
 
 
 def _chunks(grid: Mapping[str, Array]) -> Iterator[tuple[dict[str, Array], int]]:

@@ -97,7 +97,11 @@ def _recordings(job: Job) -> Iterator[Finding]:
                 names = (note.code.value, note.topic, *note.names)
                 yield Finding(Code.RECORDING, "warning", flight.name, numbers, names)
         for damage in flight.damage:
-            numbers = {name: value for name, value in vars(damage).items() if _is_number(value)}
+            numbers = {
+                name: value
+                for name, value in vars(damage).items()
+                if isinstance(value, int | float)
+            }
             names = (damage.cause.value, damage.subject)
             yield Finding(Code.SALVAGED, "warning", flight.name, numbers, names)
         rotors = () if flight.has("rotor_speed") else ("rotor_speed", "command")
@@ -107,10 +111,6 @@ def _recordings(job: Job) -> Iterator[Finding]:
         gap = float(np.max(np.diff(flight.series["position"].time), initial=0.0))
         if gap > GAP:
             yield Finding(Code.POSE_GAP, "warning", flight.name, {"seconds": gap})
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float)
 
 
 def _sparse_inputs(job: Job) -> Iterator[Finding]:

@@ -39,7 +39,6 @@ from tuner.uncertainty.verdict import (
     ReasonCode,
     Verdict,
 )
-from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import (
     COEFFICIENTS,
     VehicleFile,
@@ -205,11 +204,11 @@ def known_of(vehicle: VehicleFile) -> dict[str, float]:
     """Return coefficient -> scaled coordinate in a vehicle file, or where its term vanishes."""
     neutral = {n: row.neutral for n, row in COEFFICIENTS.items() if row.neutral is not None}
     values = neutral | values_of(vehicle)
-    return {name: scaled_of(name, v) for name, v in values.items() if _has_scale(name, v)}
-
-
-def _has_scale(name: str, value: float) -> bool:
-    return value > 0 or COEFFICIENTS[name].scale == "linear"
+    return {
+        name: scaled_of(name, v)
+        for name, v in values.items()
+        if v > 0 or COEFFICIENTS[name].scale == "linear"
+    }
 
 
 def vehicle_of(path: Path, start: VehicleFile, combination: Combination) -> VehicleFile:
@@ -247,17 +246,11 @@ def _coefficients(
     places = {name: place for place, name in enumerate(combination.names)}
     coefficients = {}
     for name, value in best.items():
-        row = COEFFICIENTS[name]
-        unit, before = row.unit, initial.get(name, value if row.neutral is None else row.neutral)
+        neutral = COEFFICIENTS[name].neutral
+        before = initial.get(name, value if neutral is None else neutral)
         if name not in places:
-            coefficients[name] = CoefficientResult(
-                unit=unit,
-                initial=before,
-                best=value,
-                fitted=False,
-                verdict=Verdict.FIXED,
-                reason=NOT_FITTED,
-                note=judgement_in_words(Verdict.FIXED, NOT_FITTED),
+            coefficients[name] = CoefficientResult.judged(
+                name, before, value, Verdict.FIXED, NOT_FITTED
             )
             continue
         place = places[name]
@@ -267,17 +260,15 @@ def _coefficients(
         scaled = float(combination.scaled[place])
         deviation = float(np.sqrt(combination.covariance[place, place]))
         ends = (scaled - Z95 * deviation, scaled + Z95 * deviation)
-        coefficients[name] = CoefficientResult(
-            unit=unit,
-            initial=before,
-            best=value,
-            fitted=True,
+        coefficients[name] = CoefficientResult.judged(
+            name,
+            before,
+            value,
+            verdict,
+            reason,
             std_error=error_of(name, scaled, deviation) if known else None,
             ci95=(value_of(name, ends[0]), value_of(name, ends[1])) if known else None,
             identifiable=reason.identifiable,
-            verdict=verdict,
-            reason=reason,
-            note=judgement_in_words(verdict, reason),
         )
     return coefficients
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from tuner.config import Options, Settings, settle
 from tuner.core.phrases import listed
@@ -97,7 +97,7 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     key = (digest(path), path.name, _version(), *map(repr, (*inputs, *maps)))
     kept = cached("verdict", *key)
     if (content := load(kept)) is not None:
-        return Verdict(**{**_tuples(json.loads(content)), "path": str(path)})
+        return replace(TypeAdapter(Verdict).validate_json(content), path=str(path))
     from tuner.core.runtime import configure  # noqa: PLC0415 (jax takes a second)
 
     configure()
@@ -106,10 +106,6 @@ def _decided(path: Path, settings: Settings) -> Verdict:
     verdict = decided(path, settings)
     store(kept, json.dumps(asdict(verdict)).encode())
     return verdict
-
-
-def _tuples(raw: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: tuple(of) if isinstance(of, list) else of for name, of in raw.items()}
 
 
 @cache

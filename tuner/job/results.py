@@ -44,7 +44,7 @@ from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
 from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import Job
-from tuner.uncertainty.estimates import Estimate, Uncertainty
+from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.records import Sources
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
@@ -55,7 +55,6 @@ from tuner.uncertainty.verdict import (
     judge_impossible_inertia,
     judge_regressed,
 )
-from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, initial_values, write_vehicle
 from tuner.vehicle.selection_table import SelectionRow
 
@@ -168,18 +167,26 @@ def _coefficients(
         if name in errors:
             regressed = _regressed(name, initial, best.get(name, value), errors[name])
         if name not in best:
-            coefficients[name] = regressed or _fixed(name, value)
+            coefficients[name] = regressed or CoefficientResult.judged(
+                name, value, value, Verdict.FIXED, NOT_FITTED
+            )
             continue
         estimate = None if uncertainty is None else uncertainty.estimates[name]
-        if regressed is not None and estimate is not None and _rougher(regressed, estimate):
+        if (
+            regressed is not None
+            and estimate is not None
+            and (regressed.std_error or 0.0) > estimate.std_error
+        ):
             coefficients[name] = regressed
             continue
         lower, upper = bounds[name]
         verdict, reason = judgements[name]
-        coefficients[name] = CoefficientResult(
-            unit=COEFFICIENTS[name].unit,
-            initial=initial,
-            best=best[name],
+        coefficients[name] = CoefficientResult.judged(
+            name,
+            initial,
+            best[name],
+            verdict,
+            reason,
             fitted=True,
             lower=lower,
             upper=upper,
@@ -187,9 +194,6 @@ def _coefficients(
             std_error_parts=None if estimate is None else estimate.parts,
             ci95=None if estimate is None else _interval(estimate.ci95),
             identifiable=None if estimate is None else reason.identifiable,
-            verdict=verdict,
-            reason=reason,
-            note=judgement_in_words(verdict, reason),
         )
     return coefficients
 
@@ -234,10 +238,6 @@ def with_errors_of_refits(
     return result.model_copy(update={"coefficients": coefficients})
 
 
-def _rougher(regressed: CoefficientResult, estimate: Estimate) -> bool:
-    return (regressed.std_error or 0.0) > estimate.std_error
-
-
 def _regressed(name: str, initial: float, best: float, error: float) -> CoefficientResult:
     """Return a coefficient by regression of accelerations, its error that of the scaled number."""
     row = COEFFICIENTS[name]
@@ -248,29 +248,15 @@ def _regressed(name: str, initial: float, best: float, error: float) -> Coeffici
         std_error = error
         interval = (best - Z95 * error, best + Z95 * error)
     verdict, reason = judge_regressed(std_error, best, row.unit, relative=row.scale == "log")
-    return CoefficientResult(
-        unit=row.unit,
-        initial=initial,
-        best=best,
-        fitted=True,
+    return CoefficientResult.judged(
+        name,
+        initial,
+        best,
+        verdict,
+        reason,
         std_error=std_error,
         ci95=interval,
         identifiable=reason.identifiable,
-        verdict=verdict,
-        reason=reason,
-        note=judgement_in_words(verdict, reason),
-    )
-
-
-def _fixed(name: str, value: float) -> CoefficientResult:
-    return CoefficientResult(
-        unit=COEFFICIENTS[name].unit,
-        initial=value,
-        best=value,
-        fitted=False,
-        verdict=Verdict.FIXED,
-        reason=NOT_FITTED,
-        note=judgement_in_words(Verdict.FIXED, NOT_FITTED),
     )
 
 

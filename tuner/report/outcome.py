@@ -127,7 +127,11 @@ class Outcome:
 
 def outcome(result: RunResult, bench: BenchRecord | None = None) -> Outcome:
     """Return whether a fit can be used, for what, and why."""
-    met = tuple(sorted((_met(flight, result) for flight in result.flights), key=_order))
+    met = tuple(
+        sorted(
+            (_met(flight, result) for flight in result.flights), key=lambda one: not one.held_out
+        )
+    )
     checks = tuple(one for one in met if one.held_out) or met
     standing = _standing(result, checks, met)
     return Outcome(
@@ -206,10 +210,6 @@ def counted(verdicts: Sequence[Verdict]) -> str:
 
 def _of_many(words: str) -> str:
     return words.replace("at its initial value", "at their initial values")
-
-
-def _order(met: Met) -> bool:
-    return not met.held_out
 
 
 def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
@@ -314,14 +314,12 @@ def _uses(result: RunResult, standing: Standing) -> tuple[str, ...]:
     if known and not by_verdict:
         sentences.append(f"Physical values: all {len(known)} coefficients are well known.")
     elif known:
-        sentences.append(f"Physical values: {listed(known)} {_are(known)} well known.")
+        sentences.append(
+            f"Physical values: {listed(known)} {'is' if len(known) == 1 else 'are'} well known."
+        )
     for verdict, names in by_verdict.items():
         sentences.append(f"Not as physical values: {listed(names)}, {verdict_in_words(verdict)}.")
     return tuple(sentences)
-
-
-def _are(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
 
 
 def _reasons(result: RunResult, checks: Sequence[Met]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from tuner.core.errors import InputError
 from tuner.core.phrases import listed, percent
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.result import EffectiveResult, Ending, FlightResult, LostTerm, PoseRmse, RunResult
+from tuner.result import EffectiveResult, Ending, FlightResult, PoseRmse, RunResult
 from tuner.uncertainty.calibration import Calibration
 from tuner.vehicle import REGISTRY, Coefficient, NotCarried, Written
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow
@@ -142,17 +142,12 @@ def what_is_lost(
                 f"the simulator computes otherwise: {'; '.join(deviations)}; that alone misses the "
                 f"flights by {rmse}"
             )
-        elif reason := _reason(term, entry):
+        elif isinstance(held := entry(REGISTRY[term.names[0]]), NotCarried):
             clauses.append(
-                f"{term.group} is not exported: {reason}; without it alone the flights are missed "
-                f"by {rmse}"
+                f"{term.group} is not exported: {held.reason}; without it alone the flights are "
+                f"missed by {rmse}"
             )
     return tuple(clauses)
-
-
-def _reason(term: LostTerm, entry: Callable[[Coefficient], Written | NotCarried | None]) -> str:
-    held = entry(REGISTRY[term.names[0]])
-    return held.reason if isinstance(held, NotCarried) else ""
 
 
 _REASONS = {

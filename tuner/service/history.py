@@ -41,7 +41,8 @@ def history(database: Database, vehicle: str) -> History:
         ).all()
         by_number = {job.number: job for job in jobs}
         rows = session.scalars(select(PointRow).where(PointRow.job.in_(by_number))).all()
-    rows = sorted(rows, key=lambda row: _moment(by_number[row.job]))
+    moments = {job.number: job.submitted if job.flown is None else job.flown for job in jobs}
+    rows = sorted(rows, key=lambda row: (moments[row.job], row.job))
     masses = {row.job: row.best for row in rows if row.coefficient == "mass"}
     mass = next((masses[row.job] for row in reversed(rows) if row.job in masses), None)
     coefficients: dict[str, CoefficientHistory] = {}
@@ -67,10 +68,6 @@ def history(database: Database, vehicle: str) -> History:
         empty = CoefficientHistory(unit=row.unit, points=[])
         coefficients.setdefault(row.coefficient, empty).points.append(point)
     return History(vehicle=vehicle, mass=mass, coefficients=coefficients)
-
-
-def _moment(job: JobRow) -> tuple[float, int]:
-    return job.submitted if job.flown is None else job.flown, job.number
 
 
 def vehicles(database: Database) -> dict[str, int]:

@@ -1,8 +1,13 @@
-"""The calls under ``/api/v1``, ``/healthz`` and ``/metrics``."""
+"""The calls under ``/api/v1``, ``/healthz`` and ``/metrics``, a job's events and its files."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+import shutil
+import tempfile
+import zipfile
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from pathlib import PurePosixPath
 from typing import Annotated, Any
 
 import anyio
@@ -11,15 +16,16 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
 from starlette.requests import ClientDisconnect
 
+from tuner.core.content_store import ContentStore
+from tuner.core.disk import file_name
 from tuner.core.errors import InputError
 from tuner.core.versions import installed
 from tuner.service import jobs, recordings
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
-from tuner.service.events import follow
 from tuner.service.history import history
 from tuner.service.metrics import Metrics
 from tuner.service.request import JobRequest
-from tuner.service.result_files import file_response, zipped
+from tuner.service.safety import REPORT_POLICY
 from tuner.service.service import Service
 from tuner.service.shapes import (
     API,
@@ -35,8 +41,117 @@ from tuner.service.shapes import (
     full_job,
     recording_answer,
 )
-from tuner.service.tables import RecordingRow, State
+from tuner.service.tables import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
 from tuner.service.upload import FIELD, Upload, receive
+from tuner.service.words import over_http
+
+LOOK = 0.5
+"""s between two looks into the table"""
+SILENCE = 15.0
+"""s after which a comment keeps the connection open"""
+
+
+async def follow(service: Service, job: str, after: int) -> AsyncIterator[str]:
+    """Yield the events of a job after one of them, and the job whenever it changes, to its end.
+
+    ``message``, ``iteration``, ``estimates``, ``folds`` and ``state`` are what happened, with their
+    numbers as ids; ``job`` is the job as it stands.
+    """
+    shown, quiet = "", 0.0
+    while not service.stopping.is_set():
+        try:
+            row, new = await anyio.to_thread.run_sync(_look, service, job, after)
+        except ServiceError as error:
+            yield _event("problem", {"detail": str(error)})
+            return
+        for event in new:
+            content = dict(event.content)
+            if event.kind == "message":
+                content["text"] = over_http(str(content["text"]))
+            yield _event(event.kind, content, event.number)
+            after = event.number
+        standing = JobAnswer.model_validate(row).model_dump_json()
+        if standing != shown:
+            yield f"event: job\ndata: {standing}\n\n"
+            shown, quiet = standing, 0.0
+        if row.state in FINISHED and not new:
+            return
+        if quiet >= SILENCE:
+            yield ": still here\n\n"
+            quiet = 0.0
+        if not new:
+            await anyio.sleep(LOOK)
+            quiet += LOOK
+
+
+def _look(service: Service, job: str, after: int) -> tuple[JobRow, Sequence[EventRow]]:
+    row = jobs.job(service.database, job)
+    return row, jobs.events(service.database, row, after=after)
+
+
+def _event(kind: str, content: Mapping[str, Any], number: int | None = None) -> str:
+    head = "" if number is None else f"id: {number}\n"
+    return f"{head}event: {kind}\ndata: {json.dumps(content)}\n\n"
+
+
+BLOCK = 1 << 20
+"""bytes that are read at a time"""
+_KINDS = {".json": "application/json", ".csv": "text/csv", ".svg": "image/svg+xml"}
+
+
+def zipped(store: ContentStore, files: Sequence[FileRow], folder: str) -> Iterator[bytes]:
+    """Yield an archive of stored files, in a folder of a name, under plain names.
+
+    Parameters
+    ----------
+    store
+        With the files.
+    files
+        Of a job.
+    folder
+        What the archive unpacks to: a plain name.
+    """
+    with tempfile.TemporaryFile() as whole:
+        with zipfile.ZipFile(whole, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in files:
+                parts = [file_name(part) for part in PurePosixPath(file.name).parts]
+                entry = zipfile.ZipInfo("/".join([folder, *parts]))
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                entry.external_attr = 0o644 << 16
+                with (
+                    store.reading(file.sha256) as stream,
+                    archive.open(entry, "w", force_zip64=file.size > 2**31 - 1) as target,
+                ):
+                    shutil.copyfileobj(stream, target, BLOCK)
+        whole.seek(0)
+        while block := whole.read(BLOCK):
+            yield block
+
+
+def file_response(store: ContentStore, row: FileRow) -> StreamingResponse:
+    """Return a stored file; a report as a page that reaches nothing, the rest to be saved."""
+    suffix, base = row.name[row.name.rfind(".") :], row.name.rpartition("/")[2]
+    headers = {
+        "content-length": str(row.size),
+        "content-security-policy": REPORT_POLICY,
+        "etag": f'"{row.sha256}"',
+    }
+    if suffix == ".html":
+        kind = "text/html; charset=utf-8"
+    else:
+        kind = _KINDS.get(suffix, "application/octet-stream")
+        headers["content-disposition"] = f'attachment; filename="{file_name(base)}"'
+    if not store.has(row.sha256):
+        raise NotKnownError(row.name, "is gone from the store", "submit the job again")
+
+    async def blocks() -> AsyncIterator[bytes]:
+        with store.reading(row.sha256) as file:
+            read: Callable[[int], bytes] = file.read
+            while block := await anyio.to_thread.run_sync(read, BLOCK):
+                yield block
+
+    return StreamingResponse(blocks(), media_type=kind, headers=headers)
+
 
 #: What any call may answer beside what it is for.
 PROBLEMS: Mapping[int | str, dict[str, Any]] = {

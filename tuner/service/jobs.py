@@ -16,11 +16,10 @@ from sqlalchemy.orm import Session, selectinload, undefer
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
 from tuner.service.names import recording_name
-from tuner.service.queue import add_event
+from tuner.service.queue import UNCLAIMED, add_event
 from tuner.service.request import JobRequest, checked
 from tuner.service.settings import Limits
 from tuner.service.tables import (
-    FINISHED,
     UNFINISHED,
     EventRow,
     FileRow,
@@ -267,7 +266,7 @@ def cancel(database: Database, name: str) -> JobRow:
         There is no such job, or it has ended.
     """
     ending = {"state": State.CANCELLED, "ended": time.time(), "exit_status": 130}
-    changes = {**ending, "claim": None, "owner": None, "lease": None, "seconds_left": None}
+    changes = {**ending, **UNCLAIMED, "seconds_left": None}
     return _move(database, name, UNFINISHED, changes, "there is nothing left to cancel")
 
 
@@ -327,8 +326,3 @@ def counts(database: Database) -> dict[str, int]:
         rows = session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all()
     found = {state: count for state, count in rows}  # noqa: C416 (rows are no pairs to mypy)
     return {state.value: found.get(state, 0) for state in State}
-
-
-def is_finished(row: JobRow) -> bool:
-    """Return whether a job has ended."""
-    return row.state in FINISHED

@@ -144,7 +144,7 @@ class Queue:
                 "exit_status": outcome.exit_status,
                 "ended": time.time(),
                 "seconds_left": 0.0 if outcome.state == State.DONE else None,
-                **_UNCLAIMED,
+                **UNCLAIMED,
             }
             if not _change(session, claim, ending):
                 return False
@@ -162,7 +162,7 @@ class Queue:
                 "state": State.QUEUED,
                 "deaths": JobRow.deaths + int(died),
                 "seconds_left": None,
-                **_UNCLAIMED,
+                **UNCLAIMED,
             }
             if not _change(session, claim, waiting):
                 return False
@@ -209,7 +209,7 @@ def _preamble(session: Session, job: int) -> tuple[str, ...]:
     return tuple(texts)
 
 
-_UNCLAIMED = {"claim": None, "owner": None, "lease": None}
+UNCLAIMED = {"claim": None, "owner": None, "lease": None}
 
 
 def _change(session: Session, claim: Claim, values: Mapping[str, Any]) -> bool:

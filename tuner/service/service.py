@@ -64,10 +64,6 @@ class Service:
         jobs = Queue(database, _identity(settings.data), settings.lease_seconds)
         return cls(settings, database, store, Dispatcher(settings, jobs, store, engine), _lock=lock)
 
-    def start(self) -> None:
-        """Begin to work."""
-        self.dispatcher.start()
-
     def close(self) -> None:
         """Stop working; jobs under way go back into the queue."""
         self.stopping.set()

@@ -16,7 +16,7 @@ import pytest
 from tests.tuner.service.conftest import ended, submit, upload
 from tuner.report.outcome import outcome
 from tuner.result import RunResult
-from tuner.service import attempt, jobs, queue, result_files
+from tuner.service import attempt, http, jobs, queue
 from tuner.service.attempt import put
 from tuner.service.dispatcher import Reporter
 from tuner.service.tables import FileRow, JobRow, State
@@ -306,13 +306,13 @@ def test_all_files_come_as_one_archive_under_plain_names(client, recording):
 
 
 def test_an_archive_unpacks_nowhere_else_and_is_made_block_by_block(idle, tmp_path, monkeypatch):
-    monkeypatch.setattr(result_files, "BLOCK", 1000)
+    monkeypatch.setattr(http, "BLOCK", 1000)
     content = random.Random(1).randbytes(50_000)
     (tmp_path / "x").write_bytes(content)
     digest = put(tmp_path / "x", idle.store)
     names = ("../../x", "/etc/x", "a/../x", "C:\\x", "plots/\0.svg")
     rows = [FileRow(name=name, sha256=digest, size=50_000) for name in names]
-    blocks = list(result_files.zipped(idle.store, rows, "job"))
+    blocks = list(http.zipped(idle.store, rows, "job"))
     assert max(map(len, blocks)) < 40_000  # compression's window; a file at once has more
     with zipfile.ZipFile(io.BytesIO(b"".join(blocks))) as opened:
         made = opened.namelist()

@@ -13,15 +13,16 @@ from tuner.report.contents import Contents
 from tuner.report.section import Section
 from tuner.report.sections.bench import bench
 from tuner.report.sections.coefficients import coefficients
-from tuner.report.sections.effects import effects
 from tuner.report.sections.flights import flights, forces
-from tuner.report.sections.global_sensitivity import global_sensitivity
-from tuner.report.sections.information import information
-from tuner.report.sections.next_flight import next_flight
-from tuner.report.sections.profiles import profiles
-from tuner.report.sections.residuals import residuals
-from tuner.report.sections.search import search
-from tuner.report.sections.selection import selection
+from tuner.report.sections.search import search, selection
+from tuner.report.sections.sensitivity import (
+    effects,
+    global_sensitivity,
+    information,
+    next_flight,
+    profiles,
+    residuals,
+)
 from tuner.report.sections.tables import effective, next_log, provenance, refits, remarks, sources
 
 SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
 
 from tuner.core.phrases import percent
 from tuner.design.proposals import next_log_in_words
@@ -152,9 +151,10 @@ def _change(before: float, after: float) -> str:
 
 def provenance(contents: Contents) -> Section:
     """Return everything that decides the numbers."""
-    about = contents.about
+    about, origins = contents.about, contents.about.settings.get("origin")
     rows: list[tuple[Cell | str, ...]] = [
-        (name, str(origin)) for name, origin in _mapping(about.settings.get("origin")).items()
+        (name, str(origin))
+        for name, origin in (origins if isinstance(origins, dict) else {}).items()
     ]
     if contents.run:
         rows.append(("seed", str(contents.run.result.seed)))
@@ -177,10 +177,6 @@ def provenance(contents: Contents) -> Section:
     ]
     said = (f"Command: {about.command}",) if about.command else ()
     return Section("provenance", "Provenance", said, tables=tables, folded=True)
-
-
-def _mapping(value: object) -> Mapping[str, object]:
-    return value if isinstance(value, dict) else {}
 
 
 def _digest(value: object) -> str:

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from tuner.core.content_store import ContentStore
 from tuner.core.files import MAX_BYTES
 from tuner.evaluate.records import RMSE_UNITS
-from tuner.result import CoefficientResult, ExportRecord, ExportRecords, FlightResult, RunResult
+from tuner.result import CoefficientResult, ExportRecord, ExportRecords, RunResult
 from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError
@@ -126,10 +126,11 @@ def flight_pairs(a: RunResult, b: RunResult) -> list[FlightPair]:
     """Return the flights of both, by content."""
     others = {flight.sha256: flight for flight in b.flights}
     return [
-        _flights(flight, others[flight.sha256]) for flight in a.flights if flight.sha256 in others
+        FlightPair(
+            flight.name,
+            (flight.split, other.split),
+            tuple((getattr(flight.rmse_best, x), getattr(other.rmse_best, x)) for x in RMSE_UNITS),
+        )
+        for flight in a.flights
+        if (other := others.get(flight.sha256)) is not None
     ]
-
-
-def _flights(a: FlightResult, b: FlightResult) -> FlightPair:
-    rmse = tuple((getattr(a.rmse_best, x), getattr(b.rmse_best, x)) for x in RMSE_UNITS)
-    return FlightPair(a.name, (a.split, b.split), rmse)

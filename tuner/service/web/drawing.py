@@ -71,13 +71,14 @@ def rmse_curve(rmse: Sequence[float]) -> Curve | None:
     if high - low < 0.3:
         low, high = low - 0.15, high + 0.15
     first, last = shown[0][0], max(shown[-1][0], shown[0][0] + 1)
+    whole = range(first, last + 1, max(1, round((last - first) / 5)))
     places = [
         (_across(n, first, last), _up(y, low, high)) for (n, _), y in zip(shown, logs, strict=True)
     ]
     return Curve(
         points=" ".join(f"{x:.1f},{y:.1f}" for x, y in places),
         last=places[-1],
-        x_ticks=tuple(Tick(_across(n, first, last), str(n)) for n in _whole_steps(first, last)),
+        x_ticks=tuple(Tick(_across(n, first, last), str(n)) for n in whole),
         y_ticks=tuple(Tick(_up(math.log10(v), low, high), f"{v:g}") for v in _decades(low, high)),
     )
 
@@ -96,14 +97,11 @@ def history_bars(history: CoefficientHistory) -> Bars:
         y, under, over = (_up(value, low, high) for value in (point.best, bottom, top))
         bars.append(Bar(x, y, under, over, point))
     every = -(-len(points) // 6)
-    days = tuple(Tick(bar.x, _day(bar.point)) for bar in bars[::every])
+    days = tuple(
+        Tick(bar.x, (bar.point.flown or bar.point.ended or "")[:10]) for bar in bars[::every]
+    )
     values = tuple(Tick(_up(v, low, high), label) for v, label in _round_numbers(low, high))
     return Bars(tuple(bars), days, values)
-
-
-def _day(point: Point) -> str:
-    moment = point.flown or point.ended or ""
-    return moment[:10]
 
 
 def _across(value: float, first: float, last: float) -> float:
@@ -112,11 +110,6 @@ def _across(value: float, first: float, last: float) -> float:
 
 def _up(value: float, low: float, high: float) -> float:
     return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (value - low) / (high - low)
-
-
-def _whole_steps(first: int, last: int) -> list[int]:
-    step = max(1, round((last - first) / 5))
-    return list(range(first, last + 1, step))
 
 
 def _round_numbers(low: float, high: float) -> list[tuple[float, str]]:

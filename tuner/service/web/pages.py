@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import anyio.to_thread
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Form, Query, Request
 from pydantic import ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
@@ -33,7 +33,7 @@ from tuner.service.safety import COOKIE
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
 from tuner.service.shapes import API
-from tuner.service.tables import JobRow, RecordingRow, State
+from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
 from tuner.service.web import comparing
 from tuner.service.web.drawing import history_bars, rmse_curve
 from tuner.service.web.rendering import render
@@ -169,12 +169,10 @@ def _submit(service: Service, form: FormData) -> Response:
 
 
 @web.post("/settings")
-async def read_settings(request: Request) -> Response:
+def read_settings(settings: Annotated[str, Form()] = "") -> Response:
     """Return what typed or dropped settings hold out, for the script, or what is wrong in them."""
-    async with request.form(max_files=0, max_fields=10, max_part_size=2**20) as form:
-        text = str(form.get("settings", ""))
     try:
-        held = _held(await anyio.to_thread.run_sync(typed_settings, text))
+        held = _held(typed_settings(settings))
     except InputError as error:
         return JSONResponse({"holdout": [], "problem": on_the_web(str(error))})
     return JSONResponse({"holdout": held, "problem": ""})
@@ -288,7 +286,7 @@ def _live(service: Service, row: JobRow) -> dict[str, object]:
         "log": log[-LOG_LINES:],
         "event": row.events,
         "files": f"{API}/jobs/{row.id}/files",
-        "ended": jobs.is_finished(row),
+        "ended": row.state in FINISHED,
     }
 
 
@@ -359,12 +357,11 @@ def login_page() -> Response:
 
 
 @web.post("/login")
-async def login(request: Request) -> Response:
+def login(
+    service: Served, request: Request, token: Annotated[str, Form(max_length=1000)] = ""
+) -> Response:
     """Open a session, which a cookie names that no script reads and no other site sends."""
-    async with request.form(max_files=0, max_fields=10, max_part_size=1000) as form:
-        token = str(form.get("token", "")).strip()
-    service = service_of(request)
-    word = await anyio.to_thread.run_sync(tokens.log_in, service.database, token)
+    word = tokens.log_in(service.database, token.strip())
     if word is None:
         error = NoTokenError("the token", "is none of this server", "ask who runs it for one")
         return render("login.html.jinja", 401, problem=str(error))

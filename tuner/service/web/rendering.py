@@ -10,6 +10,7 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from starlette.responses import HTMLResponse
 
 from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
+from tuner.report.section import figures
 from tuner.service.recordings import flight_name
 from tuner.service.safety import VISITOR
 from tuner.service.shapes import iso
@@ -37,11 +38,11 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     filters: dict[str, Callable[..., object]] = {
-        "figures": lambda value: "–" if value is None else f"{value:.5g}",
+        "figures": figures,
         "short": lambda value: "–" if value is None else f"{value:.2g}",
         "percent": lambda value: "–" if value is None else f"{100 * value:+.2f} %",
         "mm": lambda value: "" if value is None else f"{1000 * value:.2f} mm",
-        "megabytes": _megabytes,
+        "megabytes": lambda size: f"{size / 1e6:.1f} MB",
         "ago": _ago,
         "moment": lambda value: "" if value is None else iso(value),
         "lasting": _lasting,
@@ -59,10 +60,6 @@ def render(template: str, status: int = 200, /, **values: object) -> HTMLRespons
     """Return a page."""
     text = environment().get_template(template).render(**values)
     return HTMLResponse(text, status_code=status)
-
-
-def _megabytes(size: int) -> str:
-    return f"{size / 1e6:.1f} MB"
 
 
 def _ago(seconds: float | None) -> str:

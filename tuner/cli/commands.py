@@ -1,0 +1,426 @@
+"""The commands of `tune` beside the fit, the service and a starting vehicle."""
+
+from __future__ import annotations
+
+import json as json_module
+import sys
+import webbrowser
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from tuner.cli.options import EACH, TYPED, Quiet, Verbose
+from tuner.core.errors import InputError
+from tuner.options import (
+    EngineOptions,
+    ExaminationOptions,
+    Options,
+    ReadingOptions,
+    RecordingOptions,
+)
+
+if TYPE_CHECKING:
+    from tuner.evaluate.rmse import FlightErrors
+
+
+def inspect(
+    *flights: Annotated[str, Parameter(help="Inspect these recordings, or a quoted glob.")],
+    reading: Annotated[ReadingOptions, EACH] = ReadingOptions(),
+    vehicle: str | None = None,
+    json: bool = False,
+    suggest: bool = False,
+) -> None:
+    """Report whether recordings can be fitted, how, and what they hold; nothing is simulated.
+
+    Parameters
+    ----------
+    vehicle
+        Start from this vehicle file or shipped vehicle. Default: the job file's, else hovergames.
+    json
+        Print JSON instead of tables.
+    suggest
+        Print a topic map to begin with: the best guess for every column, its unit, and why.
+    """
+    if suggest:
+        from pathlib import Path
+
+        from tuner.core.recording_paths import find_flights
+        from tuner.recordings.suggestion import suggested_map
+
+        for path in find_flights(flights):
+            sys.stdout.write(suggested_map(Path(path)))
+        return
+    from dataclasses import asdict
+
+    from tuner.core.recording_paths import find_flights
+    from tuner.job.recording_verdict import in_words, verdict_of
+    from tuner.recordings.inspection import as_json, inspect_recordings
+
+    inspections, errors = inspect_recordings(
+        find_flights(flights), topics=reading.topics, namespace=reading.namespace or ""
+    )
+    verdicts = {
+        seen.path: verdict_of(seen, **vars(reading), vehicle=vehicle) for seen in inspections
+    }
+    if json:
+        print(as_json(inspections, errors, {path: asdict(of) for path, of in verdicts.items()}))
+    else:
+        from tuner.cli.tables import console
+        from tuner.recordings.inspection import render
+
+        words = {path: in_words(verdict) for path, verdict in verdicts.items()}
+        console().print(render(inspections, words))
+    if errors:
+        for error in errors[:-1]:
+            sys.stderr.write(f"tune: {error}\n")
+        raise errors[-1]
+
+
+def compare(
+    *,
+    recordings: Annotated[RecordingOptions, EACH],
+    vehicle: list[str],
+    out: list[Path] | None = None,
+    laps: bool = False,
+    plot: Path | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate the recorded flights with several coefficient sets and tabulate the RMSE.
+
+    Parameters
+    ----------
+    vehicle
+        Compare these vehicle files, or shipped vehicles by their names.
+    out
+        Write the table into these files: .csv, .json or .html.
+    laps
+        Show each lap on the terminal, too.
+    plot
+        Draw the position errors over time into this FILE.png, .svg or .pdf.
+    """
+    from tuner.cli.progress import listening
+    from tuner.cli.tables import print_comparison
+    from tuner.core.runtime import configure
+
+    configure()
+    from tuner.evaluate.compare import compare as compare_vehicles
+    from tuner.report.figures import comparison_figure
+    from tuner.report.paper import check_figure, write_figure
+
+    written = list(out or ())
+    if plot is not None:
+        check_figure(plot)
+        written.append(plot)
+
+    def draw(flown: Mapping[str, Mapping[str, FlightErrors]]) -> None:
+        if plot is not None:
+            write_figure(comparison_figure(flown), plot)
+
+    options = Options(**vars(recordings))
+    with listening(quiet=quiet, verbose=True) as listener:
+        table, settings = compare_vehicles(
+            options, vehicle, out or (), on_flown=draw, on_message=listener.on_message
+        )
+    if not quiet:
+        print_comparison(table, settings, laps=laps, written=written)
+
+
+def simulate(
+    *,
+    trajectory: str,
+    out: Path,
+    vehicle: str = "hovergames",
+    controller: str = "hovergames",
+    radius: float = 2.0,
+    omega: float = 0.7,
+    speed_scale: float = 2.1,
+    speed: float | None = None,
+    yaw_rate: float = 2.0,
+    duration: float = 40.0,
+    rate: float = 100.0,
+    sweep: list[str] | None = None,
+    precision: Literal["float32", "float64"] = "float64",
+    forces: Path | None = None,
+    engine: Annotated[EngineOptions, EACH] = EngineOptions(),
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a vehicle and its controller on a trajectory, and write the flight.
+
+    Parameters
+    ----------
+    trajectory
+        Fly this shape, such as circle, from rest; a name that does not exist lists all of them.
+    out
+        Write FILE.csv, or FILE.bag with the topics of a MAVROS lab; .png, .svg and .pdf draw it.
+    vehicle
+        Fly this vehicle file, or a shipped one by its name, say hovergames_updated.
+    controller
+        Fly this controller file, or a shipped one by its name: hovergames_sitl.
+    radius
+        Set the radius in m.
+    omega
+        Set the angular rate of the trajectory in rad/s.
+    speed_scale
+        Set the publisher's velocity scaler.
+    speed
+        Choose the velocity scaler so that the reference peaks at this speed in m/s.
+    yaw_rate
+        Set the rate of the yaw spin in rad/s.
+    duration
+        Fly for this many s.
+    rate
+        Write samples at this rate in Hz.
+    sweep
+        Vary a coefficient: NAME=LOW:HIGH:COUNT. Several of them give all combinations.
+    precision
+        Compute in this precision. float32 is twice as fast for many vehicles, and 0.02 mm off.
+    forces
+        Write force and moment of each term along the flights into this FILE.csv, too.
+    """
+    from tuner.cli.tables import print_flights
+    from tuner.core.runtime import configure
+
+    configure()
+    from tuner.engine import engine_for
+    from tuner.evaluate.simulate import fly, grid_of
+    from tuner.evaluate.write import Summary, summary_of, write_flights
+    from tuner.report.paper import SUFFIXES, check_figure, write_figure
+
+    drawn = out.suffix in SUFFIXES
+    if drawn and (sweep or forces):
+        raise InputError(out, "a figure is of one flight, without forces", "write a .csv")
+    if drawn:
+        check_figure(out)
+    flights = fly(
+        vehicle,
+        controller,
+        {
+            "name": trajectory,
+            "radius": radius,
+            "omega": omega,
+            "speed_scale": speed_scale,
+            "yaw_rate": yaw_rate,
+        },
+        speed=speed,
+        duration=duration,
+        rate=rate,
+        grid=grid_of(sweep or ()) or None,
+        precision=precision,
+        forces=forces is not None,
+    )
+    with engine_for(engine.workers, engine.cluster):
+        if drawn:
+            from tuner.report.figures import flight_figure
+
+            flight = next(flights)
+            write_figure(flight_figure(flight, f"{vehicle}: {trajectory}"), out)
+            summaries: tuple[Summary, ...] = (summary_of(flight),)
+        else:
+            summaries = write_flights(flights, out, forces=forces)
+    if not quiet:
+        print_flights(summaries, out)
+
+
+def sensitivity(
+    *,
+    examined: Annotated[ExaminationOptions, EACH],
+    arena: str | None = None,
+    global_method: Annotated[Literal["morris", "sobol"] | None, Parameter(name="--global")] = None,
+    samples: int | None = None,
+    span: float = 30.0,
+    profile: list[str] | None = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Report the effect of each coefficient, how well it is known and from which flights.
+
+    Parameters
+    ----------
+    arena
+        Propose next flights that fit into X,Y,Z in m: from wall to wall, and up. Default: what the
+        recorded flights took, and a little more.
+    global_method
+        Also compute the indices of Morris or Sobol over the range of the coefficients.
+    samples
+        Compute them from this many trajectories (Morris, default 16) or base points (Sobol, 64).
+    span
+        Vary coefficients without bounds in the job file by this many percent for them.
+    profile
+        Profile the likelihood of these coefficients: fit the others again along a grid of values.
+    """
+    from tuner.cli.options import lengths
+    from tuner.cli.progress import listening
+    from tuner.cli.results import print_sensitivity
+    from tuner.core.runtime import configure
+
+    configure()
+    from tuner.engine import engine_for
+    from tuner.job.folder import folder_for
+    from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
+
+    request = SensitivityRequest(
+        arena=None if arena is None else lengths("--arena", arena),
+        global_method=global_method,
+        samples=samples,
+        span=span / 100.0,
+        profiles=profile or (),
+    )
+    with (
+        engine_for(examined.workers, examined.cluster),
+        listening(quiet=quiet, verbose=verbose) as listener,
+    ):
+        result = examine_vehicle(
+            Options(**vars(examined)),
+            request,
+            out=folder_for(examined.out),
+            command=TYPED.get(),
+            on_message=listener.on_message,
+        )
+    if not quiet:
+        print_sensitivity(result, verbose=verbose)
+
+
+def export(
+    run: Path,
+    /,
+    *,
+    format: str,  # noqa: A002 (the option's name)
+    into: Path | None = None,
+    out: Path | None = None,
+    simulator: str = "",
+    accept: Annotated[str, Parameter(name="--accept")] = "",
+    draws: int | None = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write the coefficients of a run, or a vehicle file, for a simulator.
+
+    A run's are written once its flights fly there as in the run.
+
+    Parameters
+    ----------
+    run
+        Export from this result folder, or this vehicle file, which no flight is compared with.
+    format
+        Write a vehicle file with confidence intervals (yaml), numbers with units (json), a model of
+        Gazebo classic (sdf) or gz-sim (gz-sim; or sdf, where the model is one), parameters of PX4
+        (px4), MuJoCo's MJCF (mujoco), parameters of crazyflow (drone-models) or RotorPy (rotorpy),
+        or arguments of Isaac Lab's multirotor (isaaclab).
+    into
+        Put the coefficients into this model (.sdf or .sdf.jinja), and into what it includes from
+        folders beside its own. Default: write the tags alone.
+    out
+        Write this file; a folder, where the model is split over several. Default: the model itself,
+        or export/ in the result folder.
+    simulator
+        Write for this simulator of a format's: gazebo-classic or gz-sim (sdf), sih or gz-sim
+        (px4). Default: the one that the model is for, or the first.
+    accept
+        Export although a condition is not met, and record this reason in the file.
+    draws
+        Also write so many draws of the joint posterior into the folder --out: a table, a file for
+        each in the format, and Isaac Lab's ranges. Default folder: export/draws of the result.
+    """
+    from tuner.api import export as export_run
+
+    done = export_run(
+        run, format, into=into, out=out, simulator=simulator, accept=accept, draws=draws
+    )
+    if not quiet:
+        from tuner.cli.tables import print_export
+
+        print_export(done)
+
+
+def audit(
+    model: Path,
+    /,
+    *,
+    params: Path | None = None,
+    run: Path | None = None,
+    json: bool = False,
+    quiet: Quiet = False,
+) -> int:
+    """Check a simulator's model against itself, PX4's parameters and physics.
+
+    The exit status is 1 where a fault is found, 0 where none is.
+
+    Parameters
+    ----------
+    model
+        Audit this model (.sdf or .sdf.jinja), with what it includes from folders beside its own.
+    params
+        Also hold it against these parameters of PX4 (.params).
+    run
+        Also say how far each coefficient is from the fitted one of this result folder.
+    json
+        Print the faults as JSON.
+    """
+    from tuner.exporters.audit import audit as audited
+    from tuner.result import read_run
+
+    found = audited(model, params, None if run is None else read_run(run))
+    if json:
+        text = {"model": str(found.path), "faults": found.faults, "compared": found.compared}
+        print(json_module.dumps(text, indent=2, ensure_ascii=False))
+    else:
+        from tuner.cli.tables import console
+
+        screen = console()
+        for fault in found.faults:
+            screen.print(f"{found.path.name}: {fault}", markup=False, soft_wrap=True)
+        for line in found.compared:
+            screen.print(line, markup=False, soft_wrap=True)
+        if not found.faults and not quiet:
+            screen.print(f"{found.path.name}: no fault found, {found.mass:.4g} kg", markup=False)
+    return 1 if found.faults else 0
+
+
+def report(
+    run: Path,
+    /,
+    *,
+    open_: Annotated[bool, Parameter(name="--open", negative=())] = False,
+    plots: bool = False,
+    quiet: Quiet = False,
+) -> None:
+    """Render report.html of a result folder again, from what the folder holds.
+
+    Parameters
+    ----------
+    run
+        The result folder.
+    open_
+        Show the page in the browser.
+    plots
+        Also write its figures as SVG, into plots/ of the folder.
+    """
+    from tuner.report import render
+
+    path = render(run, plots=plots)
+    if open_ and not webbrowser.open(path.resolve().as_uri()):
+        raise InputError("--open", "finds no browser here", f"open {path} yourself")
+    if not quiet:
+        print(path)
+
+
+def bench(
+    file: Path, /, *, out: Path | None = None, quiet: Quiet = False, verbose: Verbose = False
+) -> None:
+    """Estimate coefficients from ground measurements, combine them and test whether they agree.
+
+    Parameters
+    ----------
+    file
+        The list of experiments, bench.yaml.
+    out
+        Write into this result folder. Default: runs/ and the time.
+    """
+    from tuner.job.ground import bench as run_bench
+
+    result = run_bench(file, out=out, command=TYPED.get())
+    if not quiet:
+        from tuner.cli.results import print_bench
+
+        print_bench(result, verbose=verbose)
