@@ -1,4 +1,8 @@
-"""The dispatcher: it claims jobs and starts an attempt at each, one a worker at a time."""
+"""The dispatcher: it claims jobs and starts an attempt at each, here or on a machine of a cluster.
+
+Such a machine gets a job's files from the store and puts what comes of it there, checkpoints too,
+so that any other machine can go on; its folder lasts for as long as it works.
+"""
 
 from __future__ import annotations
 
@@ -6,24 +10,126 @@ import logging
 import os
 import queue
 import shutil
+import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 from tuner.core.content_store import ContentStore
-from tuner.core.errors import InputError
+from tuner.core.disk import inside
+from tuner.core.errors import EngineError, InputError
 from tuner.core.runtime import cores
 from tuner.engine.engine import Engine
-from tuner.service.attempt import DiedError, Events, UnwantedError, attempt, outcome_of, prepare
+from tuner.engine.engine import Report as Channel
+from tuner.service.attempt import (
+    BEAT,
+    CHECKPOINTS,
+    DiedError,
+    Events,
+    Report,
+    UnwantedError,
+    attempt,
+    outcome_of,
+    prepare,
+    put,
+)
 from tuner.service.errors import NoSpaceError, UnavailableError
 from tuner.service.queue import Claim, Outcome, Queue
-from tuner.service.remote import RemoteTask, run_remotely
-from tuner.service.settings import ServiceSettings
+from tuner.service.settings import Limits, ServiceSettings
 from tuner.service.tables import State
+from tuner.service.worker import RESULT
+
+
+@dataclass(frozen=True)
+class RemoteTask:
+    """What a machine of the cluster is to do: the claim on a job, and the store's URL."""
+
+    claim: Claim
+    store: str
+    limits: Limits
+
+
+def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
+    """Work on a job, on the machine that an engine has chosen for it.
+
+    Raises
+    ------
+    DiedError
+        Its process died.
+    """
+    store, claim = ContentStore(task.store), task.claim
+    kept = dict(claim.checkpoint)
+    with tempfile.TemporaryDirectory(prefix="tune-job-") as name:
+        folder = Path(name)
+        (folder / RESULT).mkdir()
+        for file, digest in kept.items():
+            store.fetch(digest, inside(folder / RESULT, file))
+        asked = prepare(folder, claim, store)
+
+        def relay(events: Events, standing: Mapping[str, Any]) -> bool:
+            for file in (folder / RESULT).glob(CHECKPOINTS):
+                kept[file.name] = put(file, store)
+            report({"events": list(events), "standing": dict(standing), "checkpoint": dict(kept)})
+            return True
+
+        last = attempt(
+            folder,
+            claim,
+            asked,
+            limits=task.limits,
+            cores=(),
+            report=relay,
+            is_unwanted=lambda: False,
+        )
+        return outcome_of(last, folder, store)
+
+
+def run_remotely(
+    task: RemoteTask, engine: Engine, report: Report, is_unwanted: Callable[[], bool]
+) -> Outcome:
+    """Have a job worked on by a machine of a cluster, and return what came of it.
+
+    Raises
+    ------
+    UnwantedError
+        The attempt holds its job no more, or the server is ending; the machine stops working.
+    DiedError
+        The process of the job died, or the machine did.
+    """
+    heard: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    future = engine.submit(fit_remotely, task, heard.put)
+    try:
+        while True:
+            has_ended = wait([future], timeout=BEAT).done
+            events, standing = _all(heard)
+            if is_unwanted() or not report(events, standing):
+                raise UnwantedError
+            if has_ended:
+                return future.result()
+    except EngineError as error:
+        raise DiedError(f"{error.where} {error.what}") from None
+    finally:
+        future.cancel()
+
+
+def _all(heard: SimpleQueue[dict[str, Any]]) -> tuple[Events, dict[str, Any]]:
+    """Return what was heard since the last time."""
+    events: list[tuple[str, Mapping[str, Any]]] = []
+    standing: dict[str, Any] = {}
+    while True:
+        try:
+            message = heard.get_nowait()
+        except Empty:
+            return events, standing
+        events += [(kind, content) for kind, content in message["events"]]
+        standing |= {**message["standing"], "checkpoint": message["checkpoint"]}
+
 
 logger = logging.getLogger(__name__)
 
