@@ -1,5 +1,8 @@
 """Arguments in, exit status out; no logic."""
 
 from tuner.cli.run import main, program
+from tuner.core.runtime import set_environment
+
+set_environment()  # before a command imports NumPy
 
 __all__ = ["main", "program"]

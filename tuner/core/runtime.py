@@ -60,8 +60,10 @@ def use_one_thread_for_algebra() -> None:
 
 
 def set_environment() -> None:
-    """Set what jax reads from the environment when it makes its devices."""
+    """Set what jax and NumPy read from the environment when they are imported."""
     os.environ.setdefault("NPROC", "1")
+    # Matrices here are small: more threads spin for longer than they compute.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if version("jaxlib").rpartition(".")[0] not in _RELEASES_KNOWN:

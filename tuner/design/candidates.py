@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
@@ -157,6 +158,8 @@ def candidate_problem(
         resting=None if recorded.resting is None else np.ones(count, bool),
         log_voltage=_filled(recorded.log_voltage, count, np.nan),
         wander=_filled(recorded.wander, count, 0.0),
+        freedom=_filled(recorded.freedom, count, 0.0),
+        freed=recorded.freed,
     )
     return replace(
         objective,
@@ -190,7 +193,7 @@ def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet
 
 
 def _hovering(objective: Objective, places: Vec3, count: int) -> Start:
-    start = hover(objective.model.vehicle, places)
+    start = eqx.filter_jit(hover)(objective.model.vehicle, places)
     wide: Start = jax.tree.map(
         lambda leaf: np.broadcast_to(np.asarray(leaf, float), (count,)), start
     )

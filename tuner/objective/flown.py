@@ -28,12 +28,14 @@ from sim_jax.rollout import begun
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
 from sim_jax.terms import total
-from tuner.objective.flight import beginning_of, recorded_of
+from tuner.objective.flight import MOTION, TURNED, beginning_of, recorded_of
 from tuner.objective.segments import Segments
-from tuner.vehicle.model import Model, with_coefficients
+from tuner.vehicle.model import Model, coefficients_in, with_coefficients
 
 Array = NDArray[np.float64]
 
+LOGGED = ("position", "attitude", "body_rate", "rotor_speed", "command", MOTION, TURNED)
+"""What every program without derivatives logs; what nobody asks for is not written."""
 AT_ONCE = 2
 """Columns of derivatives in one pass over a block of segments: with more, code leaves the
 instruction cache and takes longer to build."""
@@ -118,7 +120,13 @@ def fly(
         What is logged; by default what was measured.
     """
     names = tuple(segments.measured) if channels is None else channels
-    own = any(np.ndim(value) for value in coefficients.values())
+    moves = tangents is not None
+    logged = names if moves else tuple(dict.fromkeys((*LOGGED, *names)))
+    if not moves:
+        coefficients = {**coefficients_in(model), **coefficients}
+    own = not moves or any(np.ndim(value) for value in coefficients.values())
+    if segments.freedom is not None and states is None:
+        states = np.zeros(np.shape(segments.freedom))
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
@@ -133,19 +141,24 @@ def fly(
                 for name, value in given.coefficients.items()
             }
         )
-    arguments = _arguments(given, own_coefficients=own, moves=tangents is not None)
+    arguments = _arguments(given, own_coefficients=own, moves=moves)
     leaves, structure = jax.tree.flatten(arguments, is_leaf=lambda leaf: isinstance(leaf, Argument))
-    static = _Static(schedule, limits, names, tangents is not None)
+    static = _Static(schedule, limits, logged, moves)
     program = _program(tuple(leaves), structure, static)
     run = program(
         given,
         None if tangents is None else _directions(given, tangents),
         lanes=segments.count,
         turns=samples,
+        wanted=None if moves else ({name: name in names for name in logged}, True),
     )
-    logged, crash_time = run.values
+    found, crash_time = run.values
     still: dict[str, Array | None] = dict.fromkeys(names)
-    return Flown(logged, still if run.columns is None else run.columns[0], crash_time)
+    return Flown(
+        {name: found[name] for name in names},
+        still if run.columns is None else run.columns[0],
+        crash_time,
+    )
 
 
 def flown_part(segments: Segments) -> Segments:

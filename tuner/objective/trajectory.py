@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,8 @@ def published(settings: TrajectorySettings, *, duration: float, control_rate: fl
         radius=np.asarray(settings.radius), omega=np.asarray(settings.omega)
     )
     ticks = math.ceil(duration * TICK_RATE) + 1
-    sent = publish(shape, ticks=ticks, velocity_scaler=settings.speed_scale)
+    pace = np.asarray(settings.speed_scale)
+    sent = eqx.filter_jit(publish)(shape, ticks=ticks, velocity_scaler=pace)
     count = math.ceil(duration * control_rate) + 1
     seen = np.minimum(np.floor(np.arange(count) * TICK_RATE / control_rate + 1e-9), ticks - 1)
     rows = seen.astype(int)

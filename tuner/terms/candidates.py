@@ -73,12 +73,14 @@ def names_in(groups: Groups) -> tuple[str, ...]:
 
 def coefficients_in(groups: Groups) -> tuple[str, ...]:
     """Return the coefficients of some groups."""
-    return tuple(n for names in groups.values() for n in names if n not in conditions())
+    around = conditions()
+    return tuple(name for name in names_in(groups) if name not in around)
 
 
 def conditions_in(groups: Groups) -> tuple[str, ...]:
     """Return what of some groups surrounds each flight."""
-    return tuple(n for names in groups.values() for n in names if n in conditions())
+    around = conditions()
+    return tuple(name for name in names_in(groups) if name in around)
 
 
 def groups_named(terms: Sequence[str], space: Space) -> Groups:

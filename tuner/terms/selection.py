@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jax import Array
@@ -53,8 +54,6 @@ from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 MAX_ROUNDS = 4
 """Of additions; each round adds all that gain by more than chance, and prunes."""
-FILLED_UP_TO = 8
-"""A space is filled up to a multiple of so many coefficients, so that programs are shared."""
 WORTH_FITTING = (
     SelectionCode.PREDICTS_FLIGHTS,
     SelectionCode.PREDICTS_SECTIONS,
@@ -216,18 +215,12 @@ class Selection:
         """Return the fit with exactly these groups, from where the last one ended or anew."""
         wanted, around = coefficients_in(groups), conditions_in(self.candidates)
         idle = tuple(name for name in around if name not in conditions_in(groups))
-        spare = [name for name in coefficients_in(self.candidates) if name not in wanted]
-        free = [*self.job.space.names, *wanted]
-        filled = [*wanted, *spare[: -len(free) % FILLED_UP_TO]]
         objective, point = with_terms(
-            self._objective_of(state.fitted), self.fitted.point, filled, self.job.settings.job
+            self._objective_of(state.fitted), self.fitted.point, wanted, self.job.settings.job
         )
         objective, _ = with_conditions(objective, point, around)
         start, names = np.array(point.coefficients), objective.space.names
-        vector = [
-            state.vector.get(name, start[i]) if name in free else start[i]
-            for i, name in enumerate(names)
-        ]
+        vector = [state.vector.get(name, start[i]) for i, name in enumerate(names)]
         new = [group for group in groups if group not in state.added]
         from_here = replace(
             state.fitted,
@@ -237,7 +230,7 @@ class Selection:
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
         free_ones = Free(
-            np.array([name in free for name in names]),
+            np.ones(len(names), bool),
             np.vstack([offsets, np.tile(moves[:, None], offsets.shape[1])]),
         )
         title = f"with {len(new)} terms more" if new else f"with {len(groups)} terms"
@@ -288,21 +281,21 @@ class Selection:
         values = {name: np.asarray(value) for name, value in neutral.items()}
         return replace(objective, model=with_coefficients(objective.model, values))
 
-    @property
-    def _space(self) -> tuple[str, ...]:
-        """The coefficients of every `Linear`, one for each flight of what surrounds it."""
-        around = conditions_in(self.candidates)
-        return (
-            *self.job.space.names,
-            *coefficients_in(self.candidates),
-            *(f"{name} {flight}" for name in around for flight in self._flights),
-        )
+    @cached_property
+    def _space(self) -> dict[str, list[int]]:
+        """Name -> its columns in every `Linear`: one for each flight of what surrounds it."""
+        names = (*self.job.space.names, *coefficients_in(self.candidates))
+        columns = {name: [number] for number, name in enumerate(names)}
+        for name in conditions_in(self.candidates):
+            first = sum(map(len, columns.values()))
+            columns[name] = [first + flight for flight in self._flights]
+        return columns
 
     @property
     def _flights(self) -> range:
         return range(self.fitted.objective.flights)
 
-    @property
+    @cached_property
     def _neutral(self) -> NDArray[np.float64]:
         """Scaled neutral values (P,) of the candidates; zero for the base model's coefficients."""
         neutral = start_of(coefficients_in(self.candidates))
@@ -315,13 +308,7 @@ class Selection:
         return np.array([0.0] * len(self.job.space) + scaled + [0.0] * around)
 
     def _columns(self, names: Sequence[str]) -> NDArray[np.intp]:
-        around = conditions_in(self.candidates)
-        wanted = [
-            f"{name} {flight}" if name in around else name
-            for name in names
-            for flight in (self._flights if name in around else range(1))
-        ]
-        return np.array([self._space.index(name) for name in wanted], np.intp)
+        return np.array([column for name in names for column in self._space[name]], np.intp)
 
     def _score(self, state: LinearisedFit, group: str) -> Score:
         """Return what a group is worth beside the others in the model."""
