@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.numerics import scaled_inverse, scaled_solve
-from tuner.objective.batch import sums_at
 from tuner.objective.criterion import Criterion, Point, SegmentSums
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
@@ -27,7 +26,13 @@ RIDGE = 1e-12
 
 
 def clocks_that_differ(
-    objective: Objective, points: Point, best: int, criterion: Criterion, free: Free
+    objective: Objective,
+    points: Point,
+    best: int,
+    criterion: Criterion,
+    free: Free,
+    *,
+    sums: SegmentSums,
 ) -> NDArray[np.bool_]:
     """Return (offsets, N) which offsets stay, of those that are free.
 
@@ -43,8 +48,9 @@ def clocks_that_differ(
         S points, and which of them.
     free
         What moves.
+    sums
+        The segments' at the points.
     """
-    sums = sums_at(objective, points, criterion)
     here: SegmentSums = jax.tree.map(lambda leaf: np.asarray(leaf)[best], sums)
     loss, gradient, hessian = (
         np.asarray(part)

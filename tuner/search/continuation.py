@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuner.objective.batch import sums_at
 from tuner.objective.criterion import OFFSET_UNIT, Point
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
@@ -145,7 +146,10 @@ def _with_clocks_set_right(problem: StageProblem, best: int) -> StageProblem:
     free, points = problem.free, problem.points
     if not free.offsets[: len(CLOCKS)].any():
         return problem
-    stay = clocks_that_differ(problem.objective, points, best, problem.criterion, free)
+    sums = sums_at(problem.objective, points, problem.criterion)
+    stay = clocks_that_differ(problem.objective, points, best, problem.criterion, free, sums=sums)
+    if not np.any(points.offsets[:, ~stay]):  # nothing moves: the points are flown already
+        return replace(problem, free=Free(free.coefficients, free.offsets & stay), sums=sums)
     points = Point(points.coefficients, points.offsets * stay)
     clocks = np.asarray(points.offsets[best])[: len(CLOCKS)] * OFFSET_UNIT
     return replace(

@@ -92,7 +92,7 @@ class LeastSquares(Optimiser):
         """Return the solver before its first step from the stage's points."""
         given = problem.criterion.states
         states = None if given is None else np.asarray(given)
-        return Descent(begin(problem.points, problem.damping), states, states)
+        return Descent(begin(problem.points, problem.damping, problem.sums), states, states)
 
     def step(self, problem: StageProblem, state: Descent) -> tuple[Descent, Iterate]:
         """Fly every start's next point with derivatives; keep those that are better.

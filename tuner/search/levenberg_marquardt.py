@@ -61,6 +61,8 @@ class Step:
         residuals linear: ½ gᵀH⁻¹g over the loss. Free of units and of damping.
     quadratics
         Of each start at its best point; empty before.
+    ahead
+        The segments' sums at the point to be tried next, where that was flown already.
     """
 
     point: Point
@@ -73,9 +75,10 @@ class Step:
     still: NDArray[np.bool_]
     predicted_reduction: Array
     quadratics: tuple[NormalEquations, ...] = ()
+    ahead: SegmentSums | None = None
 
 
-def begin(points: Point, damping: Array | None = None) -> Step:
+def begin(points: Point, damping: Array | None = None, sums: SegmentSums | None = None) -> Step:
     """Return where the solver stands before its first step from S points.
 
     Parameters
@@ -84,6 +87,8 @@ def begin(points: Point, damping: Array | None = None) -> Step:
         The starts; their leaves have S first, and so has every array returned.
     damping
         (S,) λ of the first step, relative to the Hessian per compared value; 1 by default.
+    sums
+        The segments' at the starts, where these were flown already.
     """
     points = Point(np.asarray(points.coefficients), np.asarray(points.offsets))
     starts = len(points.coefficients)
@@ -97,6 +102,7 @@ def begin(points: Point, damping: Array | None = None) -> Step:
         damping=np.ones(starts) if damping is None else np.asarray(damping, float),
         still=np.zeros(starts, bool),
         predicted_reduction=np.full(starts, np.inf),
+        ahead=sums,
     )
 
 
@@ -116,7 +122,9 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     free
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
-    sums = sums_at(objective, before.tried, criterion)
+    sums = before.ahead
+    if sums is None:
+        sums = sums_at(objective, before.tried, criterion)
     moves = np.flatnonzero(free)
     flight, starts = np.asarray(objective.segments.flight), range(len(before.loss))
     tried = [

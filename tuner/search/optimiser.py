@@ -56,6 +56,8 @@ class StageProblem:
         (S,) λ to begin with, for an optimiser that damps its steps.
     last
         Whether no stage follows, so that what is found has to stand.
+    sums
+        The segments' at the points, where these were flown already.
     """
 
     objective: Objective
@@ -67,6 +69,7 @@ class StageProblem:
     seed: int
     damping: NDArray[np.float64]
     last: bool
+    sums: SegmentSums | None = None
 
     @property
     def best(self) -> int:

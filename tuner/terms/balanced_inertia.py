@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import equinox as eqx
+import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -243,18 +244,22 @@ def _fitted_to(
     ``begin`` (K,) is another place to begin, ``settled`` (K,) what stays as it is there.
     """
     objective = fitted.objective
-    weights = {
-        name: eqx.tree_at(lambda m: m.weight, measured, measured.weight * np.asarray(inside, float))
-        for name, measured in objective.segments.measured.items()
-    }
-    some = eqx.tree_at(lambda o: o.segments.measured, objective, weights)
+    some = eqx.tree_at(
+        lambda o: o.segments,
+        objective,
+        jax.tree.map(lambda leaf: np.asarray(leaf)[..., inside], objective.segments),
+    )
+    states = fitted.criterion.states
+    criterion = replace(
+        fitted.criterion, states=None if states is None else np.asarray(states)[:, inside]
+    )
     held = np.isin(objective.space.names, list(set(fitted.held.values())))
     if settled is not None:
         held |= settled
     start = fitted.point.coefficients if begin is None else np.asarray(begin)
     problem = StageProblem(
         objective=some,
-        criterion=fitted.criterion,
+        criterion=criterion,
         stage=LEFT_OUT,
         points=Point(start[None], fitted.point.offsets[None]),
         losses=np.array([np.inf]),

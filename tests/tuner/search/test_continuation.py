@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from tests.tuner.uncertainty.making import problem, truth, with_data
+from tuner.objective.batch import sums_at
 from tuner.objective.segments import OFFSETS
+from tuner.search import continuation, levenberg_marquardt
+from tuner.search.clocks import clocks_that_differ
 from tuner.search.continuation import grow
 from tuner.search.normal_equations import normal_equations
 from tuner.search.optimiser import Free
@@ -92,6 +95,32 @@ def test_the_search_ends_within_a_tenth_of_a_standard_error_of_the_minimum(fit):
     gradient, hessian = np.asarray(gradient)[:count], np.asarray(hessian)[:count, :count]
     away = np.sqrt(compared * gradient @ np.linalg.solve(hessian, gradient))
     assert away <= 0.1
+
+
+def test_no_point_is_flown_twice_where_clocks_are_looked_at(fit, monkeypatch):
+    flown, looked_at = [], []
+
+    def recorded(objective, points, criterion):
+        numbers = (points, criterion.scale, criterion.horizon, criterion.huber)
+        flown.append(tuple(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(numbers)))
+        return sums_at(objective, points, criterion)
+
+    def judged(*given, **sums):
+        looked_at.append(clocks_that_differ(*given, **sums))
+        return looked_at[-1]
+
+    for module in (continuation, levenberg_marquardt):
+        monkeypatch.setattr(module, "sums_at", recorded)
+    monkeypatch.setattr(continuation, "clocks_that_differ", judged)
+    late = {
+        name: eqx.tree_at(lambda m: m.time, measured, measured.time + np.array([0.0, 0.02]))
+        for name, measured in fit.segments.measured.items()
+    }
+    differing = eqx.tree_at(lambda o: o.segments.measured, fit, late)
+    searched(differing, [np.asarray(fit.space.initial) + 0.1], offsets=True)
+    assert len(looked_at) == 2
+    assert looked_at[-1][0, 1]  # it stays late
+    assert len(set(flown)) == len(flown)
 
 
 def test_a_stage_begins_with_the_trust_that_the_last_one_earned(fit):
