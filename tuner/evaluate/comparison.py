@@ -17,8 +17,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 
-from sim_jax.crash import AIRBORNE, Limits
-from sim_jax.schedule import Schedule
+from sim_jax.crash import AIRBORNE
 from tuner.config.job import InletName
 from tuner.evaluate.forces import Forces, acting, in_order
 from tuner.evaluate.rmse import FlightErrors, SignalErrors, joined, laps_of, short_way
@@ -209,25 +208,13 @@ class _Group:
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
         model = with_terms_computed(model, computed)
-        owner = np.asarray(self._segments.flight)
         segments, states = self._segments, None
         if fitted_starts:
             segments = self._laid(free_starts=True)
             states = self._likeliest_starts(model, segments)
         elif self.windowed:
             segments = self._spinning(vehicle)
-        simulated, acted, crash_times = _flown(
-            model,
-            segments,
-            self._late,
-            {name: values[owner] for name, values in self._conditions.items()},
-            schedule=self._schedule,
-            samples=self._samples,
-            limits=self._limits,
-            states=states,
-            stride=self._stride,
-            flier=flier,
-        )
+        simulated, acted, crash_times = self._flown(model, segments, states, flier)
         errors, first = {}, 0
         for recording, windows in zip(self._recordings, self._windows, strict=True):
             flight, crash = recording.flight, float(crash_times[first])
@@ -251,6 +238,47 @@ class _Group:
             )
             first += len(windows)
         return errors
+
+    def _flown(
+        self, model: Model, segments: Segments, states: Array | None, flier: Callable[..., Flown]
+    ) -> tuple[dict[str, Array], dict[str, Array], Array]:
+        """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
+
+        Between the two, term -> what acted at every ``stride``-th sample, (F, m, 6).
+
+        A stamp that is so late that it was taken before the simulation begins, or so early that it
+        was taken behind its end, is compared with the simulation's first or last sample.
+        """
+        owner = np.asarray(self._segments.flight)
+        conditions = {name: values[owner] for name, values in self._conditions.items()}
+        flown = flier(
+            model,
+            segments,
+            self._schedule,
+            samples=self._samples,
+            limits=self._limits,
+            states=states,
+            conditions=conditions,
+            channels=(*POSE, "rotor_speed", MOTION, TURNED),
+        )
+        rate, calm = float(self._schedule.log_rate), np.zeros(segments.count)
+        acted = acting(
+            model.vehicle,
+            flown.channels[MOTION],
+            flown.channels[TURNED],
+            flown.channels["rotor_speed"],
+            rate=rate,
+            wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
+            stride=self._stride,
+        )
+        on_time = np.zeros((len(OFFSETS), segments.count))
+        reading = Reading(on_time, on_time[: len(CLOCKS)], rate, self._samples)
+        simulated = {}
+        for signal in POSE:
+            time = np.asarray(segments.measured[signal].time)
+            taken = np.clip(time - self._late, 0.0, (self._samples - 1) / rate).T
+            simulated[signal] = at_stamps(flown.channels[signal], signal, taken, reading)
+        return simulated, acted, flown.crash_time
 
     def _errors(self, signal: str, simulated: Array, segment: int, window: Window) -> SignalErrors:
         """Return the errors at the complete samples of a segment."""
@@ -333,53 +361,3 @@ class _Group:
             asked = np.clip(np.where(np.isfinite(asked), asked, 0.0), -FAR, FAR)
             trial = np.where(better, asked, 0.5 * (best + trial))
         return best
-
-
-def _flown(
-    model: Model,
-    segments: Segments,
-    late: Array,
-    conditions: Mapping[str, Array],
-    *,
-    schedule: Schedule,
-    samples: int,
-    limits: Limits,
-    states: Array | None,
-    stride: int,
-    flier: Callable[..., Flown],
-) -> tuple[dict[str, Array], dict[str, Array], Array]:
-    """Return signal -> (F, n, c) simulated at the recorded stamps, and crash times (F,) in s.
-
-    Between the two, term -> what acted at every ``stride``-th sample, (F, m, 6).
-
-    A stamp that is so late that it was taken before the simulation begins, or so early that it was
-    taken behind its end, is compared with the simulation's first or last sample.
-    """
-    flown = flier(
-        model,
-        segments,
-        schedule,
-        samples=samples,
-        limits=limits,
-        states=states,
-        conditions=conditions,
-        channels=(*POSE, "rotor_speed", MOTION, TURNED),
-    )
-    rate, calm = float(schedule.log_rate), np.zeros(segments.count)
-    acted = acting(
-        model.vehicle,
-        flown.channels[MOTION],
-        flown.channels[TURNED],
-        flown.channels["rotor_speed"],
-        rate=rate,
-        wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
-        stride=stride,
-    )
-    on_time = np.zeros((len(OFFSETS), segments.count))
-    reading = Reading(on_time, on_time[: len(CLOCKS)], rate, samples)
-    simulated = {}
-    for signal in POSE:
-        time = np.asarray(segments.measured[signal].time)
-        taken = np.clip(time - late, 0.0, (samples - 1) / rate).T
-        simulated[signal] = at_stamps(flown.channels[signal], signal, taken, reading)
-    return simulated, acted, flown.crash_time

@@ -123,10 +123,8 @@ def run(
     fitted, examination, inertia = _balanced(selected, fitted, examination, explanation, listener)
     explanation.tell(fitted.findings)
     vehicle = vehicle_fitted(job, fitted)
-    if found.fits(job, fitted):
-        validation = found.validation
-    else:
-        validation = _flown(job, fitted, vehicle, listener)
+    is_found = job is found.job and fitted is found.fitted
+    validation = found.validation if is_found else _flown(job, fitted, vehicle, listener)
     explanation.notice(_of_flights(job, validation, inertia))
     explanation.notice(voltage_taken(settings.vehicle, vehicle))
     sources = _known(fitted, examination, explanation)
@@ -193,10 +191,6 @@ class _Found:
     job: Job
     fitted: Fitted
     validation: Validation
-
-    def fits(self, job: Job, fitted: Fitted) -> bool:
-        """Return whether a fit is the one that was found."""
-        return job is self.job and fitted is self.fitted
 
 
 def prepared(settings: Settings) -> tuple[Job, tuple[Finding, ...]]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tuner.core.disk import check_file, file_name, inside, make_folder, whole_file, write_text
+from tuner.core.disk import check_file, file_name, inside, make_folder, whole_file
 from tuner.core.errors import InputError
 from tuner.report.chart import Bars, Chart, Heat, Line, Panel
 
@@ -41,17 +41,11 @@ SETTINGS: dict[Any, Any] = {
 
 def write_plots(charts: Sequence[Chart], folder: Path) -> tuple[Path, ...]:
     """Write each chart as ``plots/KEY.svg`` of a folder; the same charts give the same bytes."""
-    import matplotlib as mpl  # noqa: PLC0415 (a second to import)
-
-    mpl.use("Agg", force=False)
     make_folder(inside(folder, PLOTS))
-    written = []
-    with mpl.rc_context(SETTINGS):
-        for chart in charts:
-            path = plot_file(folder, chart)
-            write_text(path, _drawn(chart, "svg").decode())
-            written.append(path)
-    return tuple(written)
+    paths = tuple(plot_file(folder, chart) for chart in charts)
+    for chart, path in zip(charts, paths, strict=True):
+        write_figure(chart, path)
+    return paths
 
 
 def check_figure(path: Path) -> None:

@@ -68,19 +68,19 @@ def prepare(folder: Path, claim: Claim, store: ContentStore) -> CheckedRequest:
 def attempt(
     folder: Path,
     claim: Claim,
-    asked: CheckedRequest,
+    store: ContentStore,
     *,
     limits: Limits,
-    cores: Sequence[int],
     report: Report,
-    is_unwanted: Callable[[], bool],
-) -> dict[str, Any]:
-    """Run the worker's process to its end, and return its last message.
+    cores: Sequence[int] = (),
+    is_unwanted: Callable[[], bool] = lambda: False,
+) -> Outcome:
+    """Run the worker's process to its end, and return what it came to, its files in the store.
 
     Parameters
     ----------
-    folder, claim, asked
-        As of `prepare`.
+    folder, claim, store
+        Of the job, and where its recordings are and its result goes.
     limits, cores
         For the process.
     report
@@ -95,7 +95,10 @@ def attempt(
         The process died, or took too long.
     UnwantedError
         See there; the process has been stopped.
+    NoSpaceError
+        The disk is full.
     """
+    asked = prepare(folder, claim, store)
     assignment = Assignment(
         job=claim.id,
         folder=folder.absolute(),
@@ -133,7 +136,7 @@ def attempt(
         process.stdout.close()
     if last is None:
         raise DiedError(_cause(process.returncode))
-    return last
+    return _outcome(last, folder, store)
 
 
 def _read(stream: IO[bytes], lines: queue.Queue[bytes | None]) -> None:
@@ -220,14 +223,8 @@ def _cause(status: int) -> str:
     return f"it was ended by {name}{hint}"
 
 
-def outcome_of(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
-    """Return what an attempt came to, the files of a result put into the store.
-
-    Raises
-    ------
-    NoSpaceError
-        The disk is full.
-    """
+def _outcome(last: Mapping[str, Any], folder: Path, store: ContentStore) -> Outcome:
+    """Return what an attempt came to, the files of a result put into the store."""
     if last["kind"] == "refused":
         return Outcome(State.FAILED, error=str(last["error"]), exit_status=2)
     if last["kind"] == "fault":

@@ -35,8 +35,6 @@ from tuner.service.attempt import (
     Report,
     UnwantedError,
     attempt,
-    outcome_of,
-    prepare,
     put,
 )
 from tuner.service.errors import NoSpaceError, UnavailableError
@@ -70,7 +68,6 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
         (folder / RESULT).mkdir()
         for file, digest in kept.items():
             store.fetch(digest, inside(folder / RESULT, file))
-        asked = prepare(folder, claim, store)
 
         def relay(events: Events, standing: Mapping[str, Any]) -> bool:
             for file in (folder / RESULT).glob(CHECKPOINTS):
@@ -78,16 +75,7 @@ def fit_remotely(task: RemoteTask, report: Channel) -> Outcome:
             report({"events": list(events), "standing": dict(standing), "checkpoint": dict(kept)})
             return True
 
-        last = attempt(
-            folder,
-            claim,
-            asked,
-            limits=task.limits,
-            cores=(),
-            report=relay,
-            is_unwanted=lambda: False,
-        )
-        return outcome_of(last, folder, store)
+        return attempt(folder, claim, store, limits=task.limits, report=relay)
 
 
 def run_remotely(
@@ -262,17 +250,15 @@ class Dispatcher:
         if self._engine is not None:
             task = RemoteTask(claim, self._settings.store_url, limits)
             return run_remotely(task, self._engine, report, is_unwanted)
-        asked = prepare(folder, claim, self._store)
-        last = attempt(
+        return attempt(
             folder,
             claim,
-            asked,
+            self._store,
             limits=limits,
             cores=self._cores(slot),
             report=report,
             is_unwanted=is_unwanted,
         )
-        return outcome_of(last, folder, self._store)
 
     def _on_worker_death(self, claim: Claim, death: DiedError) -> None:
         """Put the job of a worker that died back, or give it up after too many deaths."""

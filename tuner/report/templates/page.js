@@ -24,10 +24,13 @@
   const NARROW = 560; // px
   const DASHES = { solid: null, dot: "1.5,3", dash: "6,4" };
   const number = (value) => +value.toPrecision(5);
-  const decades = (low, high) => (at) => {
-    const leading = +at.toExponential()[0];
-    return leading === 1 || (high < 30 * low && leading % 3 === 2) ? String(+at.toPrecision(3)) : ""; // 1, or 1, 2, 5
+  const decades = (low, high) => {
+    const [first, last] = [Math.floor(Math.log10(low)), Math.ceil(Math.log10(high))];
+    const steps = high < 30 * low ? [1, 2, 5] : [1];
+    const ticks = d3.range(first, last + 1, Math.ceil((last - first) / 8)).flatMap((power) => steps.map((step) => step * 10 ** power));
+    return { ticks: ticks.filter((at) => at > 0.999 * low && at < 1.001 * high), tickFormat: (at) => (at < 0.9e-3 ? at.toExponential(0) : String(+at.toPrecision(3))) };
   };
+  const whole = (low, high) => [10 ** Math.floor(Math.log10(low)), 10 ** Math.ceil(Math.log10(high))];
   const lettersOf = (labels) => d3.max(labels, (label) => label.length) ?? 0;
 
   const ofLine = (line, log) => {
@@ -52,8 +55,8 @@
       [across, up] = [[x, w], [y, h]].map(([[low, high], size]) => [(low + high - scale * size) / 2, (low + high + scale * size) / 2]);
     }
     return {
-      x: { type: panel.x_scale, ...(panel.x_scale === "log" && { tickFormat: decades(...d3.extent(known, (point) => point.x)) }), ...(across && { domain: across }) },
-      y: { type: panel.y_scale, ...(panel.y_scale === "log" && { tickFormat: decades(...d3.extent(known, (point) => point.y)) }), nice: !up, ...(up && { domain: up }), ...(panel.y_scale === "linear" && height < 200 && { ticks: 4 }) },
+      x: { type: panel.x_scale, ...(panel.x_scale === "log" && decades(...(across ?? d3.extent(known, (point) => point.x)))), ...(across && { domain: across }) },
+      y: { type: panel.y_scale, ...(panel.y_scale === "log" && decades(...whole(...d3.extent(known, (point) => point.y)))), nice: !up, ...(up && { domain: up }), ...(panel.y_scale === "linear" && height < 200 && { ticks: 4 }) },
       marks: [
         Plot.ruleY(panel.levels, { y: "0", strokeDasharray: "4,3" }),
         Plot.text(panel.levels, { y: "0", text: "1", frameAnchor: "right", dy: -7 }),
@@ -70,7 +73,7 @@
     const least = d3.min(known, (bar) => bar.value) / 2;
     const across = log ? { x1: () => least, x2: "value" } : { x: "value" };
     return {
-      x: { type: panel.x_scale, ...(log && { tickFormat: decades(...d3.extent(known, (bar) => bar.value)) }) },
+      x: { type: panel.x_scale, ...(log && decades(least, d3.max(known, (bar) => bar.value))) },
       y: { type: "band", domain: panel.marks[0].labels },
       marks: [Plot.barX(known, { ...across, y: "label", fill: "colour", title: "text", tip: true })],
     };
@@ -173,11 +176,11 @@
   };
 
   const save = (box, chart) => {
-    const whole = d3.create("svg").attr("xmlns", "http://www.w3.org/2000/svg").attr("font-family", "system-ui, sans-serif").attr("font-size", 12);
+    const figure = d3.create("svg").attr("font-family", "system-ui, sans-serif").attr("font-size", 12);
     let y = 22;
-    whole.append("text").attr("x", 8).attr("y", 15).text(chart.title);
+    figure.append("text").attr("x", 8).attr("y", 15).text(chart.title);
     for (const button of box.querySelectorAll(".legend [aria-pressed=true]")) {
-      const mark = whole.append("g").attr("transform", `translate(8 ${y})`);
+      const mark = figure.append("g").attr("transform", `translate(8 ${y})`);
       mark.append(() => button.querySelector("svg").cloneNode(true));
       mark.append("text").attr("x", 28).attr("y", 9).text(button.textContent);
       y += 16;
@@ -185,12 +188,12 @@
     for (const panel of box.querySelectorAll(":scope > svg")) {
       const copy = panel.cloneNode(true);
       copy.setAttribute("y", y);
-      whole.append(() => copy);
+      figure.append(() => copy);
       y += +panel.getAttribute("height");
     }
-    whole.attr("width", box.clientWidth).attr("height", y);
+    figure.attr("width", box.clientWidth).attr("height", y);
     const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([whole.node().outerHTML], { type: "image/svg+xml" }));
+    link.href = URL.createObjectURL(new Blob([new XMLSerializer().serializeToString(figure.node())], { type: "image/svg+xml" }));
     link.download = `${chart.key}.svg`;
     link.click();
     URL.revokeObjectURL(link.href);
