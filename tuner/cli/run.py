@@ -15,7 +15,6 @@ from cyclopts import CycloptsError
 from tuner.cli.app import COMMANDS, app
 from tuner.cli.options import TYPED
 from tuner.core.errors import InputError, ServerFaultError, did_you_mean
-from tuner.core.runtime import use_one_thread_for_algebra
 
 DONE = 0
 INTERNAL_ERROR = 1
@@ -39,7 +38,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     given = sys.argv[1:] if arguments is None else list(arguments)
     TYPED.set(shlex.join(["tune", *given]))
-    use_one_thread_for_algebra()
     logging.basicConfig(level=logging.WARNING, format="tune: %(message)s", stream=sys.stderr)
     logging.captureWarnings(True)
     status = DONE

@@ -50,20 +50,11 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
-def use_one_thread_for_algebra() -> None:
-    """Keep NumPy's linear algebra on the thread that asks for it; call it before NumPy's import.
-
-    A job's matrices are small: threads that wait for the next one take most of the processor.
-    """
-    for name in THREADS:
-        os.environ.setdefault(name, "1")
-
-
 def set_environment() -> None:
     """Set what jax and NumPy read from the environment when they are imported."""
     os.environ.setdefault("NPROC", "1")
-    # Matrices here are small: more threads spin for longer than they compute.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for name in THREADS:  # matrices are small: more threads spin for longer than they compute
+        os.environ.setdefault(name, "1")
     # Loading its own compiled code, XLA complains of pseudo-features that no processor reports.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if version("jaxlib").rpartition(".")[0] not in _RELEASES_KNOWN:
