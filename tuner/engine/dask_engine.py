@@ -29,7 +29,7 @@ from distributed.comm import CommClosedError
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import cache_folder
 from tuner.core.errors import EngineError
-from tuner.core.runtime import configure, set_environment
+from tuner.core.runtime import configure
 from tuner.engine.cluster_file import ClusterFile
 from tuner.engine.clusters import cluster_of, connected
 from tuner.engine.engine import HERE, Engine, Report, Task, using
@@ -64,7 +64,6 @@ class SetUp(WorkerPlugin):  # type: ignore[misc]
             pin({self.pool[(first + i) % len(self.pool)] for i in range(self.cores)})
         if self.gpus:
             os.environ["CUDA_VISIBLE_DEVICES"] = str(int(worker.name) % self.gpus)
-        set_environment()
         configure()
 
 
