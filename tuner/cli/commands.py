@@ -106,8 +106,7 @@ def compare(
 
     configure()
     from tuner.evaluate.compare import compare as compare_vehicles
-    from tuner.report.figures import comparison_figure
-    from tuner.report.paper import check_figure, write_figure
+    from tuner.report.paper import check_figure, comparison_figure, write_figure
 
     written = list(out or ())
     if plot is not None:
@@ -186,7 +185,7 @@ def simulate(
     from tuner.engine import engine_for
     from tuner.evaluate.simulate import fly, grid_of
     from tuner.evaluate.write import Summary, summary_of, write_flights
-    from tuner.report.paper import SUFFIXES, check_figure, write_figure
+    from tuner.report.paper import SUFFIXES, check_figure, flight_figure, write_figure
 
     drawn = out.suffix in SUFFIXES
     if drawn and (sweep or forces):
@@ -212,8 +211,6 @@ def simulate(
     )
     with engine_for(engine.workers, engine.cluster):
         if drawn:
-            from tuner.report.figures import flight_figure
-
             flight = next(flights)
             write_figure(flight_figure(flight, f"{vehicle}: {trajectory}"), out)
             summaries: tuple[Summary, ...] = (summary_of(flight),)

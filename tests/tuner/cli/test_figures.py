@@ -7,7 +7,7 @@ import pytest
 from tests.tuner.report import making
 from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.cli import main
-from tuner.cli.run import WRONG_INPUT
+from tuner.cli.app import WRONG_INPUT
 from tuner.core.errors import InputError
 from tuner.report.chart import FITTED, Chart, Line, Panel
 from tuner.report.paper import check_figure, write_figure

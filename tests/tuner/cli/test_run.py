@@ -61,7 +61,7 @@ def failing(monkeypatch):
         def fail(_):
             raise error
 
-        monkeypatch.setattr("tuner.cli.run.app", fail)
+        monkeypatch.setattr("tuner.cli.app.app", fail)
 
     return make
 
