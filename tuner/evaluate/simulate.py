@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import starmap
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -241,32 +242,27 @@ def simulate(
     pieces = ((*piece, *flown) for piece in _chunks(grid or {}))
     engine = current()
     here = isinstance(engine, Here)  # flights then need not be in memory all at once
-    for flights in map(_flights, pieces) if here else engine.stream(_flown, pieces):
+    for flights in starmap(_flights, pieces) if here else engine.stream(_flown, pieces):
         yield from flights
 
 
-_Piece = tuple[
-    dict[str, Array],
-    int,
-    VehicleFile,
-    ControllerFile,
-    TrajectorySettings,
-    float,
-    float,
-    Precision,
-    bool,
-]
-"""Columns of a grid, how many of its flights are wanted, and the rest as of `simulate`."""
-
-
-def _flown(piece: _Piece, _report: Report) -> list[Simulation]:
+def _flown(piece: tuple[Any, ...], _report: Report) -> list[Simulation]:
     """Return what `_flights` yields: it leaves the process all at once."""
-    return list(_flights(piece))
+    return list(_flights(*piece))
 
 
-def _flights(piece: _Piece) -> Iterator[Simulation]:
+def _flights(  # noqa: PLR0917 (a piece travels as a tuple)
+    columns: dict[str, Array],
+    wanted: int,
+    vehicle: VehicleFile,
+    controller: ControllerFile,
+    trajectory: TrajectorySettings,
+    duration: float,
+    rate: float,
+    precision: Precision,
+    forces: bool,
+) -> Iterator[Simulation]:
     """Fly a piece of a grid, and yield as many of its flights as are wanted."""
-    columns, wanted, vehicle, controller, trajectory, duration, rate, precision, forces = piece
     clock = np.arange(math.floor(duration * rate + 1e-9) + 1) / rate
     fits = round(controller.physics.rate) % rate == 0
     schedule = schedule_of(controller, log_rate=round(rate) if fits else None)
