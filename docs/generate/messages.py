@@ -103,6 +103,9 @@ IN_OTHER_WORDS: Mapping[Code, str] = {
     Code.CONTROLLER_ANSWERS: "Recorded commands follow from rate set-points and gyro with another "
     "P or I than the controller file's, or later or earlier than its filters and D let them. "
     "Compare it with the autopilot's parameters; intervals hold what the difference moves.",
+    Code.ROTOR_SPEEDS_LATE: "Recorded rotor speeds come after the turning that they make, or "
+    "before it: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
+    "that moves.",
     Code.TERM_SHOWS: "A term that was found says something of the vehicle or its files: thrust "
     "grows with another power of the rotor speed than the second, the rate controller's gains are "
     "not those of the file, the autopilot sits askew, or its gyro's scale is off.",

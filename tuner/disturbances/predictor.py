@@ -21,6 +21,7 @@ from tuner.disturbances.information import hidden
 from tuner.disturbances.observer import CHANNELS, Expected, Feed
 from tuner.disturbances.recorded import (
     FLIGHT_CONTROLLER,
+    Sampled,
     each_reading,
     gathered,
     sampled,
@@ -283,7 +284,7 @@ class Predictor:
         )
 
     def _stepped(self, other: Objective, point: Point) -> Predictor:
-        """Return the predictor of another problem, in finer steps of physics or pushed along."""
+        """Return the predictor of another problem: finer steps, pushed along, other stamps."""
         segments, found = self.feed.segments, self.found
         assert found is not None
         assert found.gains is not None
@@ -296,9 +297,22 @@ class Predictor:
             feed=replace(
                 self.feed,
                 segments=replace(segments, inlet=inlet, disturbance=other.segments.disturbance),
+                samples={
+                    name: self._placed(name, other.segments.measured[name].time)
+                    for name in self.feed.samples
+                },
             ),
             found=replace(found, gains=gains),
         )
+
+    def _placed(self, name: str, time: Any) -> Sampled:
+        """Return a channel's samples where (n, F) stamps in s have them, each at its own tick."""
+        laid, rows = self.feed.samples[name], self.rows[name]
+        place = np.array(laid.place)
+        sample, flight = np.nonzero(rows >= 0)
+        tick, rate = rows[sample, flight], float(self.schedule.log_rate)
+        place[tick, flight] = 1.0 - tick + np.asarray(time)[sample, flight] * rate
+        return replace(laid, place=jnp.asarray(place))
 
     def jacobian(self, objective: Objective, point: Point, moved: Sequence[int]) -> Jacobian:
         """Return whitened innovations at a point, and derivatives by some of its P parameters.

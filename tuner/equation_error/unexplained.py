@@ -46,6 +46,8 @@ SHIFTS, MOVED = 4, 1e-3
 """In how many ways a motor's curve and lags move rotor speeds, and by how much they are moved."""
 MOST = 5
 """Features that are told at most."""
+LATE = ("rotor_speed", "late")
+"""What is told of the rotors' speeds: their lateness against the gyro, by all moments."""
 AXES = ("force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z")
 
 
@@ -92,10 +94,14 @@ class Unexplained:
         The likeliest first.
     accelerations
         Of each flight (N, 6), m/s² and rad/s², body axes, what all of them make.
+    late
+        s by which recorded rotor speeds come after the turning that they make: stamped late, or
+        filtered; zero if that is chance.
     """
 
     laws: tuple[Law, ...]
     accelerations: tuple[Array, ...]
+    late: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -182,28 +188,38 @@ def unexplained(
     made = Accelerations(model, (), (*recorded, *moved)).at(np.zeros(0), noise=False)
     shifts = [
         np.stack([(one.left - other.left) / MOVED for other in made[at : at + SHIFTS]], 2)
-        * of_commands
-        for one, at, of_commands in zip(
-            along, range(len(recorded), len(made), SHIFTS), driven, strict=True
-        )
+        for one, at in zip(along, range(len(recorded), len(made), SHIFTS), strict=True)
     ]
     mean = float(np.mean([part.rotor_speed.mean() for part in simulated]))
     motions = [_motion(part, one, mean) for part, one in zip(simulated, along, strict=True)]
-    names = [(axis, name) for axis, features in FEATURES.items() for name in features]
-    tables = [_features(motion) for motion in motions]
+    names = [*((axis, name) for axis, features in FEATURES.items() for name in features), LATE]
+    tables = [
+        np.concatenate([_features(motion), _late(shift) * (not of_commands)], axis=2)
+        for motion, shift, of_commands in zip(motions, shifts, driven, strict=True)
+    ]
     columns = [
         np.concatenate(
-            [one.columns, _nuisances(part, motion, (number, len(motions))), shift, table], axis=2
+            [
+                one.columns,
+                _nuisances(part, motion, (number, len(motions)), of_commands),
+                shift * of_commands,
+                table,
+            ],
+            axis=2,
         )
-        for number, (part, one, motion, shift, table) in enumerate(
-            zip(simulated, along, motions, shifts, tables, strict=True)
+        for number, (part, one, motion, shift, table, of_commands) in enumerate(
+            zip(simulated, along, motions, shifts, tables, driven, strict=True)
         )
     ]
     first = columns[0].shape[2] - len(names)
     information, score = _sums(recorded, made[: len(recorded)], columns)
     model_columns, told = list(range(first)), list[tuple[int, float]]()
+    late = _likeliest(information, score, model_columns, [first + len(names) - 1])
+    if late is not None:  # no law: it is judged by itself, and first
+        told.append(late)
+        model_columns.append(late[0])
     while len(told) < MOST:
-        rest = [i for i in range(first, first + len(names)) if i not in model_columns]
+        rest = [i for i in range(first, first + len(names) - 1) if i not in model_columns]
         likeliest = _likeliest(information, score, model_columns, rest)
         if likeliest is None:
             break
@@ -218,10 +234,13 @@ def unexplained(
     laws = []
     for column, deviation in told:
         axis, name = names[column - first]
+        if (axis, name) == LATE:
+            continue
         row = AXES.index(axis)
         size = parts[row, column - first] * sizes[column - first] / modelled[row]
         laws.append(Law(axis, name, float(size), deviation))
-    return Unexplained(tuple(laws), tuple(table @ sizes for table in tables))
+    made_of_laws = tuple(table[..., :-1] @ sizes[:-1] for table in tables)
+    return Unexplained(tuple(laws), made_of_laws, float(sizes[-1]))
 
 
 def _moved(part: Measured) -> list[Measured]:
@@ -254,17 +273,26 @@ def _features(motion: _Motion) -> Array:
     return table
 
 
-def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int]) -> Array:
+def _late(shift: Array) -> Array:
+    """Return what moments (N, 6, 1) are short of for each s by which rotor speeds are late."""
+    column = shift[..., 2:].sum(axis=2, keepdims=True)
+    column[:, :3] = 0.0
+    return np.asarray(column)
+
+
+def _nuisances(part: Measured, motion: _Motion, place: tuple[int, int], of_commands: bool) -> Array:
     """Return (N, 6, n) what else errors may be, and is not told.
 
     A steady one of each axis in each flight (``place``: which of how many); what a thrust looks
-    like along x and y from an attitude that is tilted or late; and what comes late of each axis.
+    like along x and y from an attitude that is tilted or late; what comes late of each force, whose
+    clock is another than the gyro's, and of each moment where rotor speeds are made of commands.
     """
     number, flights = place
     table = np.zeros((len(motion.v), 6, 6 * flights + 12))
-    every = np.arange(6)
+    every, late = np.arange(6), np.arange(6 if of_commands else 3)
     table[:, every, 6 * number + every] = 1.0
-    table[:, every, 6 * flights + every] = np.gradient(motion.modelled, part.step, axis=0)
+    changes = np.gradient(motion.modelled, part.step, axis=0)
+    table[:, late, 6 * flights + late] = changes[:, late]
     tilted = np.column_stack([motion.modelled[:, 2], motion.w[:, :2]])
     for axis in (0, 1):
         columns = 6 * flights + 6 + 3 * axis + np.arange(3)

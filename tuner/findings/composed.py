@@ -250,6 +250,17 @@ def controller_answers(finding: Finding) -> str:
     )
 
 
+def rotor_speeds_late(finding: Finding) -> str:
+    """Return by how much rotor speeds and turning disagree in time."""
+    seconds = finding.numbers["seconds"]
+    after = "after" if seconds > 0.0 else "before"
+    return (
+        f"Recorded rotor speeds come {1e3 * abs(seconds):.2g} ms {after} the turning that they "
+        "make: they were filtered, or are stamped otherwise than the gyro. Intervals hold what "
+        "that moves."
+    )
+
+
 def rotor_changed(finding: Finding) -> str:
     """Return which rotor changed within a flight, when, and by how much."""
     loss, (place,) = finding.numbers["loss"], finding.names

@@ -344,6 +344,11 @@ class Code(Worded):
         composed.controller_answers,
         "Compare the controller file with the autopilot's parameters, as they are now.",
     )
+    ROTOR_SPEEDS_LATE = (
+        "rotor_speeds_late",  # seconds
+        composed.rotor_speeds_late,
+        "Log them unfiltered, and stamped when they were measured.",
+    )
     ROTOR_CHANGED = (
         "rotor_changed",  # seconds, rotor (from 1), loss (share); names: its place
         composed.rotor_changed,

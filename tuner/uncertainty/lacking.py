@@ -46,6 +46,8 @@ from tuner.vehicle.model import Model
 MATTERS = 0.5
 """Standard errors without it, from which the move of a coefficient is said."""
 _CHANNELS = ("position", "attitude", "rotor_speed", "body_rate", "command")
+LATE = 1e-3
+"""s of rotor speeds' lateness that is worth a word."""
 SMALLEST = 0.03
 """Share of what varies along an axis below which a law is none to speak of."""
 
@@ -62,21 +64,31 @@ class Lack:
         What all of them make, in every segment; None for no laws.
     answers
         Which of the rate controller's gains are not the file's.
+    late
+        s by which recorded rotor speeds come after the turning that they make; zero for not.
     """
 
     laws: tuple[Law, ...]
     disturbance: Disturbance | None
     answers: tuple[Answer, ...] = ()
+    late: float = 0.0
 
     def acting_on(self, objective: Objective) -> Objective:
-        """Return a problem whose simulated flights it pushes, and whose gains are those found."""
+        """Return a problem whose simulated flights it pushes, and whose gains are those found.
+
+        And whose rotor speeds were taken when they turned so.
+        """
         segments, model = objective.segments, objective.model
         rate = model.controller.rate
         for answer in self.answers:
             rate = _answering(rate, answer)
+        measured = dict(segments.measured)
+        if self.late and "rotor_speed" in measured:
+            speeds = measured["rotor_speed"]
+            measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time - self.late)
         return replace(
             objective,
-            segments=replace(segments, disturbance=self.disturbance),
+            segments=replace(segments, disturbance=self.disturbance, measured=measured),
             model=eqx.tree_at(lambda m: m.controller.rate, model, rate),
         )
 
@@ -139,7 +151,7 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
     parameters = objective.space.parameters
     found = unexplained(model, parameters, scaled, tuple(pairs.values()))
     if not found.laws:
-        return Lack((), None, heard) if heard else None
+        return Lack((), None, heard, found.late) if heard or found.late else None
     body = model.vehicle.body
     by = np.array([*[body.mass] * 3, body.inertia_xx, body.inertia_yy, body.inertia_zz], float)
     ticks = np.arange(objective.samples + 2) / rate
@@ -152,11 +164,11 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         for axis, column in enumerate(acting.T):
             pushes[axis, :, number] = np.interp(ticks, one.time, column)
     force, moment = (Vec3(*map(jnp.asarray, rows)) for rows in (pushes[:3], pushes[3:]))
-    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate), heard)
+    return Lack(found.laws, Disturbance(force=force, moment=moment, rate=rate), heard, found.late)
 
 
 def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ...]:
-    """Return how the rate controller answers, and the laws that may have moved coefficients."""
+    """Return what there is to say of it; of laws, those that may have moved coefficients."""
     if lack is None:
         return ()
     moved = [
@@ -192,6 +204,9 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
         for part, those in parts.items()
         if those
     ]
+    if abs(lack.late) > LATE:
+        numbers = {"seconds": lack.late}
+        laws.insert(0, Finding(Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", numbers))
     return (*controller, *laws)
 
 

@@ -381,3 +381,28 @@ def test_a_push_that_is_known_moves_innovations_in_proportion(fitted) -> None:
     moved = once["position"] - here["position"]
     assert np.abs(moved[:, 0]).max() > 10.0 * np.abs(moved[:, 1]).max() > 0.0
     np.testing.assert_allclose(twice["position"] - here["position"], 2.0 * moved, atol=0.05)
+
+
+def test_samples_that_are_stamped_otherwise_move_their_own_innovations_in_proportion(
+    fitted,
+) -> None:
+    problem, predictor, point = fitted
+
+    def stamped(seconds: float) -> dict[str, np.ndarray]:
+        measured = dict(problem.segments.measured)
+        speeds = measured["rotor_speed"]
+        measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time + seconds)
+        other = replace(problem, segments=replace(problem.segments, measured=measured))
+        residuals = predictor._stepped(other, point).jacobian(other, point, []).residuals
+        return {name: np.asarray(rows) for name, rows in residuals.items()}
+
+    here = {n: np.asarray(r) for n, r in predictor.jacobian(problem, point, []).residuals.items()}
+    same, once, twice = stamped(0.0), stamped(0.002), stamped(0.004)
+    for name, rows in here.items():
+        np.testing.assert_allclose(same[name], rows, atol=1e-3)
+        if name != "rotor_speed":
+            continue
+        moved = once[name] - rows
+        assert np.abs(moved).max() > 0.1
+        bent = np.abs(twice[name] - rows - 2.0 * moved)  # where a rotor starts to change its speed
+        assert np.quantile(bent, 0.98) < 0.05 * np.abs(moved).max()

@@ -185,6 +185,9 @@ MADE = {
         {"roll": 1.05, "roll_error": 0.004},
         ("P", "roll"),
     ),
+    Code.ROTOR_SPEEDS_LATE: Finding(
+        Code.ROTOR_SPEEDS_LATE, "warning", "rotor speeds", {"seconds": 0.009}
+    ),
     Code.TERM_SHOWS: Finding(
         Code.TERM_SHOWS,
         "warning",

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
@@ -262,3 +263,27 @@ def test_the_intervals_of_what_another_controller_moves_hold_it(factor):
         assert parts.lack > parts.noise
     said = lack_found(examination.lack, examination.uncertainty)
     assert said[0].code is Code.CONTROLLER_ANSWERS
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.012])
+def test_rotor_speeds_that_were_filtered_are_told_and_in_the_intervals(seconds):
+    objective = problem({})
+    measured, flights = flown(problem({}, random=np.random.default_rng(5)), 0)
+    if seconds:
+        keep = np.exp(-1.0 / RATE / seconds)
+        speeds = np.array(measured["rotor_speed"].values)
+        speeds = lfilter([1.0 - keep], [1.0, -keep], speeds - speeds[0], axis=0) + speeds[0]
+        measured["rotor_speed"] = replace(measured["rotor_speed"], values=jnp.asarray(speeds))
+        for number, flight in enumerate(flights):
+            flight.series["rotor_speed"] = Series(flight.time, speeds[..., number])
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    fitted = making.fitted_of(objective, making.truth(objective))
+    lack = lack_of(fitted, flights)
+    if not seconds:
+        assert lack is None
+        return
+    assert lack.late == pytest.approx(keep / (1.0 - keep) / RATE, rel=0.3)  # a sampled filter's lag
+    acting = lack.acting_on(objective).segments.measured
+    moved = acting["rotor_speed"].time - measured["rotor_speed"].time
+    assert np.asarray(moved) == pytest.approx(-lack.late)
+    assert acting["body_rate"] is measured["body_rate"]
