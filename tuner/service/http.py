@@ -39,7 +39,6 @@ from tuner.service.shapes import (
     RecordingAnswer,
     accepted,
     full_job,
-    recording_answer,
 )
 from tuner.service.tables import FINISHED, EventRow, FileRow, JobRow, RecordingRow, State
 from tuner.service.upload import FIELD, Upload, receive
@@ -260,13 +259,13 @@ async def post_recording(request: Request, response: Response) -> RecordingAnswe
     """Store a recording and say what it holds; the same content is stored once."""
     row, is_new = await upload(request)
     response.status_code = 201 if is_new else 200
-    return recording_answer(row)
+    return RecordingAnswer.model_validate(row)
 
 
 @api.get("/recordings/{recording}", responses=NOT_FOUND)
 def get_recording(service: Served, recording: str) -> RecordingAnswer:
     """Return a stored recording, so that it need not be sent again."""
-    return recording_answer(recordings.recording(service.database, recording))
+    return RecordingAnswer.model_validate(recordings.recording(service.database, recording))
 
 
 @api.post("/jobs", status_code=202)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
-from tuner.service.tables import EventRow, FileRow, JobRow, RecordingRow, State
+from tuner.service.tables import EventRow, FileRow, JobRow, State
 from tuner.service.words import over_http
 
 API = "/api/v1"
@@ -40,7 +40,9 @@ class Problem(BaseModel):
 class RecordingAnswer(BaseModel):
     """A stored recording: its SHA-256, its name, and what `tune inspect` says of it."""
 
-    id: str
+    model_config = ConfigDict(from_attributes=True)
+
+    id: str = Field(validation_alias="sha256")
     name: str
     inspection: dict[str, JsonValue]
 
@@ -91,7 +93,9 @@ class JobAnswer(BaseModel):
 class FlightAnswer(BaseModel):
     """A recording of a job."""
 
-    id: str
+    model_config = ConfigDict(from_attributes=True)
+
+    id: str = Field(validation_alias="sha256")
     name: str
     holdout: bool
 
@@ -154,11 +158,6 @@ class Health(BaseModel):
     version: str
 
 
-def recording_answer(row: RecordingRow) -> RecordingAnswer:
-    """Return a recording as JSON."""
-    return RecordingAnswer(id=row.sha256, name=row.name, inspection=row.inspection)
-
-
 def links(row: JobRow, files: Sequence[str] = ()) -> Links:
     """Return where more of a job is found."""
     at = f"{API}/jobs/{row.id}"
@@ -182,10 +181,7 @@ def full_job(row: JobRow, events: Sequence[EventRow]) -> FullJobAnswer:
     answer = JobAnswer.model_validate(row)
     return FullJobAnswer(
         **dict(answer),
-        flights=[
-            FlightAnswer(id=flight.sha256, name=flight.name, holdout=flight.holdout)
-            for flight in row.flights
-        ],
+        flights=[FlightAnswer.model_validate(flight) for flight in row.flights],
         log=[over_http(str(e.content["text"])) for e in events if e.kind == "message"],
         links=links(row, answer.files),
     )
