@@ -13,7 +13,7 @@ import tuner
 from tests.tuner.service.conftest import submit, upload
 from tuner.cli import main
 from tuner.client import folder as folder_module
-from tuner.client.job_request import request_of
+from tuner.client.client import request_of
 from tuner.config import Options
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.result import Run
