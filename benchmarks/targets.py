@@ -13,11 +13,8 @@ from pathlib import Path
 
 from tuner.core.runtime import configure
 from tuner.core.shipped import EXPORT_TARGETS
-from tuner.exporters.draft import write
-from tuner.exporters.effective import pose_rmse
-from tuner.exporters.effective_of_run import kept_effective
-from tuner.exporters.refly import refly
-from tuner.exporters.target import Choices, target_of
+from tuner.exporters.effective import kept_effective, pose_rmse, refly
+from tuner.exporters.target import Choices, target_of, write
 from tuner.report.result_texts import rmse_in_words
 from tuner.result import PoseRmse, read_run
 

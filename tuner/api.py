@@ -334,10 +334,9 @@ def export(
         The file cannot be written.
     """
     configure()
-    from tuner.exporters.effective_of_run import kept_effective  # noqa: PLC0415
+    from tuner.exporters.effective import kept_effective, refly  # noqa: PLC0415
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
-    from tuner.exporters.refly import refly  # noqa: PLC0415
 
     given: dict[str, Any] = {
         "today": date.today(),  # the user's own day

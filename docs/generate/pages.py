@@ -16,8 +16,7 @@ from tuner.core.shipped import configs_folder
 from tuner.engine.cluster_file import ClusterFile
 from tuner.ground.plan import BenchFile
 from tuner.result import RunResult
-from tuner.vehicle import ControllerFile, VehicleFile
-from tuner.vehicle.coefficient_table import markdown_table
+from tuner.vehicle import COEFFICIENTS, Coefficient, ControllerFile, VehicleFile, Written
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -119,3 +118,30 @@ PAGES: Mapping[str, Callable[[], str]] = {
     SCHEMA: _schema,
     OPENAPI: openapi_file,
 }
+
+
+_HEADER = ("coefficient", "unit", "meaning", "vehicle file", "fitted", "SDF", "PX4", "source")
+
+
+def markdown_table() -> str:
+    """Return the coefficients of a vehicle file as a Markdown table, a row each."""
+    rows = [_HEADER, ("---",) * len(_HEADER), *map(_cells, COEFFICIENTS.values())]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _cells(row: Coefficient) -> tuple[str, ...]:
+    return (
+        f"`{row.name}`",
+        row.unit or "–",
+        row.meaning.replace("|", "\\|"),
+        f"`{'.'.join(part for part in row.place if part)}`",
+        "by default" if row.free else "if freed",
+        _entry(row, "sdf"),
+        _entry(row, "px4"),
+        row.source.replace("<", "`<").replace(">", ">`"),
+    )
+
+
+def _entry(row: Coefficient, target: str) -> str:
+    entry = row.exported_as.get(target)
+    return f"`{entry.tag}`" if isinstance(entry, Written) else "–"

@@ -33,9 +33,6 @@ def test_the_example_goes_from_recordings_to_a_simulator(tmp_path):
 
     model = (tmp_path / "quad_x.sdf").read_text()
     assert f"<motorConstant>{run.vehicle.aerodynamics.motor_constant:.12g}</motorConstant>" in model
-    hover = {
-        parameter.name: parameter.value for parameter in read_parameters(tmp_path / "quad_x.params")
-    }
-    assert 0.4 < hover["MPC_THR_HOVER"] < 0.7
+    assert 0.4 < read_parameters(tmp_path / "quad_x.params")["MPC_THR_HOVER"] < 0.7
     assert (tmp_path / "before.html").exists()
     assert read_vehicle(tmp_path / "run" / "best_fit.yaml") == run.vehicle

@@ -35,8 +35,8 @@ from tuner.core import shipped
 from tuner.core.errors import ConfigError, ExportError
 from tuner.core.yaml_section import build, section_of
 from tuner.evaluate.write import write_flights
-from tuner.exporters.draft import Draft, differences
-from tuner.exporters.target import Target, registered
+from tuner.exporters.simulators import registered
+from tuner.exporters.target import Draft, Target, differences
 from tuner.findings.findings import Finding, Worded, brief, one_line
 from tuner.options import FILES, Options
 from tuner.recordings.inspection import inspect_recordings

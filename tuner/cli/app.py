@@ -26,7 +26,7 @@ EXAMPLES = (
 
 def version() -> str:
     """Return the installed version."""
-    from tuner.core.versions import installed
+    from tuner.core.runtime import installed
 
     return installed()
 

@@ -46,15 +46,15 @@ def inspect(
     if suggest:
         from pathlib import Path
 
-        from tuner.core.recording_paths import find_flights
-        from tuner.recordings.suggestion import suggested_map
+        from tuner.core.disk import find_flights
+        from tuner.recordings.inspector import suggested_map
 
         for path in find_flights(flights):
             sys.stdout.write(suggested_map(Path(path)))
         return
     from dataclasses import asdict
 
-    from tuner.core.recording_paths import find_flights
+    from tuner.core.disk import find_flights
     from tuner.job.recording_verdict import in_words, verdict_of
     from tuner.recordings.inspection import as_json, inspect_recordings
 

@@ -12,9 +12,8 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from tuner.config.job import JobFile, Search, read_job
-from tuner.core.disk import exists
+from tuner.core.disk import exists, find_flights
 from tuner.core.errors import ConfigError, InputError, did_you_mean
-from tuner.core.recording_paths import find_flights
 from tuner.core.shipped import Kind, find_config
 from tuner.core.validation import config_error
 from tuner.core.yaml_section import build, section_of
@@ -22,8 +21,7 @@ from tuner.ground.bench_json import joint_prior
 from tuner.options import FILES, IN_JOB_FILE, Options
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.joint_prior import JointPrior
-from tuner.vehicle.values import check_names, with_values
-from tuner.vehicle.vehicle import VehicleFile, read_vehicle
+from tuner.vehicle.vehicle import VehicleFile, check_names, read_vehicle, with_values
 
 JOB_FILE = "tune.yaml"
 DEFAULT_NAME = "hovergames"

@@ -1,4 +1,4 @@
-"""The file system: what is written appears whole, and a refusal becomes one line for the user.
+"""The file system: what is written appears whole, a refusal becomes one line, globs become paths.
 
 Standard library only, so that a recording seen before is answered before anything heavy is loaded.
 """
@@ -6,12 +6,13 @@ Standard library only, so that a recording seen before is answered before anythi
 from __future__ import annotations
 
 import errno
+import glob
 import hashlib
 import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -229,3 +230,33 @@ def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
+    """Return the recordings that paths and quoted globs mean, each once, globs sorted.
+
+    Raises
+    ------
+    InputError
+        A path does not exist, a glob matches nothing, or nothing is named at all.
+    """
+    recordings: dict[Path, Path] = {}
+    for pattern in patterns:
+        path = Path(pattern).expanduser()
+        if exists(path):
+            matches = [path]
+        elif glob.has_magic(pattern):
+            matches = [Path(match) for match in sorted(glob.glob(str(path)))]  # noqa: PTH207
+            if not matches:
+                raise InputError(pattern, "matches no file", "check the folder and the pattern")
+        else:
+            raise InputError(path, "does not exist", "check the path")
+        for match in matches:
+            if match.is_dir() and not (match / "metadata.yaml").exists():
+                raise InputError(
+                    match, "is a folder", f"give the recordings in it: '{match}/*.bag'"
+                )
+            recordings.setdefault(match.resolve(), match)
+    if not recordings:
+        raise InputError("--flights", "names no recording", "give the recordings to use")
+    return tuple(recordings.values())

@@ -1,4 +1,4 @@
-"""Set-up of jax: threads, precision, compiled code.
+"""Set-up of jax: threads, precision, compiled code; versions that decide a run's numbers.
 
 A job's flights run as kernels of `lanes`, which have threads of their own. What XLA and NumPy's
 linear algebra compute in a job is small, and thread pools make it slower: they are turned off.
@@ -14,9 +14,29 @@ from __future__ import annotations
 import gc
 import logging
 import os
-from importlib.metadata import version
+import platform
+from importlib.metadata import PackageNotFoundError, version
 
 from tuner.core.disk import cache_folder
+
+PROGRAM = "multirotor-tune"
+LIBRARIES = ("jax", "jaxlib", "equinox", "numpy", "rosbags")
+
+
+def installed(distribution: str = PROGRAM) -> str:
+    """Return the installed version of a distribution, or ``not installed``."""
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this program and of the libraries that it computes with."""
+    return {"python": platform.python_version()} | {
+        name: installed(name) for name in (PROGRAM, *LIBRARIES)
+    }
+
 
 logger = logging.getLogger(__name__)
 

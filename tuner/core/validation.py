@@ -122,7 +122,9 @@ def complaint(detail: ErrorDetails) -> tuple[str, str]:
         case "missing":
             return f"key '{key}' is missing", "add it"
         case _:
-            return f"{key} is {_short(detail['input'])}", expected(detail["type"], context)
+            text = repr(detail["input"])
+            shown = text if len(text) <= 60 else text[:57] + "..."
+            return f"{key} is {shown}", expected(detail["type"], context)
 
 
 def expected(kind: str, context: Mapping[str, Any]) -> str:
@@ -157,8 +159,3 @@ def dotted(place: Place) -> str:
     for part in place:
         text += f"[{part}]" if isinstance(part, int) else f".{part}"
     return text.removeprefix(".")
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

@@ -176,19 +176,14 @@ def _faster(job: Job, fitted: Fitted) -> list[LogProposal]:
         thinned = eqx.tree_at(lambda o: o.segments, fitted.objective, coarser)
         losses.append(_loss(fitted, thinned))
     shrinks = dict.fromkeys(fitted.objective.space.names, share_at_twice_the_rate(losses))
-    return [
-        LogProposal(signal=signal, change="faster", rate=2.0 * _rate(job, signal), shrinks=shrinks)
-    ]
+    gaps = np.concatenate([np.diff(flight.series[signal].time) for flight in job.fitted])
+    rate = 2.0 * float(1.0 / np.median(gaps))
+    return [LogProposal(signal=signal, change="faster", rate=rate, shrinks=shrinks)]
 
 
 def _loss(fitted: Fitted, objective: Objective) -> float:
     sums = objective.sums(fitted.point, fitted.criterion, derivatives=False)
     return float(np.sum(np.asarray(sums.loss)))
-
-
-def _rate(job: Job, signal: str) -> float:
-    gaps = [np.diff(flight.series[signal].time) for flight in job.fitted]
-    return float(1.0 / np.median(np.concatenate(gaps)))
 
 
 def _thinned(recording: Recording, signal: str, every: int) -> Recording:

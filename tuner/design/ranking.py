@@ -1,30 +1,272 @@
 """Which further flight would narrow the intervals of what is not known well yet the most.
 
-Every candidate is simulated with the fitted coefficients, differentiated by all of them, and
-weighed with the noise that the recorded flights had in each channel; its information is added to
-theirs. The measures are those of experiment design: the D-optimal flight shrinks the volume of the
-confidence ellipsoid the most, the A-optimal one the sum of squared relative errors (Goodwin and
-Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 1977).
+Every candidate inside an arena is simulated with the fitted coefficients, differentiated by all of
+them, and weighed with the noise that the recorded flights had in each channel; its information is
+added to theirs. The measures are those of experiment design: the D-optimal flight shrinks the
+volume of the confidence ellipsoid the most, the A-optimal one the sum of squared relative errors
+(Goodwin and Payne, "Dynamic System Identification: Experiment Design and Data Analysis", 1977).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_jax.control.position import ReferencePoint
+from sim_jax.inlet import ReferenceInlet
+from sim_jax.state import hover
+from sim_jax.trajectory import Shape, shapes
+from sim_jax.vector import Vec3
+from tuner.config import TrajectorySettings
+from tuner.core.errors import InputError
 from tuner.core.numerics import log_determinant, scaled_inverse, unit_diagonal
-from tuner.design.candidates import Arena, Candidate, candidate_point, candidate_problem, candidates
 from tuner.design.proposals import Proposal, Proposals
-from tuner.objective.criterion import Criterion
+from tuner.objective.criterion import Criterion, Point
 from tuner.objective.information import information_from_jacobian
 from tuner.objective.normal import Objective
+from tuner.objective.segments import Measured, Segments
+from tuner.objective.trajectory import Published, at_speed, published
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.examination import Examination
 from tuner.uncertainty.verdict import Verdict
 from tuner.vehicle import COEFFICIENTS
+
+CLEARANCE = 0.5
+"""Distance that a reference keeps from the walls, from which a vehicle may stray, m."""
+LEVEL = 1.0
+"""Height above the ground at which the publisher's shapes are flown, m."""
+SPEEDS = (1.5, 3.0, 4.5, 6.0)
+"""Peak speeds of the reference, m/s."""
+YAW_RATES = (1.0, 2.0, 4.0, 6.0)
+"""Yaw rates of the spins, rad/s."""
+SMALLEST = 0.5
+"""Radius of a shape below which it is not worth flying, m."""
+HARDEST = 9.0
+"""Acceleration of the reference beyond which it is not proposed, some 45° of tilt; m/s²."""
+SAMPLE_RATE = 100.0
+"""Highest rate at which candidates are compared, Hz; their weights stand for more samples."""
+
+
+@dataclass(frozen=True)
+class Arena:
+    """A box about the origin, from wall to wall along x and y and from the ground up; m."""
+
+    x: float
+    y: float
+    z: float
+
+    @staticmethod
+    def of(numbers: Sequence[float]) -> Arena:
+        """Return an arena from its three lengths.
+
+        Raises
+        ------
+        InputError
+            They are not three, or too small to fly in.
+        """
+        if len(numbers) != 3:
+            raise InputError("--arena", "needs three lengths in m", "write it as 8,6,3")
+        arena = Arena(*numbers)
+        smallest = 2 * CLEARANCE + 2 * SMALLEST
+        if min(arena.x, arena.y) < smallest or arena.z < LEVEL + CLEARANCE:
+            raise InputError(
+                "--arena",
+                f"{arena.x:g} by {arena.y:g} by {arena.z:g} m is too small to fly in",
+                f"give at least {smallest:g},{smallest:g},{LEVEL + CLEARANCE:g}",
+            )
+        return arena
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A flight that could be flown, and its name: shape, size and speed in words."""
+
+    name: str
+    trajectory: TrajectorySettings
+
+
+def candidates(arena: Arena) -> tuple[Candidate, ...]:
+    """Return every shape that moves in two sizes and several speeds, and the yaw spins."""
+    flights: list[Candidate] = []
+    for shape in shapes().values():
+        flights += [] if shape.spins else _moving(shape, arena)
+        for rate in YAW_RATES if shape.spins else ():
+            settings = TrajectorySettings(name=shape.name, yaw_rate=rate)
+            flights.append(Candidate(f"{_noun(shape)} at {rate:g} rad/s", settings))
+    return tuple(flights)
+
+
+def _moving(shape: type[Shape], arena: Arena) -> Iterator[Candidate]:
+    walls = zip((arena.x, arena.y), shape.extent, strict=True)
+    widest = [(wall / 2 - CLEARANCE) / extent for wall, extent in walls if extent]
+    for share in (1.0, 0.5) if widest and shape.peak_speed else ():
+        radius = max(min(widest) * share, SMALLEST)
+        settings = TrajectorySettings(name=shape.name, radius=round(radius, 2))
+        for speed in SPEEDS:
+            if shape.peak_acceleration * speed**2 / radius <= HARDEST:
+                name = f"{_noun(shape)} of {settings.radius:g} m radius at {speed:g} m/s"
+                yield Candidate(name, at_speed(settings, speed))
+
+
+def _noun(shape: type[Shape]) -> str:
+    return f"a {shape.name.replace('_', ' ')}"
+
+
+def candidate_problem(
+    objective: Objective,
+    flights: Sequence[Candidate],
+    *,
+    seconds: float,
+    spin_channels: Sequence[str],
+) -> Objective:
+    """Return the problem with candidates in the place of recordings, whose values are zero.
+
+    Parameters
+    ----------
+    objective
+        The problem of the recorded flights, which are whole.
+    flights
+        The candidates.
+    seconds
+        How long each lasts.
+    spin_channels
+        Channels that a yaw spin is compared by.
+    """
+    recorded, schedule = objective.segments, objective.schedule
+    references = [
+        published(
+            flight.trajectory,
+            duration=seconds,
+            control_rate=schedule.position_control_rate,
+        )
+        for flight in flights
+    ]
+    starts: Vec3 = jax.tree.map(lambda *places: np.stack(places), *(r.start for r in references))
+    spins = np.array([shapes()[flight.trajectory.name].spins for flight in flights])
+    count = len(flights)
+    segments = Segments(
+        inlet=_laid(references, recorded),
+        start=jax.tree.map(
+            lambda leaf: np.broadcast_to(np.asarray(leaf, float), (count,)),
+            eqx.filter_jit(hover)(objective.model.vehicle, starts),
+        ),
+        measured={
+            name: _sampled(
+                measured,
+                silent=spins & (name not in spin_channels),
+                seconds=seconds,
+                recorded=_seconds(objective),
+            )
+            for name, measured in recorded.measured.items()
+        },
+        flight=np.arange(count),
+        resting=None if recorded.resting is None else np.ones(count, bool),
+        log_voltage=_filled(recorded.log_voltage, count, np.nan),
+        wander=_filled(recorded.wander, count, 0.0),
+        freedom=_filled(recorded.freedom, count, 0.0),
+        freed=recorded.freed,
+    )
+    return replace(
+        objective,
+        segments=segments,
+        samples=round(seconds * schedule.log_rate),
+        multiplicity=None,
+    )
+
+
+def _laid(references: Sequence[Published], recorded: Segments) -> ReferenceInlet:
+    """Return the references side by side, the last points held."""
+    assert isinstance(recorded.inlet, ReferenceInlet)
+    inlets = [reference.inlet for reference in references]
+    length = max(len(reference.lap) - 1 for reference in references)  # none acts at the end
+
+    def beside(*rows: Array) -> Array:
+        edges = [
+            np.pad(np.asarray(row)[:length], (0, max(length - len(row), 0)), mode="edge")
+            for row in rows
+        ]
+        return np.stack(edges, axis=-1)
+
+    points: ReferencePoint = jax.tree.map(beside, *(inlet.points for inlet in inlets))
+    held = recorded.inlet.level_held
+    return ReferenceInlet(
+        points,
+        spins=np.stack([inlet.spins for inlet in inlets]),
+        yaw_rate=np.stack([inlet.yaw_rate for inlet in inlets]),
+        level_held=None if held is None else np.zeros(len(inlets), bool),
+    )
+
+
+def _filled(recorded: Any, count: int, value: float) -> Array | None:
+    """Return rows (n, C) of one value where the recorded flights have rows (n, F)."""
+    return None if recorded is None else np.full((*recorded.shape[:-1], count), value)
+
+
+def _seconds(objective: Objective) -> Array:
+    """Return (F,) s that each segment was recorded for."""
+    ends = [np.asarray(m.time).max(axis=0) for m in objective.segments.measured.values()]
+    return np.asarray(np.maximum(np.max(ends, axis=0), 1e-9))
+
+
+def _sampled(
+    measured: Measured,
+    *,
+    silent: NDArray[np.bool_],
+    seconds: float,
+    recorded: Array,
+) -> Measured:
+    """Return one channel of every candidate, as often and as precisely recorded as in the best.
+
+    Parameters
+    ----------
+    measured
+        The channel of the recorded segments.
+    silent
+        (C,) for which candidates it is not compared.
+    seconds, recorded
+        How long a candidate lasts, and (F,) how long each segment was recorded, in s.
+    """
+    weight = np.asarray(measured.weight)
+    rows = int(seconds * SAMPLE_RATE) - 1
+    recorded_rate = (weight > 0).sum(axis=0) / recorded
+    equivalent = np.where(
+        weight.max(axis=0) > 0, weight.max(axis=0) * np.sqrt(recorded_rate / SAMPLE_RATE), 0.0
+    )
+    segments = len(silent)
+    time = np.repeat(np.arange(1, rows + 1)[:, None] / SAMPLE_RATE, segments, axis=1)
+    values = np.zeros((rows, np.asarray(measured.values).shape[1], segments))
+    if values.shape[1] > weight.shape[1]:
+        values[:, 0] = 1.0  # an attitude
+    constant = np.where(silent, 0.0, equivalent.max(axis=1)[:, None])
+    weights = np.broadcast_to(constant, (rows, *constant.shape))
+    return Measured(time=np.asarray(time), values=np.asarray(values), weight=np.asarray(weights))
+
+
+def candidate_point(
+    point: Point, criterion: Criterion, objective: Objective, *, seconds: float
+) -> tuple[Point, Criterion]:
+    """Return point and criterion of candidates of so many s, weighed as most recorded flights."""
+    count = objective.flights
+    offsets = np.zeros((np.asarray(point.offsets).shape[0], count))
+    reference_offset = np.zeros((np.asarray(criterion.reference_offset).shape[0], count))
+    scale = {
+        name: np.full(count, float(np.median(np.asarray(of_segment))))
+        for name, of_segment in criterion.scale.items()
+    }
+    return Point(point.coefficients, np.asarray(offsets)), Criterion(
+        horizon=np.asarray(round(seconds * objective.schedule.log_rate)),
+        scale=scale,
+        reference_offset=np.asarray(reference_offset),
+        huber=np.asarray(np.inf),
+        prior=criterion.prior,
+    )
+
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,9 @@ import numpy as np
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ExportError
-from tuner.exporters.draft import read_file
-from tuner.exporters.sdf.composite import Array, Inertial, together
-from tuner.exporters.sdf.includes import assembled
-from tuner.exporters.sdf.model import Model, inertials, read_model
-from tuner.exporters.sdf.spans import Element, number, rendered
+from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
+from tuner.exporters.sdf.spans import Element, assembled, number, rendered
+from tuner.exporters.target import read_file
 from tuner.exporters.targets.px4 import outside_range, read_parameters
 from tuner.result import Run
 from tuner.vehicle import values_of
@@ -91,7 +89,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     rotors = _rotors(model)
     if not rotors:
         raise ExportError(path, "has no motor with a link and a number", "give each motor its own")
-    given = {} if params is None else {p.name: p.value for p in read_parameters(params)}
+    given = {} if params is None else read_parameters(params)
     whole = together([body for _, body in inertials(model)])
     bodies = [*_of_bodies(model)]
     hover = [*_of_hover(whole, rotors, _speeds(model, rotors, given))]
@@ -99,7 +97,7 @@ def audit(path: Path, params: Path | None = None, run: Run | None = None) -> Aud
     if not bodies and not any("times the weight" in fault for fault in hover):
         faults += _of_whole(whole, rotors)  # which else follows from those
     if params is not None:
-        faults += outside_range(read_parameters(params))
+        faults += outside_range(given)
         faults += _of_parameters(given, whole, rotors, _speeds(model, rotors, given))
     compared = () if run is None else tuple(_against(run, whole, rotors))
     return Audited(path, whole.mass, tuple(dict.fromkeys(faults)), compared)

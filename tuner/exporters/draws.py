@@ -19,7 +19,7 @@ from tuner.core.disk import inside, make_folder, write_text
 from tuner.core.errors import ConfigError, ExportError, InputError
 from tuner.core.files import csv_text
 from tuner.core.numerics import symmetric_eigen
-from tuner.exporters.draft import Draft, write
+from tuner.exporters.target import Draft, write
 from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
 from tuner.result import Run
 from tuner.uncertainty.sensitivity_json import Knowledge

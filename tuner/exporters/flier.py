@@ -45,15 +45,12 @@ class Body(Protocol):
 
     def begin(self, state: Array, rotor_speed: Array) -> None:
         """Set the state (13,) and the rotor speeds in the vehicle file's rad/s."""
-        ...
 
     def step(self, asked: Array) -> Array:
         """Advance by a physics step in which so many rad/s are asked of the rotors; the state."""
-        ...
 
     def rotor_speed(self) -> Array:
         """Return the rotor speeds in the vehicle file's rad/s."""
-        ...
 
 
 def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
@@ -92,7 +89,10 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
         blocks = samples * schedule.blocks_per_sample
         count = int(np.size(state.crash_time))
         bodies = [make(schedule.step) for _ in range(count)]
-        moving, turning = np.asarray(_rows(state.motion)), np.stack(state.rotor_speed)
+        begin = state.motion
+        parts = (begin.position, begin.velocity, begin.attitude, begin.body_rate)
+        moving = np.concatenate([np.asarray(part.stacked()) for part in parts])
+        turning = np.stack(state.rotor_speed)
         for number, body in enumerate(bodies):
             body.begin(moving[:, number], turning[:, number])
         crash_time = np.full(count, np.inf)
@@ -123,18 +123,6 @@ def flier(make: Callable[[float], Body]) -> Callable[..., Flown]:
         return Flown(stacked, dict.fromkeys(channels), crash_time)
 
     return fly
-
-
-def _rows(motion: Motion) -> Any:
-    """Return a motion as rows (13, F)."""
-    return jnp.concatenate(
-        [
-            motion.position.stacked(),
-            motion.velocity.stacked(),
-            motion.attitude.stacked(),
-            motion.body_rate.stacked(),
-        ]
-    )
 
 
 @eqx.filter_jit

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 
 from tuner.core.errors import InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
-from tuner.exporters.draft import Draft, Gate
-from tuner.exporters.hover import hover_command, thrust_to_weight
+from tuner.exporters.simulators import hover_command, thrust_to_weight
+from tuner.exporters.target import Draft, Gate
 from tuner.result import Run
 from tuner.vehicle import VehicleFile
 

@@ -1,4 +1,4 @@
-"""What each simulator computes of a vehicle, written down once for each, with source and version.
+"""What rotors give, and what each simulator computes of a vehicle, with source and version.
 
 A simulator is told apart from the physics that is fitted by the coefficients that it flies at a
 value of its own (`Simulator.entry`) and by its laws (`Simulator.laws`). Both together give the
@@ -7,18 +7,13 @@ vehicle that it flies, which the project's own simulation flies for it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from statistics import fmean
+from types import MappingProxyType
 
 from sim_jax.constants import GRAVITY
-from tuner.exporters.hover import (
-    full_thrust,
-    hover_command,
-    hover_speed,
-    rotor_speed,
-    thrust_at,
-)
 from tuner.vehicle import (
     COEFFICIENTS,
     REGISTRY,
@@ -30,6 +25,52 @@ from tuner.vehicle import (
     with_values,
 )
 from tuner.vehicle.registry import NO_LOSS
+
+
+def rotor_speed(vehicle: VehicleFile, command: float) -> float:
+    """Return the steady rotor speed in rad/s at a command 0..1."""
+    motor = vehicle.motor
+    shifted = command + motor.input_offset
+    speed = shifted * (motor.input_scaling + motor.quadratic * shifted) + motor.zero_position_armed
+    return min(speed, motor.max_rotor_velocity)
+
+
+def thrust_at(vehicle: VehicleFile, speed: float) -> float:
+    """Return one rotor's thrust in N at a rotor speed in rad/s, in still air."""
+    aerodynamics = vehicle.aerodynamics
+    return aerodynamics.motor_constant * (
+        speed if aerodynamics.thrust_law == "linear" else speed * speed
+    )
+
+
+def full_thrust(vehicle: VehicleFile) -> float:
+    """Return one rotor's thrust in N at full command."""
+    return thrust_at(vehicle, rotor_speed(vehicle, 1.0))
+
+
+def thrust_to_weight(vehicle: VehicleFile) -> float:
+    """Return the thrust of all rotors at full command over the weight."""
+    return len(vehicle.rotors) * full_thrust(vehicle) / (vehicle.mass * GRAVITY)
+
+
+def hover_speed(vehicle: VehicleFile) -> float:
+    """Return the rotor speed in rad/s at which the rotors carry the vehicle."""
+    aerodynamics = vehicle.aerodynamics
+    squared = vehicle.mass * GRAVITY / len(vehicle.rotors) / aerodynamics.motor_constant
+    return squared if aerodynamics.thrust_law == "linear" else math.sqrt(squared)
+
+
+def hover_command(vehicle: VehicleFile) -> float | None:
+    """Return the command 0..1 at which the vehicle hovers; None if full command does not do."""
+    wanted = hover_speed(vehicle)
+    low, high = 0.0, 1.0
+    if not rotor_speed(vehicle, low) < wanted < rotor_speed(vehicle, high):
+        return None
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if rotor_speed(vehicle, middle) < wanted else (low, middle)
+    return 0.5 * (low + high)
+
 
 Entry = Written | NotCarried
 Laws = Callable[[VehicleFile], VehicleFile]
@@ -219,10 +260,6 @@ def linear_at_hover(vehicle: VehicleFile) -> VehicleFile:
     )
 
 
-def _sih_laws(vehicle: VehicleFile) -> VehicleFile:
-    return _one_damping(_same_drag(_mean_lag(linear_in(vehicle, idle=False))))
-
-
 FASTEST_GZ = 1000.0
 """rad/s up to which PX4's bridge to gz-sim takes rotor speeds."""
 
@@ -268,7 +305,10 @@ def _between_whole_speeds(vehicle: VehicleFile) -> VehicleFile:
 # simulators
 
 
-def _registered(target: str, other: Mapping[str, NotCarried]) -> Callable[..., Entry | None]:
+def registered(
+    target: str, other: Mapping[str, NotCarried] = MappingProxyType({})
+) -> Callable[..., Entry | None]:
+    """Return the `Target.entry` of a target whose entries stand in the registry, but for some."""
     return lambda row: other.get(row.name) or row.exported_as.get(target)
 
 
@@ -278,7 +318,7 @@ GAZEBO_CLASSIC = Simulator(
     version="PX4-SITL_gazebo-classic 807b67bb",
     source="src/gazebo_motor_model.cpp, include/gazebo_mavlink_interface.h",
     deviations=("thrust falls by the length of the axial airspeed over 25 m/s",),
-    entry=_registered("sdf", {}),
+    entry=registered("sdf"),
 )
 GZ_SIM = Simulator(
     name="gz-sim",
@@ -291,7 +331,7 @@ GZ_SIM = Simulator(
         "rolling moments add up whichever way rotors turn: none is written",
         "commands are mapped by a line from SIM_GZ_EC_MIN to SIM_GZ_EC_MAX, whole rad/s up to 1000",
     ),
-    entry=_registered(
+    entry=registered(
         "sdf",
         {
             "max_relative_airspeed": NotCarried(
@@ -316,8 +356,8 @@ SIH = Simulator(
         "one drag in all directions, linear in the velocity and at the centre of mass",
         "one damping of rotation about all axes",
     ),
-    entry=_registered("px4", {}),
-    laws=_sih_laws,
+    entry=registered("px4"),
+    laws=lambda vehicle: _one_damping(_same_drag(_mean_lag(linear_in(vehicle, idle=False)))),
     free=("linear_drag_x", "linear_drag_y", "linear_drag_z"),
     ties=(("linear_drag_x", "linear_drag_y", "linear_drag_z"),),
     fixed=("input_scaling", "zero_position_armed", "time_constant_up", "time_constant_down"),
@@ -371,22 +411,6 @@ def _about_centre(vehicle: VehicleFile) -> VehicleFile:
     return vehicle.replace(effects=effects, rotors=rotors)
 
 
-def _mujoco_laws(vehicle: VehicleFile) -> VehicleFile:
-    return linear_in(_mean_lag(_about_centre(vehicle)), idle=True)
-
-
-def _rotorpy_laws(vehicle: VehicleFile) -> VehicleFile:
-    return _mean_lag(_about_centre(vehicle))
-
-
-def _isaac_laws(vehicle: VehicleFile) -> VehicleFile:
-    return _one_damping(_same_drag(_about_centre(vehicle)))
-
-
-def _dragging_at_hover(vehicle: VehicleFile) -> VehicleFile:
-    return _dragging(vehicle, drag_at_hover(vehicle))
-
-
 def _square_x(vehicle: VehicleFile) -> VehicleFile:
     """Return a vehicle whose rotors sit in a square about the centre of mass, at its height."""
     arm = fmean(abs(rotor.position[axis]) for rotor in vehicle.rotors for axis in (0, 1))
@@ -423,7 +447,7 @@ MUJOCO = Simulator(
         rotor_drag_ratio_y="biasprm",
         **_CENTRE,
     ),
-    laws=_mujoco_laws,
+    laws=lambda vehicle: linear_in(_mean_lag(_about_centre(vehicle)), idle=True),
     fixed=(*_MOTORS, "time_constant_up", "time_constant_down"),
 )
 ROTORPY = Simulator(
@@ -444,7 +468,7 @@ ROTORPY = Simulator(
         flapping_moment_coefficient="k_flap",
         **_CENTRE,
     ),
-    laws=_rotorpy_laws,
+    laws=lambda vehicle: _mean_lag(_about_centre(vehicle)),
     ties=(("time_constant_up", "time_constant_down"),),
 )
 DRONE_MODELS = Simulator(
@@ -467,7 +491,7 @@ DRONE_MODELS = Simulator(
         rotor_drag_coefficient="drag_matrix",
         rotor_inertia="prop_inertia",
     ),
-    laws=lambda vehicle: _square_x(_dragging_at_hover(vehicle)),
+    laws=lambda vehicle: _square_x(_dragging(vehicle, drag_at_hover(vehicle))),
     free=("linear_drag_x", "linear_drag_y"),
 )
 ISAAC_LAB = Simulator(
@@ -490,7 +514,7 @@ ISAAC_LAB = Simulator(
         rotor_drag_coefficient="linear_damping",
         **_CENTRE,
     ),
-    laws=_isaac_laws,
+    laws=lambda vehicle: _one_damping(_same_drag(_about_centre(vehicle))),
     free=_LINEAR,
     ties=(_LINEAR,),
 )

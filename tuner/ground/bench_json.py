@@ -1,20 +1,191 @@
-"""The content of ``bench.json``: what the experiments gave, for a fit's prior and in sentences."""
+"""Measurements combined by generalised least squares: as a prior, as ``bench.json``, in words."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, ConfigDict, PlainSerializer
+from scipy.special import chdtrc  # scipy.stats takes a second to import
 
 from tuner.core.errors import InputError
 from tuner.core.files import Part, ResultFile
+from tuner.core.numerics import scaled_inverse, scaled_solve, symmetric_eigen
 from tuner.core.phrases import listed
-from tuner.ground.combination import DISAGREE, Combination, Conflict
-from tuner.ground.measurement import Curve, Measurement, Remark, error_of, value_of
+from tuner.ground.measurement import Array, Curve, Measurement, Remark, error_of, value_of
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.joint_prior import JointPrior
+
+CONFLICT = 3.0
+"""Standard errors apart beyond which two measurements of one number contradict each other."""
+UNKNOWN = 1e-11
+"""Share of the best-known direction's information below which a direction is not measured."""
+DISAGREE = 0.01
+"""p-value below which the experiments are said to disagree."""
+SMALL = 1e-6
+"""Share of a coefficient that may lie in unmeasured directions, for rounding."""
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """An experiment that contradicts what all others say of the same number.
+
+    Attributes
+    ----------
+    experiment
+        Its name.
+    names
+        The coefficients that its number depends on.
+    measured, expected
+        Its number, in scaled coordinates, and what the others predict.
+    deviation
+        Their difference in standard errors.
+    """
+
+    experiment: str
+    names: tuple[str, ...]
+    measured: float
+    expected: float
+    deviation: float
+
+
+Numbers = Annotated[
+    NDArray[np.float64], BeforeValidator(np.asarray), PlainSerializer(lambda array: array.tolist())
+]
+
+
+class Combination(Part):
+    """What all measurements together say.
+
+    Attributes
+    ----------
+    names
+        The N coefficients that some measurement speaks of.
+    scaled
+        (N,) best scaled coordinates (logarithms, where the registry says so).
+    information
+        (N, N) inverse covariance, singular where a combination of coefficients was not measured.
+    covariance
+        (N, N) in the directions that were measured, zero in the others.
+    chi_square, degrees_of_freedom, p_value
+        Of the hypothesis that all agree; a p-value of 1 where nothing was measured twice.
+    conflicts
+        Experiments that the others contradict, the worst first.
+    """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
+
+    names: tuple[str, ...]
+    scaled: Numbers
+    information: Numbers
+    covariance: Numbers
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float
+    conflicts: tuple[Conflict, ...]
+
+    @property
+    def determined(self) -> NDArray[np.bool_]:
+        """(N,) whether the measurements alone determine each coefficient."""
+        _, unmeasured = _inverse(self.information, self.names)
+        return np.asarray((unmeasured**2).sum(axis=1) < SMALL)
+
+
+def combine(measurements: Sequence[Measurement], known: Mapping[str, float]) -> Combination:
+    """Return the generalised least squares estimate (Gauss-Markov) of all coefficients.
+
+    Of what was not measured (a torque stand without a thrust stand) the estimate moves as little
+    from the vehicle file as it can, each coefficient in units of its prior's standard deviation.
+
+    Parameters
+    ----------
+    measurements
+        At least one.
+    known
+        Coefficient -> scaled coordinate in the vehicle file.
+    """
+    names = tuple(dict.fromkeys(n for measurement in measurements for n in measurement.names))
+    start = np.array([known[name] for name in names])
+    information, pull = _normal_equations(measurements, names, start)
+    covariance, unmeasured = _inverse(information, names)
+    scaled = start + covariance @ pull
+    numbers = sum(len(measurement.value) for measurement in measurements)
+    freedom = numbers - (len(names) - unmeasured.shape[1])
+    residuals = [(m, m.value - _design(m, names) @ scaled) for m in measurements]
+    chi_square = sum(float(off @ scaled_solve(m.covariance, off)) for m, off in residuals)
+    return Combination(
+        names=names,
+        scaled=scaled,
+        information=information,
+        covariance=covariance,
+        chi_square=chi_square,
+        degrees_of_freedom=freedom,
+        p_value=float(chdtrc(freedom, chi_square)) if freedom > 0 else 1.0,
+        conflicts=_conflicts(measurements, names, start),
+    )
+
+
+def _inverse(information: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    """Return the covariance of what was measured, and (N, U) the directions that were not.
+
+    The directions are those of coordinates in units of the default priors' standard deviations.
+    """
+    unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
+    values, vectors = symmetric_eigen(information * np.outer(unit, unit))
+    measured = values > UNKNOWN * values.max(initial=1e-300)
+    inverse = (vectors[:, measured] / values[measured]) @ vectors[:, measured].T
+    return inverse * np.outer(unit, unit), vectors[:, ~measured]
+
+
+def _design(measurement: Measurement, names: Sequence[str]) -> Array:
+    return np.array([[row.get(name, 0.0) for name in names] for row in measurement.rows])
+
+
+def _normal_equations(
+    measurements: Sequence[Measurement], names: Sequence[str], start: Array
+) -> tuple[Array, Array]:
+    information, pull = np.zeros((len(names), len(names))), np.zeros(len(names))
+    for measurement in measurements:
+        design = _design(measurement, names)
+        weight = scaled_inverse(measurement.covariance)
+        information += design.T @ weight @ design
+        pull += design.T @ weight @ (measurement.value - design @ start)
+    return information, pull
+
+
+def _conflicts(
+    measurements: Sequence[Measurement], names: Sequence[str], start: Array
+) -> tuple[Conflict, ...]:
+    """Return the experiments that all others together contradict, each left out in turn."""
+    conflicts = []
+    for left_out in measurements:
+        others = [m for m in measurements if m is not left_out]
+        if not others:
+            continue
+        information, pull = _normal_equations(others, names, start)
+        covariance, unmeasured = _inverse(information, names)
+        unit = np.array([COEFFICIENTS[name].prior_sd for name in names])
+        predicted = start + covariance @ pull
+        for row, value, variance in zip(
+            _design(left_out, names), left_out.value, np.diag(left_out.covariance), strict=True
+        ):
+            reach = np.abs(unmeasured.T @ (row * unit)).max(initial=0.0)
+            if reach > SMALL * np.linalg.norm(row * unit):
+                continue  # the others say nothing of this number
+            expected = float(row @ predicted)
+            error = float(np.sqrt(variance + row @ covariance @ row))
+            deviation = (float(value) - expected) / error
+            if abs(deviation) > CONFLICT:
+                members = tuple(n for n, factor in zip(names, row, strict=True) if factor)
+                conflicts.append(
+                    Conflict(left_out.experiment, members, float(value), expected, deviation)
+                )
+    return tuple(sorted(conflicts, key=lambda conflict: -abs(conflict.deviation)))
 
 
 class ExperimentRecord(Part):
@@ -28,48 +199,29 @@ class ExperimentRecord(Part):
     curves: list[Curve]
 
 
-class BenchRecord(ResultFile):
-    """The content of ``bench.json``.
-
-    Attributes
-    ----------
-    names
-        The N coefficients that were measured.
-    scaled
-        Their N scaled coordinates (logarithms, where the registry says so).
-    information, covariance
-        (N, N) of those, see `tuner.ground.combination.Combination`.
-    chi_square, degrees_of_freedom, p_value
-        Of the hypothesis that all experiments agree.
-    conflicts, experiments
-        In detail.
-    """
+class BenchRecord(Combination, ResultFile):
+    """The content of ``bench.json``: what the experiments say together, and each in detail."""
 
     FILE = "bench.json"
 
-    names: list[str]
-    scaled: list[float]
-    information: list[list[float]]
-    covariance: list[list[float]]
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float
-    conflicts: list[Conflict]
     experiments: list[ExperimentRecord]
 
 
 def bench_record(combination: Combination, measurements: Sequence[Measurement]) -> BenchRecord:
     """Return what to write."""
     return BenchRecord(
-        names=list(combination.names),
-        scaled=combination.scaled.tolist(),
-        information=combination.information.tolist(),
-        covariance=combination.covariance.tolist(),
-        chi_square=combination.chi_square,
-        degrees_of_freedom=combination.degrees_of_freedom,
-        p_value=combination.p_value,
-        conflicts=list(combination.conflicts),
-        experiments=[_experiment(measurement) for measurement in measurements],
+        **dict(combination),
+        experiments=[
+            ExperimentRecord(
+                name=each.experiment,
+                rows=[_plain(row) for row in each.rows],
+                value=each.value.tolist(),
+                std_error=np.sqrt(np.diag(each.covariance)).tolist(),
+                remarks=[Remark(remark.code, _plain(remark.numbers)) for remark in each.remarks],
+                curves=list(each.curves),
+            )
+            for each in measurements
+        ],
     )
 
 
@@ -82,24 +234,12 @@ def joint_prior(folder: Path) -> JointPrior:
         The folder is not that of `tune bench`, or names an unknown coefficient.
     """
     record = BenchRecord.read(folder, "give --bench the result folder of tune bench")
-    count = len(record.names)
-    information, mean = np.array(record.information, float), np.array(record.scaled, float)
+    count, information, mean = len(record.names), record.information, record.scaled
     whole = information.shape == (count, count) and mean.shape == (count,) and count > 0
     known = all(name in COEFFICIENTS for name in record.names)
     if not (whole and known and np.isfinite(information).all() and np.isfinite(mean).all()):
         raise InputError(folder / BenchRecord.FILE, "was edited", "run tune bench again")
-    return JointPrior(tuple(record.names), mean, information)
-
-
-def _experiment(measurement: Measurement) -> ExperimentRecord:
-    return ExperimentRecord(
-        name=measurement.experiment,
-        rows=[_plain(row) for row in measurement.rows],
-        value=measurement.value.tolist(),
-        std_error=np.sqrt(np.diag(measurement.covariance)).tolist(),
-        remarks=[Remark(remark.code, _plain(remark.numbers)) for remark in measurement.remarks],
-        curves=list(measurement.curves),
-    )
+    return JointPrior(record.names, mean, information)
 
 
 def _plain(numbers: Mapping[str, float]) -> dict[str, float]:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
-from tuner.ground.laws import bifilar_inertia
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
 
 FEWEST_SWINGS = 5.0
@@ -18,6 +18,17 @@ LARGE_SWING = math.radians(20)
 """Amplitude beyond which the law's small angles are wrong by more than the correction knows."""
 BEAT = 0.15
 """Share of the amplitude that a second frequency may have before the swing is called a beat."""
+
+
+def bifilar_inertia(
+    frequency: float, *, mass: float, wire_distance: float, wire_length: float
+) -> float:
+    """Return the moment of inertia, kg m², about the vertical axis of a bifilar pendulum.
+
+    I = m g d² / (16 π² h f²) (Eq. 3.1), for swings so small that sin θ is θ, with f the undamped
+    frequency in Hz, m in kg, the distance d between the wires and their length h in m.
+    """
+    return mass * GRAVITY * wire_distance**2 / (16 * math.pi**2 * wire_length * frequency**2)
 
 
 def bifilar(

@@ -30,9 +30,9 @@ from tuner.ground.plan import (
 )
 from tuner.ground.propeller import propeller, read_static_table
 from tuner.ground.rig_data import (
+    TABLES,
     angle_of_attitude,
     attitude_of,
-    is_table,
     open_table,
     read_columns,
     steady_flight,
@@ -120,7 +120,7 @@ def _read(
 
 def _bifilar(name: str, given: Bifilar, vehicle: VehicleFile, folder: Path) -> Measurement:
     path = folder / Path(given.recording).expanduser()
-    if not is_table(path):
+    if path.suffix.lower() not in TABLES:
         time, quaternion = attitude_of(path)
         angle = angle_of_attitude(str(path), quaternion, given.axis)
         samples = {"time": time, "angle": angle}

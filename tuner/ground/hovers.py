@@ -1,4 +1,8 @@
-"""Hovers with weights and steady yaw spins: what the balance of force and torque says."""
+"""Hovers with weights and steady yaw spins: what the balance of force and torque says.
+
+Equations are those of the thesis; where its text slips, the law here is the corrected one, and its
+docstring names the slip.
+"""
 
 from __future__ import annotations
 
@@ -6,11 +10,49 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import ConfigError
-from tuner.ground.laws import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
 from tuner.ground.measurement import Curve, Measurement, Remark
+
+
+def hover_motor_constant(mass: float, rotor_speed: float, rotors: int = 4) -> float:
+    """Return the motor constant, N s²/rad², of a vehicle that hovers: m g = n k Ω² (6.4.1).
+
+    Mass in kg, the rotors' common speed in rad/s. Two such hovers are Eq. 6.10.
+    """
+    return mass * GRAVITY / (rotors * rotor_speed**2)
+
+
+def fast_pair_speed(
+    slow: NDArray[np.float64] | float, *, mass: float, motor_constant: float
+) -> NDArray[np.float64]:
+    """Return the speed, rad/s, of the faster pair of four rotors in a level spin, from the weight.
+
+    m g = 2 k (Ω_slow² + Ω_fast²). At 599 rad/s of the slow pair of the thesis's vehicle (2.243 kg,
+    1.45e-5 N s²/rad²) it is 632 rad/s, as its text computes; its Eq. 8.4 then uses 643.
+    """
+    square = mass * GRAVITY / (2 * motor_constant) - np.square(slow)
+    return np.sqrt(np.maximum(square, 0.0))
+
+
+def spin_drag_over_torque(
+    yaw_rate: NDArray[np.float64] | float,
+    slow: NDArray[np.float64] | float,
+    fast: NDArray[np.float64] | float,
+    *,
+    radius: float,
+) -> NDArray[np.float64]:
+    """Return rotor_drag_coefficient / (moment_constant · motor_constant), rad s/m², of a spin.
+
+    In a steady level spin at ω the drag of four rotors at a distance r from the axis, each
+    c Ω (ω r) r, balances the difference of their drag torques (Eq. 8.3 without its small-angle
+    shortcuts): c ω r² 2(Ω_s + Ω_f) = k_M k_F 2(Ω_f² - Ω_s²), so that
+    c/(k_M k_F) = (Ω_f - Ω_s)/(ω r²).
+    Speeds in rad/s, radius in m.
+    """
+    return np.asarray((np.asarray(fast) - np.asarray(slow)) / (np.asarray(yaw_rate) * radius**2))
 
 
 def hover_weights(

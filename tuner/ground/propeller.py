@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from tuner.core.errors import RecordingError
-from tuner.ground.laws import propeller_moment_constant, propeller_motor_constant
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
 
 THEORY = 0.4
@@ -16,6 +15,27 @@ THEORY = 0.4
 TORQUE_THEORY = 0.3
 """The same of the ratio of torque to thrust, in which part of the error cancels."""
 MAX_BYTES = 1_000_000
+
+
+def propeller_motor_constant(
+    thrust_coefficient: float, *, diameter: float, density: float
+) -> float:
+    """Return the motor constant, N s²/rad²: C_T ρ D⁴/(2π)² (Eq. 6.8, 6.9).
+
+    C_T is referred to revolutions per second, as propeller tables have it; D in m, ρ in kg/m³.
+    """
+    return thrust_coefficient * density * diameter**4 / (2 * math.pi) ** 2
+
+
+def propeller_moment_constant(
+    thrust_coefficient: float, power_coefficient: float, *, diameter: float
+) -> float:
+    """Return the moment constant, m: C_P D/(2π C_T) (Eq. 7.5, 7.7), D in m.
+
+    Torque is power over speed, C_P ρ n³ D⁵/(2π n), and thrust C_T ρ n² D⁴: their ratio has D to the
+    first power. Eq. 7.9 of the thesis carries D⁴ where Eq. 7.5 has D, which is a slip.
+    """
+    return power_coefficient * diameter / (2 * math.pi * thrust_coefficient)
 
 
 def read_static_table(path: Path) -> Array:

@@ -1,4 +1,4 @@
-"""Recordings of rigs and flights for ground measurements: columns by name, means of steady flight.
+"""Recordings of rigs and flights for ground measurements: columns by name, steady parts, means.
 
 Columns come in SI units by their names; of a flight count the steady part of a hover or a spin, and
 a pendulum's angle.
@@ -12,13 +12,156 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.ndimage import median_filter
 
 from tuner.core.errors import RecordingError
+from tuner.core.numerics import Z95, robust_sd
 from tuner.ground.measurement import Array, Curve
-from tuner.ground.plateaus import levels_of, without_outliers
 from tuner.recordings.content import Content, ReadOptions, read_content
-from tuner.recordings.recording import ROWS, Clock, Request
-from tuner.recordings.table import Table
+from tuner.recordings.recording import ROWS, Clock, Request, TabularRecording
+
+OUTLIER = 3.0
+"""Standard deviations (robust) beyond which a tachometer's sample is dropped (thesis 6.3.2)."""
+MIDDLE = (0.3, 0.95)
+"""Share of a step, from and to, that is its middle: transients over, the next not begun."""
+TRUSTED = 4
+"""Degrees of freedom from which the residuals' own scatter is the only measure of error."""
+FEWEST_IN_LEVEL = 8
+"""Samples without which a step has no mean."""
+
+
+@dataclass(frozen=True)
+class Plateau:
+    """One steady part.
+
+    Attributes
+    ----------
+    samples
+        Indices of the samples that count.
+    begin, end
+        s.
+    """
+
+    samples: NDArray[np.intp]
+    begin: float
+    end: float
+
+
+def levels_of(signal: Array, time: Array, *, shortest: float, step: float) -> list[Plateau]:
+    """Return the steady parts of a signal that moves in steps.
+
+    Parameters
+    ----------
+    signal
+        (n,) what was stepped: a command, or a rotor's speed, NaN where it was not measured.
+    time
+        (n,) s.
+    shortest
+        s below which a level is a transient.
+    step
+        Change of the level that counts as a step, in the signal's unit.
+    """
+    width = max(3, 2 * int(0.5 * shortest / max(float(np.median(np.diff(time))), 1e-9) / 2) + 1)
+    filled = np.interp(np.arange(len(signal)), *_known(signal))
+    smooth = median_filter(filled, size=width, mode="nearest")
+    plateaus, first = [], 0
+    level = smooth[0]
+    for index in range(1, len(smooth) + 1):
+        ended = index == len(smooth) or abs(smooth[index] - level) > step
+        if not ended:
+            count = index - first + 1
+            level += (smooth[index] - level) / min(count, width)
+            continue
+        plateau = _middle(time, first, index)
+        if plateau is not None and time[index - 1] - time[first] >= shortest:
+            plateaus.append(plateau)
+        if index < len(smooth):
+            first, level = index, smooth[index]
+    return plateaus
+
+
+def _known(signal: Array) -> tuple[Array, Array]:
+    known = np.flatnonzero(np.isfinite(signal))
+    return known.astype(float), signal[known]
+
+
+def _middle(time: Array, first: int, end: int) -> Plateau | None:
+    begin, last = time[first], time[end - 1]
+    low, high = (begin + share * (last - begin) for share in MIDDLE)
+    samples = first + np.flatnonzero((time[first:end] >= low) & (time[first:end] <= high))
+    return Plateau(samples, float(low), float(high)) if len(samples) >= FEWEST_IN_LEVEL else None
+
+
+def without_outliers(values: Array) -> NDArray[np.bool_]:
+    """Return (n,) which values lie within `OUTLIER` robust standard deviations of their median."""
+    finite = np.isfinite(values)
+    middle = np.median(values[finite])
+    spread = max(float(robust_sd(values[finite] - middle)), 1e-12 * abs(middle))
+    return np.asarray(finite & (np.abs(values - middle) <= OUTLIER * spread))
+
+
+def kept_levels(
+    stepped: Array,
+    time: Array,
+    speed: Array,
+    usable: NDArray[np.bool_],
+    *,
+    shortest: float,
+    step: float,
+) -> tuple[list[tuple[Plateau, NDArray[np.intp]]], NDArray[np.bool_], int]:
+    """Return steady parts of what was stepped, each with the samples of the speed that count.
+
+    Also (n,) which samples those are, and how many were dropped; parameters as of `levels_of`.
+    """
+    parts, used, dropped = [], np.zeros(len(time), bool), 0
+    for plateau in levels_of(stepped, time, shortest=shortest, step=step):
+        kept = without_outliers(speed[plateau.samples]) & usable[plateau.samples]
+        dropped += int((~kept).sum())
+        inside = plateau.samples[kept]
+        if len(inside) >= 4:
+            used[inside] = True
+            parts.append((plateau, inside))
+    return parts, used, dropped
+
+
+def mean_and_error(values: Array) -> tuple[float, float]:
+    """Return a plateau's mean and the standard error of it, correlation between samples included.
+
+    The variance of the mean comes from the means of blocks, which neighbouring samples that move
+    together make larger than the variance over the count.
+    """
+    count = len(values)
+    blocks = min(8, count // 4)
+    plain = float(values.std(ddof=1)) / np.sqrt(count)
+    if blocks < 4:
+        return float(values.mean()), plain
+    means = np.array([block.mean() for block in np.array_split(values, blocks)])
+    return float(values.mean()), max(plain, float(means.std(ddof=1)) / np.sqrt(blocks))
+
+
+def widened(covariance: Array, chi_square: float, freedom: int) -> Array:
+    """Return a covariance with the scatter of the residuals: Birge's ratio and Student's t.
+
+    A few residuals that happen to be small do not narrow it.
+
+    Parameters
+    ----------
+    covariance
+        Of weighted least squares.
+    chi_square, freedom
+        Sum of the squared weighted residuals, and the degrees of freedom that they have.
+    """
+    ratio = chi_square / max(freedom, 1)
+    ratio = max(ratio, 1.0) if freedom < TRUSTED else ratio
+    return np.asarray(covariance * ratio * student(freedom) ** 2)
+
+
+def student(freedom: int) -> float:
+    """Return by what factor few degrees of freedom widen an interval (Student's t)."""
+    return float(stats.t.ppf(0.975, max(freedom, 1))) / Z95
+
 
 MAX_BYTES = 200_000_000
 MOST = 60_000
@@ -60,7 +203,7 @@ VERTICAL = 0.9
 """Least cosine between the body axis that hangs vertical and the vertical."""
 
 
-def open_table(path: Path) -> Table:
+def open_table(path: Path) -> TabularRecording:
     """Open a CSV or Parquet file.
 
     Raises
@@ -68,6 +211,8 @@ def open_table(path: Path) -> Table:
     RecordingError
         It cannot be read, is too large, or is no table.
     """
+    from tuner.recordings.table import Table  # noqa: PLC0415 (pyarrow takes a third of a second)
+
     try:
         if path.is_dir() or path.stat().st_size > MAX_BYTES:
             raise RecordingError(path, "is a folder or larger than 200 MB", "cut it to the rig's")
@@ -171,11 +316,6 @@ class SteadyFlight:
     rotor_speed: Array
     yaw_rate: float
     curve: Curve
-
-
-def is_table(path: Path) -> bool:
-    """Return whether a recording is a table by its name, with columns of a rig's."""
-    return path.suffix.lower() in TABLES
 
 
 def attitude_of(path: Path) -> tuple[Array, Array]:

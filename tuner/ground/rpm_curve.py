@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 from tuner.core.errors import RecordingError
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
-from tuner.ground.plateaus import levels_of, mean_and_error, widened, without_outliers
+from tuner.ground.rig_data import kept_levels, mean_and_error, widened
 
 SHORTEST = 0.8
 STEP = 0.015
@@ -44,17 +44,13 @@ def rpm_curve(
         There are too few steps or the rotor speed does not follow the command.
     """
     time, command, speed = samples["time"], samples["command"], samples["rotor_speed"]
-    points, used, dropped = [], np.zeros(len(time), bool), 0
     steady = np.isfinite(command) & np.isfinite(samples.get("voltage", command))
-    for plateau in levels_of(command, time, shortest=SHORTEST, step=STEP):
-        kept = without_outliers(speed[plateau.samples]) & steady[plateau.samples]
-        dropped += int((~kept).sum())
-        inside = plateau.samples[kept]
-        if len(inside) < 4:
-            continue
-        used[inside] = True
-        battery = float(np.mean(samples["voltage"][inside])) if "voltage" in samples else 1.0
-        points.append((float(np.mean(command[inside])), *mean_and_error(speed[inside]), battery))
+    parts, used, dropped = kept_levels(command, time, speed, steady, shortest=SHORTEST, step=STEP)
+    battery = samples.get("voltage", np.ones(len(time)))
+    points = [
+        (float(np.mean(command[at])), *mean_and_error(speed[at]), float(np.mean(battery[at])))
+        for _, at in parts
+    ]
     if len({round(point[0] / STEP) for point in points}) < FEWEST:
         what = f"holds {len(points)} steady steps of the command of {SHORTEST:g} s and more"
         raise RecordingError(path, what, f"record {FEWEST} or more commands, each for seconds")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import scaled_inverse
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
-from tuner.ground.plateaus import levels_of, mean_and_error, widened, without_outliers
+from tuner.ground.rig_data import kept_levels, mean_and_error, widened
 
 SHORTEST = 1.0
 """s below which a level of the rotor speed is a transient."""
@@ -116,7 +116,9 @@ def _slope(
         Remark("levels", {"levels": len(levels), "outliers": dropped}),
         Remark("offset", {"force": float(solution[1])}),
     ]
-    bend, bend_error = _curvature(design, measured, levels)
+    relative = design[:, 0] / design[:, 0].max()
+    bent = _weighted(np.column_stack([design, relative**2]), measured, levels)
+    bend, bend_error = float(bent[0][-1]), math.sqrt(bent[1][-1, -1])  # of Ω⁴ beside Ω²
     if abs(bend) > 3 * bend_error and len(levels) >= FEWEST + 2:
         remarks.append(Remark("not_quadratic", {"deviation": bend / bend_error}))
     squares = design[:, 0]
@@ -140,18 +142,17 @@ def _slope(
 
 def _levels(time: Array, speed: Array, force: Array) -> tuple[list[_Level], NDArray[np.bool_], int]:
     step = STEP * float(np.nanquantile(speed, 0.98))
-    levels, used, dropped = [], np.zeros(len(time), bool), 0
-    for plateau in levels_of(speed, time, shortest=SHORTEST, step=step):
-        kept = without_outliers(speed[plateau.samples]) & np.isfinite(force[plateau.samples])
-        dropped += int((~kept).sum())
-        inside = plateau.samples[kept]
-        if len(inside) < 4:
-            continue
-        used[inside] = True
-        mean_speed, speed_error = mean_and_error(speed[inside])
-        mean_force, force_error = mean_and_error(force[inside])
-        middle = 0.5 * (plateau.begin + plateau.end)
-        levels.append(_Level(mean_speed, speed_error, mean_force, force_error, middle))
+    parts, used, dropped = kept_levels(
+        speed, time, speed, np.isfinite(force), shortest=SHORTEST, step=step
+    )
+    levels = [
+        _Level(
+            *mean_and_error(speed[inside]),
+            *mean_and_error(force[inside]),
+            0.5 * (plateau.begin + plateau.end),
+        )
+        for plateau, inside in parts
+    ]
     return levels, used, dropped
 
 
@@ -173,10 +174,3 @@ def _weighted(design: Array, measured: Array, levels: list[_Level]) -> tuple[Arr
     residual = measured - design @ solution
     chi_square = float(residual @ (weight * residual))
     return solution, widened(inverse, chi_square, len(levels) - design.shape[1])
-
-
-def _curvature(design: Array, measured: Array, levels: list[_Level]) -> tuple[float, float]:
-    """Return the coefficient of Ω⁴ beside Ω², relative units, and its standard error."""
-    squares = design[:, 0] / design[:, 0].max()
-    solution, covariance = _weighted(np.column_stack([design, squares**2]), measured, levels)
-    return float(solution[-1]), math.sqrt(covariance[-1, -1])

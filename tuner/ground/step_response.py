@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from tuner.core.errors import RecordingError
 from tuner.core.numerics import robust_sd
 from tuner.ground.measurement import Array, Curve, Measurement, Remark
-from tuner.ground.plateaus import OUTLIER, student
+from tuner.ground.rig_data import OUTLIER, student
 
 STEP = 0.02
 """Change of the command between two samples that counts as a step."""

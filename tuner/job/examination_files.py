@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from sim_jax.inlet import ReferenceInlet
-from tuner.design.candidates import CLEARANCE, LEVEL, SMALLEST, Arena
 from tuner.design.proposals import Proposals
-from tuner.design.ranking import rank_next_flights
+from tuner.design.ranking import CLEARANCE, LEVEL, SMALLEST, Arena, rank_next_flights
 from tuner.recordings.flight import Flight
 from tuner.search.fitted import Fitted
 from tuner.search.problem import SPIN_CHANNELS, Job

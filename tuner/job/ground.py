@@ -13,11 +13,10 @@ from pydantic import JsonValue
 from tuner.core.disk import make_folder
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Z95
+from tuner.core.runtime import PROGRAM, versions
 from tuner.core.shipped import find_config
-from tuner.core.versions import PROGRAM, versions
 from tuner.findings.findings import Code, Finding
-from tuner.ground.bench_json import bench_record
-from tuner.ground.combination import Combination, combine
+from tuner.ground.bench_json import Combination, bench_record, combine
 from tuner.ground.experiments import measure, names_of
 from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
 from tuner.ground.plan import BenchFile, YawSpin, read_bench

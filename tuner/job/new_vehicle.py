@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 
 from tuner.core.disk import check_file, write_text
+from tuner.core.runtime import PROGRAM, installed
 from tuner.core.shipped import configs_folder
-from tuner.core.versions import PROGRAM, installed
 from tuner.core.yaml_document import commented, dump_yaml
 from tuner.vehicle import (
     COEFFICIENTS,

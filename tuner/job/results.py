@@ -12,7 +12,7 @@ from pydantic import JsonValue
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.numerics import Z95
-from tuner.core.versions import PROGRAM, versions
+from tuner.core.runtime import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
 from tuner.design.proposals import LogProposal
 from tuner.evaluate.held_out import (

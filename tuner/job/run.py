@@ -30,10 +30,8 @@ from tuner.evaluate.held_out import (
     vehicle_fitted,
 )
 from tuner.evaluate.predict import with_inputs_on_time
-from tuner.exporters.effective import Effective, effective_fit
-from tuner.exporters.effective_of_run import kept_effective
+from tuner.exporters.effective import Effective, effective_fit, kept_effective, refly
 from tuner.exporters.export import exports_of_job
-from tuner.exporters.refly import refly
 from tuner.findings.findings import Finding, remedy, sentence
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings

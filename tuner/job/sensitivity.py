@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from tuner.config import Options, Settings, settle
 from tuner.core.disk import make_folder
 from tuner.core.errors import InputError, did_you_mean
-from tuner.core.versions import versions
-from tuner.design.candidates import Arena
+from tuner.core.runtime import versions
 from tuner.design.proposals import Proposals
+from tuner.design.ranking import Arena
 from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
 from tuner.job.examination_files import write_knowledge, write_next_flight

@@ -12,7 +12,7 @@ import numpy as np
 from tuner.config import Settings
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, Finding
-from tuner.ground.combination import Combination, combine
+from tuner.ground.bench_json import Combination, combine
 from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import agreeing, measure_inertial
 from tuner.inertial.prediction import AHEAD, rate_errors

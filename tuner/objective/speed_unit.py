@@ -17,7 +17,7 @@ from tuner.core.errors import RecordingError
 from tuner.objective.explained import squared_speed
 from tuner.recordings.flight import Flight, Series
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.units import UNITS
+from tuner.recordings.unit_detection import UNITS
 from tuner.vehicle import VehicleFile
 
 SPEED_UNITS = {"si": "in rad/s", "rpm": "in revolutions a minute", "hz": "in revolutions a second"}

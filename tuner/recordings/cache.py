@@ -11,11 +11,11 @@ import hashlib
 import json
 import logging
 import os
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
-from tuner.core.disk import cache_folder, readable
+from tuner.core.disk import cache_folder, readable, whole_file
+from tuner.core.errors import OutputError
 
 logger = logging.getLogger(__name__)
 
@@ -40,22 +40,19 @@ def digest(path: Path) -> str:
         A file cannot be read.
     """
     with readable(path):
-        return _digest_of(path)
-
-
-def _digest_of(path: Path) -> str:
-    files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
-    about = [(str(file), file.stat()) for file in files]
-    if sum(stat.st_size for _, stat in about) <= LARGE:
-        return _digest(path, files)
-    # Name, size and time of change stand for the content of what takes seconds to read.
-    parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
-    known = cached("digest", json.dumps(parts))
-    if (known_digest := load(known)) is not None and len(known_digest) == 64:
-        return known_digest.decode()
-    fresh = _digest(path, files)
-    store(known, fresh.encode())
-    return fresh
+        inside = path.rglob("*") if path.is_dir() else [path]
+        files = sorted(file for file in inside if file.is_file() or file == path)
+        about = [(str(file), file.stat()) for file in files]
+        if sum(stat.st_size for _, stat in about) <= LARGE:
+            return _digest(path, files)
+        # Name, size and time of change stand for the content of what takes seconds to read.
+        parts = [(n, s.st_size, s.st_mtime_ns, s.st_ino) for n, s in about]
+        known = cached("digest", json.dumps(parts))
+        if (known_digest := load(known)) is not None and len(known_digest) == 64:
+            return known_digest.decode()
+        fresh = _digest(path, files)
+        store(known, fresh.encode())
+        return fresh
 
 
 def _digest(path: Path, files: Iterable[Path]) -> str:
@@ -101,17 +98,11 @@ def store(path: Path, content: bytes) -> None:
     """Keep something: it appears whole or not at all, and a full disk is no error."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=".")
-        try:
-            with os.fdopen(handle, "wb") as stream:
-                stream.write(content)
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+        with whole_file(path) as unfinished:
+            unfinished.write_bytes(content)
         _make_room()
-    except OSError as err:
-        logger.info("nothing is cached in %s: %s", path.parent, err.strerror)
+    except (OSError, OutputError) as err:
+        logger.info("nothing is cached in %s: %s", path.parent, err)
 
 
 def _make_room() -> None:

@@ -76,7 +76,8 @@ def message_times(
     for topic, of in samples.items():
         if of.stamp is None or topic in receive_only or not len(of.stamp):
             continue
-        if _unset(of.stamp, of.receive):
+        passed, went_on = (np.ptp(np.quantile(t, (0.1, 0.9))) for t in (of.receive, of.stamp))
+        if passed > SECOND and went_on < passed / 2:
             unset.append(topic)
             continue
         stamp, repaired = _repair(topic, of.stamp, of.receive)
@@ -100,13 +101,6 @@ def message_times(
                 kind: Kind = "info" if topic in unhurried else "warning"
                 notes.append(Note(NoteCode.NO_HEADER, kind, topic, len(of.receive)))
     return times, tuple(notes)
-
-
-def _unset(stamp: Nanoseconds, receive: Nanoseconds) -> bool:
-    """Return whether stamps do not go on as their arrivals do."""
-    passed = np.quantile(receive, 0.9) - np.quantile(receive, 0.1)
-    went_on = np.quantile(stamp, 0.9) - np.quantile(stamp, 0.1)
-    return bool(passed > SECOND and went_on < passed / 2)
 
 
 def _repair(topic: str, stamp: Nanoseconds, receive: Nanoseconds) -> tuple[Nanoseconds, list[Note]]:
@@ -230,6 +224,17 @@ def fit_grid(time: Array, rate: float) -> Grid | None:
     return Grid(float(time[0]) + origin, rate, drift, spread)
 
 
+def clock_of(
+    series: Mapping[str, Series], rate: float, start: float = -np.inf, end: float = np.inf
+) -> Grid | None:
+    """Return the ticks that the reference or, where there is none, the set-points follow."""
+    for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
+        grid = fit_grid(series[name].between(start, end).time, rate) if name in series else None
+        if grid is not None:
+            return grid
+    return None
+
+
 def pose_offset(series: Mapping[str, Series]) -> float | None:
     """Return by how many seconds the attitude's stamps are late against the gyro's.
 
@@ -247,7 +252,15 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     # The best whole lag first, then a parabola through the three highest points.
     most = round(REACH * RATE)
     lags = np.arange(-most, most + 1)
-    score = np.array([_shifted(turning, gyro, int(lag)) for lag in lags])
+    count = len(clock)
+    score = np.array(
+        [  # of the attitude moved back by a lag
+            correlation(
+                turning[max(0, lag) : count + min(0, lag)], gyro[max(0, -lag) : count - max(0, lag)]
+            )
+            for lag in lags.tolist()
+        ]
+    )
     best = int(np.argmax(score))
     unlike = 1 - score
     if score[best] < ALIKE or best in (0, len(lags) - 1) or unlike[best] > SHARPER * unlike[most]:
@@ -256,12 +269,6 @@ def pose_offset(series: Mapping[str, Series]) -> float | None:
     bend = left - 2 * peak + right
     fine = 0.5 * (left - right) / bend if bend < 0 else 0.0
     return float((lags[best] + fine) / RATE)
-
-
-def _shifted(late: Array, early: Array, lag: int) -> float:
-    """Return how alike two signals are when the first is moved back by some samples."""
-    n = len(late)
-    return correlation(late[max(0, lag) : n + min(0, lag)], early[max(0, -lag) : n - max(0, lag)])
 
 
 def align_pose(

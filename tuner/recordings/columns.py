@@ -11,6 +11,9 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from tuner.recordings.recording import Clock
+from tuner.recordings.topics import Source
+
 #: Unit as written -> unit of a topic map.
 UNITS_WRITTEN: Mapping[str, str] = {
     "s": "s", "sec": "s", "secs": "s", "seconds": "s", "second": "s",
@@ -203,17 +206,10 @@ AXES: Mapping[str, Sequence[str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Found:
-    """Columns that together are a signal: their names in its order, their unit, their group."""
-
-    fields: tuple[str, ...]
-    unit: str | None
-    group: str
-
-
-def recognised(columns: Sequence[str], units: Mapping[str, str]) -> dict[str, Found]:
-    """Return the signals, and the ``time``, that a table's columns hold by their names.
+def recognised(
+    columns: Sequence[str], units: Mapping[str, str]
+) -> tuple[Clock | None, dict[str, Source]]:
+    """Return the time, and the signals, that a table's columns hold by their names.
 
     Parameters
     ----------
@@ -222,20 +218,17 @@ def recognised(columns: Sequence[str], units: Mapping[str, str]) -> dict[str, Fo
     units
         Column -> unit, of a row of units.
     """
-    guesses = {name: guess(name, units.get(name)) for name in columns}
-    times = [name for name, g in guesses.items() if g and g.signal == "time"]
+    guesses = {name: g for name in columns if (g := guess(name, units.get(name))) is not None}
+    times = [name for name, g in guesses.items() if g.signal == "time"]
     stamps = [name for name in times if name.endswith("header.stamp")]  # rather than of recording
     time = next(iter((*stamps, *times)), None)
-    found = {}
-    if time is not None:
-        known = guesses[time]
-        found["time"] = Found((time,), known.unit if known else None, "")
+    found: dict[str, Source] = {}
     for signal, axes in AXES.items():
         groups: dict[str, dict[str, str]] = {}
         for name, g in guesses.items():
-            if g is not None and g.signal == signal:
+            if g.signal == signal:
                 groups.setdefault(g.group, {}).setdefault(g.axis, name)
-        for group, held in sorted(groups.items(), key=lambda item: _rank(item[0])):
+        for _, held in sorted(groups.items(), key=lambda item: _rank(item[0])):
             count = range(len(axes))
             ways = (axes, [str(i) for i in count], [str(i + 1) for i in count])
             numbers = {axis for axis in held if axis.isdecimal()}
@@ -244,12 +237,16 @@ def recognised(columns: Sequence[str], units: Mapping[str, str]) -> dict[str, Fo
             )
             if wanted is not None:
                 names = tuple(held[axis] for axis in wanted)
-                written = {g.unit for name in names if (g := guesses[name]) is not None}
-                found[signal] = Found(names, written.pop() if len(written) == 1 else None, group)
+                written = {guesses[name].unit for name in names}
+                unit = written.pop() if len(written) == 1 else None
+                if signal == "angles":
+                    angles = Source(fields=names, unit=unit, quaternion="rpy")
+                    found.setdefault("attitude", angles)
+                else:
+                    found[signal] = Source(fields=names, unit=unit)
                 break
-    if "attitude" in found:
-        found.pop("angles", None)
-    return found
+    known = None if time is None else {"field": time, "unit": guesses[time].unit}
+    return None if known is None else Clock.model_validate(known), found
 
 
 def _rank(group: str) -> tuple[bool, int]:

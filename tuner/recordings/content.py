@@ -34,15 +34,18 @@ from tuner.recordings.topics import (
     sidecar_path,
 )
 from tuner.recordings.unit_detection import (
+    ATTITUDES,
     NAMES,
     Stamped,
     is_too_slow,
+    quaternion_of,
     scales_of,
+    to_enu_flu,
+    to_si,
     unit_by_range,
     unit_of,
     unit_of_angles,
 )
-from tuner.recordings.units import ATTITUDES, quaternion_of, to_enu_flu, to_si
 from tuner.vehicle.motor_orders import columns_of, motor_order_of, order_in_words
 
 PX4_REFERENCES = ("trajectory_setpoint", "vehicle_local_position_setpoint")
@@ -201,8 +204,10 @@ def read_signals(options: ReadOptions, *, with_pose: bool) -> Signals:
         raw, quicker = _quickened(raw)
         notes += quicker
     if order is not None and set(PER_MOTOR) & set(raw):
-        raw = _in_order(raw, columns_of(order))
-        names = (order_in_words([column + 1 for column in columns_of(order)]),)
+        columns = columns_of(order)
+        for name in set(PER_MOTOR) & set(raw):
+            raw[name] = replace(raw[name], values=raw[name].values[:, columns])
+        names = (order_in_words([column + 1 for column in columns]),)
         notes.append(Note(NoteCode.MOTOR_ORDER_GIVEN, "info", names=names))
     series, epoch, dropped = _clean(path, raw, with_pose=with_pose)
     topics = {signal: data.topic for signal, data in raw.items()}
@@ -263,16 +268,6 @@ def read_content(options: ReadOptions) -> Content:
     notes = (*signals.notes, *shifted, *turned, *stale, *_unmeasured(series, topics))
     read = vars(signals) | {"series": series, "notes": notes}
     return Content(**read, missions=missions)
-
-
-def _in_order(raw: dict[str, Raw], columns: list[int]) -> dict[str, Raw]:
-    """Return signals with a column a motor in PX4's order."""
-    ordered = {
-        name: replace(raw[name], values=raw[name].values[:, columns])
-        for name in PER_MOTOR
-        if name in raw
-    }
-    return {name: ordered.get(name, data) for name, data in raw.items()}
 
 
 def _quickened(raw: dict[str, Raw]) -> tuple[dict[str, Raw], list[Note]]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.recordings.flight import Array, Series
+from tuner.recordings.interpolation import runs
 from tuner.recordings.notes import Kind, Note, NoteCode
 
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -275,8 +276,7 @@ def repeated(time: Array, values: Array, limits: Limits) -> NDArray[np.bool_]:
     if len(values) < 4:
         return stuck
     same = np.concatenate([[False], (values[1:] == values[:-1]).all(axis=1)])
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    for first, behind in zip(edges[::2], edges[1::2], strict=True):
+    for first, behind in runs(same):
         if behind - first < 3 or behind >= len(values):
             continue
         leap = np.abs(values[behind] - values[behind - 1]).max()

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
+from tuner.recordings.layout import is_table
 from tuner.recordings.recording import Recording
-from tuner.recordings.table import is_table
 
 NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
 """Suffixes of recordings that no text has."""
@@ -66,58 +67,50 @@ def _is_ros(head: Head) -> bool:
     return head.path.is_dir() or head.start.startswith(magic) or empty_bag
 
 
-def _open_ros(path: Path, messages: tuple[Path, ...]) -> Recording:
-    from tuner.recordings.ros.recording import RosRecording, open_container  # noqa: PLC0415
-
-    return RosRecording(path, open_container(path), messages)
-
-
-def _open_ulog(path: Path, _: tuple[Path, ...]) -> Recording:
-    from tuner.recordings.ulog import ULogRecording  # noqa: PLC0415
-
-    return ULogRecording(path)
-
-
-def _is_micro_sd(head: Head) -> bool:
-    """Return whether a file begins as a log of version 1 or 2: a byte 0xBC is that of any text."""
-    return head.start[:1] == b"\xbc" and head.start[1:3] in (b"\x01\x00", b"\x02\x00")
-
-
-def _open_micro_sd(path: Path, _: tuple[Path, ...]) -> Recording:
-    from tuner.recordings.micro_sd import MicroSdRecording  # noqa: PLC0415
-
-    return MicroSdRecording(path)
-
-
 def _is_table(head: Head) -> bool:
     """Return whether a file is Parquet, or a text with cells that is not called a bag or a log."""
-    if head.start.startswith(b"PAR1"):
-        return True
-    return head.path.suffix.lower() not in NO_TEXTS and is_table(head.start)
+    text = head.path.suffix.lower() not in NO_TEXTS and is_table(head.start)
+    return head.start.startswith(b"PAR1") or text
 
 
-def _open_table(path: Path, _: tuple[Path, ...]) -> Recording:
-    from tuner.recordings.table import Table  # noqa: PLC0415
+def _in(module: str, name: str) -> Callable[[Path, tuple[Path, ...]], Recording]:
+    """Return what opens a recording with a reader of a module that is then imported."""
 
-    return Table(path)
+    def opened(path: Path, messages: tuple[Path, ...]) -> Recording:
+        reader = getattr(import_module(f"tuner.recordings.{module}"), name)
+        recording: Recording = reader(path, messages) if module.startswith("ros") else reader(path)
+        return recording
 
-
-def _is_matlab(head: Head) -> bool:
-    return head.start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"))
-
-
-def _open_matlab(path: Path, _: tuple[Path, ...]) -> Recording:
-    from tuner.recordings.matlab import MatlabTable  # noqa: PLC0415
-
-    return MatlabTable(path)
+    return opened
 
 
 READERS: tuple[Reader, ...] = (
-    Reader("ros", "ROS 1 .bag, ROS 2 folders, .db3 and .mcap", _is_ros, _open_ros),
-    Reader("ulog", "PX4 .ulg", lambda head: head.start.startswith(b"ULog"), _open_ulog),
-    Reader("micro_sd", "Crazyflie micro-SD logs", _is_micro_sd, _open_micro_sd),
-    Reader("table", "MATLAB .mat", _is_matlab, _open_matlab, tabular=True),
-    Reader("table", ".csv and .parquet", _is_table, _open_table, tabular=True),
+    Reader(
+        "ros",
+        "ROS 1 .bag, ROS 2 folders, .db3 and .mcap",
+        _is_ros,
+        _in("ros.recording", "RosRecording"),
+    ),
+    Reader(
+        "ulog",
+        "PX4 .ulg",
+        lambda head: head.start.startswith(b"ULog"),
+        _in("ulog", "ULogRecording"),
+    ),
+    Reader(
+        "micro_sd",
+        "Crazyflie micro-SD logs",  # a byte 0xBC alone is that of any text
+        lambda head: head.start.startswith((b"\xbc\x01\x00", b"\xbc\x02\x00")),
+        _in("micro_sd", "MicroSdRecording"),
+    ),
+    Reader(
+        "table",
+        "MATLAB .mat",
+        lambda head: head.start.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file")),
+        _in("matlab", "MatlabTable"),
+        tabular=True,
+    ),
+    Reader("table", ".csv and .parquet", _is_table, _in("table", "Table"), tabular=True),
 )
 """The first that matches reads a recording."""
 

@@ -30,8 +30,13 @@ from tuner.recordings.interpolation import (
 )
 from tuner.recordings.missions import Mission
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.unit_detection import Stamped, pull_and_tilt
-from tuner.recordings.units import ATTITUDE_READINGS, Reading, to_enu_flu
+from tuner.recordings.unit_detection import (
+    ATTITUDE_READINGS,
+    Reading,
+    Stamped,
+    pull_and_tilt,
+    to_enu_flu,
+)
 
 DOUBTS = (NoteCode.ATTITUDE_DOUBTED, NoteCode.BODY_RATE_DOUBTED, NoteCode.VELOCITY_DOUBTED)
 """Notes of what fits no reading."""

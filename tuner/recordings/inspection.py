@@ -351,50 +351,65 @@ def _number(value: float | None, form: str, scale: float = 1.0) -> str:
     return "" if value is None else format(value * scale, form)
 
 
-def _titled(title: str) -> Table:
-    return Table(title=title, title_justify="left", title_style="bold", box=None)
+def _table(
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[tuple[str, Sequence[str | Text]]],
+    left: Sequence[str],
+) -> Table:
+    """Return a table, of style and cells of each row; columns but those to the left are numbers."""
+    table = Table(title=title, title_justify="left", title_style="bold", box=None)
+    for name in columns:
+        table.add_column(name, justify="left" if name in left else "right", no_wrap=name == "topic")
+    for style, cells in rows:
+        table.add_row(*cells, style=style)
+    return table
 
 
 def _topics(inspection: Inspection) -> Table:
-    table = _titled("topics")
-    for name in ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for"):
-        right = name not in ("topic", "type", "used for")
-        table.add_column(name, justify="right" if right else "left", no_wrap=name == "topic")
-    for topic in inspection.topics:
-        table.add_row(
-            topic.name or "(table)",
-            topic.type,
-            str(topic.count),
-            _number(topic.rate, ".1f"),
-            _number(topic.longest_gap, ".3f"),
-            _number(topic.jitter, ".2f", 1e3),
-            _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
-            ", ".join(topic.signals),
-            style="" if topic.signals else "dim",
+    names = ("topic", "type", "messages", "Hz", "gap s", "jitter ms", "delay ms", "used for")
+    rows = (
+        (
+            "" if topic.signals else "dim",
+            (
+                topic.name or "(table)",
+                topic.type,
+                str(topic.count),
+                _number(topic.rate, ".1f"),
+                _number(topic.longest_gap, ".3f"),
+                _number(topic.jitter, ".2f", 1e3),
+                _number(topic.delay, ".2f", 1e3) if topic.delay and abs(topic.delay) < 3600 else "",
+                ", ".join(topic.signals),
+            ),
         )
-    return table
+        for topic in inspection.topics
+    )
+    return _table("topics", names, rows, ("topic", "type", "used for"))
 
 
 def _missions(inspection: Inspection) -> Table:
-    table = _titled("missions")
     numbers = ("laps", "mean m/s", "top m/s", "tilt °", "turn rad/s", "height m", "pose known")
-    for name in ("start s", "s", "begins with", *numbers, "remark"):
-        table.add_column(name, justify="left" if name in ("begins with", "remark") else "right")
-    for mission in inspection.missions:
-        table.add_row(
-            f"{mission.start:.2f}",
-            f"{mission.duration:.2f}",
-            mission.begins_with,
-            "" if mission.laps is None else str(mission.laps),
-            f"{mission.mean_speed:.2f}",
-            f"{mission.top_speed:.2f}",
-            f"{mission.largest_tilt:.1f}",
-            _number(mission.top_turn_rate, ".2f"),
-            f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
-            f"{100 * mission.known:.1f} %",
-            _remark(mission),
+    rows = (
+        (
+            "",
+            (
+                f"{mission.start:.2f}",
+                f"{mission.duration:.2f}",
+                mission.begins_with,
+                "" if mission.laps is None else str(mission.laps),
+                f"{mission.mean_speed:.2f}",
+                f"{mission.top_speed:.2f}",
+                f"{mission.largest_tilt:.1f}",
+                _number(mission.top_turn_rate, ".2f"),
+                f"{mission.height[0]:.2f}–{mission.height[1]:.2f}",
+                f"{100 * mission.known:.1f} %",
+                _remark(mission),
+            ),
         )
-    return table
+        for mission in inspection.missions
+    )
+    columns = ("start s", "s", "begins with", *numbers, "remark")
+    return _table("missions", columns, rows, ("begins with", "remark"))
 
 
 def _remark(mission: MissionReport) -> str:
@@ -423,21 +438,19 @@ def _clock_and_battery(inspection: Inspection) -> Text:
 
 
 def _inlets(inspection: Inspection) -> Table:
-    table = _titled("inlets")
-    table.add_column("inlet")
-    table.add_column("can be fed from this recording")
+    rows = []
     for inlet in inspection.inlets:
         usable = not inlet.missing and inspection.problem is None
         lacks = f"lacks {', '.join(inlet.missing)}" if inlet.missing else "no mission"
-        table.add_row(inlet.name, "yes" if usable else lacks, style="" if usable else "dim")
-    return table
+        rows.append(("" if usable else "dim", (inlet.name, "yes" if usable else lacks)))
+    columns = ("inlet", "can be fed from this recording")
+    return _table("inlets", columns, rows, columns)
 
 
 def _coefficients(inspection: Inspection) -> Table:
-    table = _titled("could inform")
-    for name in ("coefficient", "", "because"):
-        table.add_column(name)
-    for finding in inspection.coefficients:
-        how = Text(finding.how, _COLOURS[finding.how])
-        table.add_row(finding.coefficient, how, finding.why)
-    return table
+    rows = (
+        ("", (found.coefficient, Text(found.how, _COLOURS[found.how]), found.why))
+        for found in inspection.coefficients
+    )
+    columns = ("coefficient", "", "because")
+    return _table("could inform", columns, rows, columns)

@@ -1,7 +1,8 @@
 """Read a recording to say what it holds, whether or not a flight can be made of it.
 
 Which inlets it can be fed in at and which coefficients it could show are rules of thumb from what
-was recorded and how hard it was flown; what a fit identified stands in its own report.
+was recorded and how hard it was flown; what a fit identified stands in its own report. Of a
+recording that no map reads, a topic map to begin with: the best guess for every column, and why.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import yaml
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
-from tuner.recordings.clocks import fit_grid, pose_offset
+from tuner.recordings.clocks import clock_of, pose_offset
+from tuner.recordings.columns import recognised
 from tuner.recordings.content import (
     Content,
     ReadOptions,
@@ -26,7 +29,7 @@ from tuner.recordings.content import (
 )
 from tuner.recordings.defects import is_stale
 from tuner.recordings.flight import SIGNALS, Array, Series
-from tuner.recordings.formats import open_recording
+from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import noted_contradiction
 from tuner.recordings.inertial import flying, is_inertial, obstacle
 from tuner.recordings.inspection import (
@@ -41,9 +44,9 @@ from tuner.recordings.interpolation import RATE, derivative, resample, smooth, u
 from tuner.recordings.loader import keep_flights
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.recording import Recording, Samples, Topic
-from tuner.recordings.sources import Place
-from tuner.recordings.topics import Sidecar, TopicMap
+from tuner.recordings.recording import Samples, Topic
+from tuner.recordings.sources import choose_map, locate
+from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
 from tuner.vehicle import COEFFICIENTS
 
 NO_DATE = 631_152_000_000_000_000
@@ -95,7 +98,18 @@ def examine(
                     return _without_pose(signals)
             # Its topics are listed nevertheless, so that the user sees what to map.
             messages = options.given.messages if options.given else ()
-            return _without_flight(open_recording(path, messages), err)
+            recording = open_recording(path, messages)
+            return Inspection(
+                path=str(path),
+                format=recording.format,
+                size=_size(path),
+                started=None,
+                duration=0.0,
+                topic_map="",
+                problem=f"{err.what}; {err.remedy}",
+                topics=tuple(_topic(topic, None, ()) for topic in recording.topics),
+                inlets=inlets({}, trajectory=False),
+            )
     if keep and content.missions:
         keep_flights(content, options)
     return _with_flight(content, options.sidecar)
@@ -110,31 +124,14 @@ def _without_pose(signals: Signals) -> Inspection:
     return replace(
         _with_signals(signals),
         problem=f"{error.what}; {error.remedy}" if error else None,
-        inlets=inlets(_columns(signals.series), trajectory=False),
+        inlets=inlets(_measured(signals.series), trajectory=False),
         notes=(*fitted, *signals.notes),
-    )
-
-
-def _without_flight(recording: Recording, problem: RecordingError) -> Inspection:
-    return Inspection(
-        path=str(recording.path),
-        format=recording.format,
-        size=_size(recording.path),
-        started=None,
-        duration=0.0,
-        topic_map="",
-        problem=f"{problem.what}; {problem.remedy}",
-        topics=tuple(
-            TopicReport(topic.name, topic.type, topic.count, None, None, None, None, ())
-            for topic in recording.topics
-        ),
-        inlets=inlets({}, trajectory=False),
     )
 
 
 def _with_flight(content: Content, sidecar: Sidecar) -> Inspection:
     missions = tuple(_mission(content, i) for i in range(len(content.missions)))
-    measured = _columns(content.series)
+    measured = _measured(content.series)
     unusable = is_stale(content.series, content.notes) or noted_contradiction(content.notes)
     if unusable:  # a fit leaves it out
         del measured["attitude"]
@@ -154,6 +151,8 @@ def _with_signals(read: Signals) -> Inspection:
     recording, samples = read.recording, read.samples
     times = [s.receive for s in samples.values() if len(s.receive)]
     first, last = min(int(t.min()) for t in times), max(int(t.max()) for t in times)
+    measured, battery = _measured(read.series), read.series.get("battery_voltage")
+    voltage = None if battery is None else battery.values
     return Inspection(
         path=str(recording.path),
         format=recording.format,
@@ -162,15 +161,28 @@ def _with_signals(read: Signals) -> Inspection:
         duration=(last - first) * 1e-9,
         topic_map=read.topic_map.name,
         problem=None,
-        topics=_topics(recording, read.places, samples),
-        signals=_signals(read.series, read.places),
-        battery=_battery(read.series),
+        topics=tuple(
+            _topic(
+                topic,
+                samples.get(topic.name),
+                tuple(s for s, place in read.places.items() if place.topic == topic.name),
+            )
+            for topic in recording.topics
+        ),
+        signals=tuple(
+            SignalReport(
+                name,
+                read.places[name].topic,
+                SIGNALS[name][1],
+                len(samples.time),
+                samples.rate,
+                measured[name],
+            )
+            for name, samples in read.series.items()
+        ),
+        battery=None if voltage is None else (float(voltage[0, 0]), float(voltage[-1, 0])),
         damage=read.damage,
     )
-
-
-def _columns(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]]:
-    return {name: _measured(samples) for name, samples in series.items()}
 
 
 def _size(path: Path) -> int:
@@ -184,54 +196,27 @@ def _date(nanoseconds: int) -> str | None:
     return datetime.fromtimestamp(nanoseconds * 1e-9, UTC).isoformat(timespec="seconds")
 
 
-def _measured(series: Series) -> tuple[int, ...]:
-    return tuple(int(i) for i in np.flatnonzero(np.isfinite(series.values).any(axis=0)))
-
-
-def _battery(series: Mapping[str, Series]) -> tuple[float, float] | None:
-    voltage = series.get("battery_voltage")
-    return None if voltage is None else (float(voltage.values[0, 0]), float(voltage.values[-1, 0]))
-
-
-def _signals(series: Mapping[str, Series], places: Mapping[str, Place]) -> tuple[SignalReport, ...]:
-    return tuple(
-        SignalReport(
-            name,
-            places[name].topic,
-            SIGNALS[name][1],
-            len(samples.time),
-            samples.rate,
-            _measured(samples),
-        )
+def _measured(series: Mapping[str, Series]) -> dict[str, tuple[int, ...]]:
+    """Return signal -> its columns that were measured."""
+    return {
+        name: tuple(int(i) for i in np.flatnonzero(np.isfinite(samples.values).any(axis=0)))
         for name, samples in series.items()
-    )
+    }
 
 
-def _topics(
-    recording: Recording, places: Mapping[str, Place], samples: Mapping[str, Samples]
-) -> tuple[TopicReport, ...]:
-    return tuple(
-        _topic(
-            topic, samples.get(topic.name), [s for s, p in places.items() if p.topic == topic.name]
-        )
-        for topic in recording.topics
-    )
-
-
-def _topic(topic: Topic, samples: Samples | None, held: Sequence[str]) -> TopicReport:
-    name, kind, count, signals = topic.name, topic.type, topic.count, tuple(held)
+def _topic(topic: Topic, samples: Samples | None, signals: tuple[str, ...]) -> TopicReport:
     if samples is None or len(samples.receive) < 2:
-        return TopicReport(name, kind, count, None, None, None, None, signals)
-    time = _seconds(samples)
-    steps = np.diff(time)
+        return TopicReport(topic.name, topic.type, topic.count, None, None, None, None, signals)
+    stamps = samples.receive if samples.stamp is None else samples.stamp
+    steps = np.diff(np.sort(np.asarray((stamps - stamps[0]) * 1e-9, dtype=np.float64)))
     usual = float(np.median(steps))
     delay = None
     if samples.stamp is not None and samples.stamp is not samples.receive:
         delay = float(np.median(samples.receive - samples.stamp)) * 1e-9
     near = steps[(steps > 0) & (steps < 3 * usual)]
     return TopicReport(
-        name=name,
-        type=kind,
+        name=topic.name,
+        type=topic.type,
         count=len(samples.receive),
         rate=1 / usual if usual > 0 else None,
         longest_gap=float(steps.max()),
@@ -241,20 +226,9 @@ def _topic(topic: Topic, samples: Samples | None, held: Sequence[str]) -> TopicR
     )
 
 
-def _seconds(samples: Samples) -> Array:
-    stamps = samples.receive if samples.stamp is None else samples.stamp
-    return np.sort(np.asarray((stamps - stamps[0]) * 1e-9, dtype=np.float64))
-
-
 def _clock(content: Content) -> Mapping[str, float]:
-    clock = {}
-    for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
-        if name in content.series:
-            grid = fit_grid(content.series[name].time, 100.0)
-            if grid is not None:
-                clock = {"spread": grid.spread, "drift": grid.drift}
-                break
-    offset = pose_offset(content.series)
+    grid, offset = clock_of(content.series, 100.0), pose_offset(content.series)
+    clock = {} if grid is None else {"spread": grid.spread, "drift": grid.drift}
     return clock if offset is None else {**clock, "pose_offset": offset}
 
 
@@ -265,7 +239,7 @@ def _mission(content: Content, index: int) -> MissionReport:
     attitude = resample("attitude", content.series["attitude"], clock)
     speed = np.linalg.norm(derivative(smooth(position)), axis=1)
     up = upward(attitude)[:, 2]
-    rates = content.series.get("body_rate")
+    rates, lap = content.series.get("body_rate"), content.series.get("lap")
     turning = None
     if rates is not None:
         turn_rates = np.linalg.norm(resample("body_rate", rates, clock), axis=1)
@@ -276,7 +250,7 @@ def _mission(content: Content, index: int) -> MissionReport:
         start=mission.start,
         duration=mission.end - mission.start,
         begins_with=mission.begins_with,
-        laps=_laps(content.series.get("lap"), mission.start, mission.end),
+        laps=None if lap is None else len(lap.between(mission.start, mission.end).time),
         mean_speed=_of(np.nanmean, speed),
         top_speed=_of(np.nanmax, speed),
         largest_tilt=float(np.degrees(np.arccos(np.clip(_of(np.nanmin, up), -1, 1)))),
@@ -291,12 +265,6 @@ def _mission(content: Content, index: int) -> MissionReport:
 
 def _of(reduce: object, values: Array) -> float:
     return float(reduce(values)) if np.isfinite(values).any() else float("nan")  # type: ignore[operator]
-
-
-def _laps(lap: Series | None, start: float, end: float) -> int | None:
-    if lap is None:
-        return None
-    return int(((lap.time >= start) & (lap.time <= end)).sum())
 
 
 _NEEDS: Mapping[str, Sequence[str]] = {
@@ -439,3 +407,92 @@ def _spread(series: Mapping[str, Series], name: str, missions: Sequence[MissionR
         return np.zeros(values.shape[1])
     largest = np.nanmax(np.abs(values), axis=0)
     return np.asarray(np.maximum(np.nanstd(values, axis=0), 0.25 * largest))
+
+
+LACKING = "position", "attitude", "command", "rotor_speed", "body_rate"
+"""Signals that are asked for where no column seems to hold them."""
+
+
+def suggested_map(path: Path) -> str:
+    """Return the text of a topic map for a recording, to be checked and completed.
+
+    Raises
+    ------
+    RecordingError
+        It cannot be read.
+    """
+    recording = open_recording(path)
+    if not is_tabular(recording.format):
+        maps = [topic_map for topic_map in shipped_maps() if topic_map.format == recording.format]
+        chosen = choose_map(recording, maps)
+        places, _ = locate(recording, chosen)
+        if not places:
+            listed = ", ".join(topic.name for topic in recording.topics[:12])
+            raise RecordingError(path, f"has no topic that a map knows, but {listed}", "map them")
+        found = {name: place.source.replace(topic=place.topic) for name, place in places.items()}
+        why = dict.fromkeys(found, f"as in the shipped map {chosen.name}")
+        lines = [f"format: {recording.format}", f"extends: {chosen.name}"]
+        return _text(path, lines, found, why, [])
+    columns = recording.fields("")
+    time, found = recognised(columns, recording.units)
+    lines = ["# time: {field: ..., unit: ms}      # no column seems to hold it"]
+    if time is not None:
+        about = "unit" if time.unit else "its unit is told by its step"
+        lines = [f"time: {_inline(time.model_dump(exclude_none=True))}      # by its name; {about}"]
+    inferred = _inferred(path)
+    why = {
+        signal: "by the names" + _of_unit(source, inferred.get(signal), signal)
+        for signal, source in found.items()
+    }
+    taken = {field for source in found.values() for field in source.fields or ()}
+    taken |= set() if time is None else {time.field}
+    lines.insert(0, f"format: {recording.format}")
+    return _text(path, lines, found, why, [c for c in columns if c not in taken])
+
+
+def _inferred(path: Path) -> dict[str, str]:
+    """Return in which units signals are by their numbers: signal -> words."""
+    with contextlib.suppress(RecordingError):
+        notes = read_content(ReadOptions(path)).notes
+        codes = (NoteCode.UNIT_READ, NoteCode.FRAME_TURNED)
+        return {note.names[0]: note.names[1] for note in notes if note.code in codes}
+    return {}
+
+
+def _of_unit(source: Source, inferred: str | None, name: str) -> str:
+    if inferred:
+        return f"; by the numbers {inferred}"
+    if source.unit or (name == "attitude" and source.quaternion != "rpy"):
+        return ""
+    return "; no unit among them: SI as it seems, add it if that is wrong"
+
+
+def _text(
+    path: Path,
+    lines: list[str],
+    found: dict[str, Source],
+    why: dict[str, str],
+    unused: list[str],
+) -> str:
+    name = "".join(letter if letter.isalnum() else "_" for letter in path.stem)[:40]
+    text = [
+        f"# A suggestion for {path.name!r}: check it, and read with --topics FILE.",
+        f"name: {name or 'suggested'}",
+        *lines,
+        "signals:" if found else "signals: {}",
+    ]
+    for signal, source in found.items():
+        about = source.model_dump(exclude_defaults=True, exclude_none=True)
+        about = {key: list(of) if isinstance(of, tuple) else of for key, of in about.items()}
+        text.append(f"  {signal}: {_inline(about)}      # {why[signal]}")
+    lacking = [signal for signal in LACKING if signal not in found]
+    for signal in lacking:
+        dots = ", ".join(["..."] * SIGNALS[signal][0])
+        text.append(f"  # {signal}: {{fields: [{dots}], unit: si}}      # no column seems so")
+    if unused:
+        text.append(f"# not used: {', '.join(ascii(column)[1:-1] for column in unused)}")
+    return "\n".join(text) + "\n"
+
+
+def _inline(value: object) -> str:
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000, allow_unicode=True).strip()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tuner.recordings.flight import SIGNALS, Array, Series
 
@@ -38,7 +38,11 @@ def resample(signal: str, series: Series, clock: Array) -> Array:
             result[np.logical_not(_covered(time, clock)), column] = np.nan
         else:
             gap = FOREVER if signal == "lap" else longest_gap(time)
-            result[:, column] = _hold(time, values, clock, gap)
+            # A nanosecond of tolerance: stamps that were moved onto ticks carry rounding errors.
+            index = np.searchsorted(time, clock + 1e-9, side="right") - 1
+            last = np.maximum(index, 0)
+            known = (index >= 0) & (clock - time[last] <= gap)
+            result[:, column] = np.where(known, values[last], np.nan)
     return result
 
 
@@ -79,6 +83,12 @@ def longest_gap(time: Array) -> float:
     return max(GAP, 3 * float(np.median(np.diff(time)))) if len(time) > 1 else GAP
 
 
+def runs(flags: ArrayLike) -> list[tuple[int, int]]:
+    """Return where each run of true flags begins, and behind its end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(flags, np.int8), [0]])))
+    return [(int(first), int(behind)) for first, behind in edges.reshape(-1, 2)]
+
+
 def _covered(time: Array, clock: Array) -> NDArray[np.bool_]:
     """Return for which instants samples lie on both sides, not too far apart."""
     after = np.clip(np.searchsorted(time, clock, side="left"), 0, len(time) - 1)
@@ -112,13 +122,6 @@ def _along_arc(series: Series, clock: Array) -> Array:
     sign = np.concatenate([[1.0], np.cumprod(flips)])
     result[known] = arc * (sign if arc[0, 0] >= 0 else -sign)[:, None]
     return result
-
-
-def _hold(time: Array, values: Array, clock: Array, gap: float) -> Array:
-    # A nanosecond of tolerance: stamps that were moved onto ticks carry rounding errors.
-    index = np.searchsorted(time, clock + 1e-9, side="right") - 1
-    known = (index >= 0) & (clock - time[np.maximum(index, 0)] <= gap)
-    return np.where(known, values[np.maximum(index, 0)], np.nan)
 
 
 def stretch(series: Mapping[str, Series]) -> Array:

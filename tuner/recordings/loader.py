@@ -18,11 +18,11 @@ import numpy as np
 from tuner.core.disk import exists, readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.cache import cached, digest, load, store
-from tuner.recordings.clocks import Grid, fit_grid
+from tuner.recordings.clocks import Grid, clock_of
 from tuner.recordings.content import Content, ReadOptions, read_content
 from tuner.recordings.flight import SIGNALS, Array, Flight, InitialState, Series
-from tuner.recordings.interpolation import longest_gap, resample, without_gaps
-from tuner.recordings.missions import Mission, yaw_spin
+from tuner.recordings.interpolation import longest_gap, resample, runs, without_gaps
+from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Damage, Note, NoteCode
 from tuner.recordings.states import initial_state
 from tuner.recordings.topics import TopicMap
@@ -48,7 +48,7 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
     """
     path, rate, series = options.path, options.rate, content.series
     mission = content.missions[index]
-    grid = _mission_grid(series, mission, rate)
+    grid = clock_of(series, rate, mission.start - BEFORE, mission.end)
     start = grid.tick_nearest(mission.start) if grid else mission.start
     count = math.floor((mission.end - start) * rate + 1e-6) + 1
     if count < 2:
@@ -58,7 +58,9 @@ def make_flight(content: Content, options: ReadOptions, index: int, *, sha256: s
         raise RecordingError(path, what, "give 'start' and 'end' in a side-car")
     clock = np.arange(count) / rate
     # Beyond the last tick, so that it has a sample on either side.
-    nearby = {name: _from_start(data, start, mission.end + AFTER) for name, data in series.items()}
+    kept = (start - BEFORE, mission.end + AFTER + 1e-6)
+    near = {name: data.between(*kept) for name, data in series.items()}
+    nearby = {name: Series(data.time - start, data.values) for name, data in near.items()}
     until = mission.end - start + 1e-6
     mission_series = {name: data.between(-np.inf, until) for name, data in nearby.items()}
     mission_series = {name: data for name, data in mission_series.items() if len(data.time)}
@@ -100,28 +102,10 @@ def gaps_in(signals: Mapping[str, Array], series: Mapping[str, Series], rate: fl
         known = np.isfinite(values).any(axis=1)
         unknown = int((~known).sum())
         if unknown > longest_gap(series[name].time) * rate:
-            edges = np.diff(np.concatenate([[0], ~known, [0]]).astype(np.int8))
-            runs = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
-            times = {"seconds": unknown / rate, "longest": float(runs.max() / rate)}
+            longest = max(behind - first for first, behind in runs(~known))
+            times = {"seconds": unknown / rate, "longest": longest / rate}
             notes.append(Note(NoteCode.SIGNAL_UNKNOWN, count=unknown, numbers=times, names=(name,)))
     return notes
-
-
-def _mission_grid(series: Mapping[str, Series], mission: Mission, rate: float) -> Grid | None:
-    """Fit the uniform clock to the reference or, where there is none, to the set-points."""
-    for name in ("reference_position", "rate_setpoint", "thrust_setpoint"):
-        if name in series:
-            time = series[name].time
-            near = time[(time >= mission.start - BEFORE) & (time <= mission.end)]
-            grid = fit_grid(near, rate)
-            if grid is not None:
-                return grid
-    return None
-
-
-def _from_start(series: Series, start: float, end: float) -> Series:
-    kept = series.between(start - BEFORE, end + 1e-6)
-    return Series(kept.time - start, kept.values)
 
 
 def _on_clock(signal: str, series: Series, clock: Array, grid: Grid | None) -> Array:

@@ -7,13 +7,15 @@ reads what ``save`` writes by default, h5py the files of version 7.3.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import pyarrow
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.columns import guess
@@ -28,7 +30,7 @@ from tuner.recordings.recording import (
     TabularRecording,
     reason_of,
 )
-from tuner.recordings.times import NEVER, read_times
+from tuner.recordings.table import NEVER, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"
 #: Bytes of all arrays together, and how many arrays: scipy recurses into those inside others.
@@ -104,8 +106,6 @@ class MatlabTable(TabularRecording):
         self, clock: Clock, names: list[str], fields: tuple[str, ...]
     ) -> tuple[Samples, tuple[Note, ...]]:
         """Return the rows of one structure, NaN in the columns of the others."""
-        import pyarrow  # noqa: PLC0415 (a third of a second)
-
         stamps = self._columns[clock.field]
         column = pyarrow.chunked_array([pyarrow.array(stamps)])
         held = {name: self._columns[name] for name in names}
@@ -120,9 +120,15 @@ def _load(path: Path) -> Mapping[str, Any]:
     from scipy.io import loadmat  # noqa: PLC0415 (slow to import)
 
     data = path.read_bytes() if path.stat().st_size <= LARGEST else b""
-    if not data or _unpacked(data) > LARGEST:
+    size, arrays = 0 if data else LARGEST + 1, 0
+    for piece in _unpacked(data):
+        size += len(piece)
+        arrays += piece.count(b"\x0e\0\0\0") + piece.count(b"\0\0\0\x0e")  # at least
+        if size > LARGEST:
+            break
+    if size > LARGEST:
         raise RecordingError(path, "is larger than any recording of a flight", "cut it")
-    if _arrays(data) > MOST_ARRAYS:
+    if arrays > MOST_ARRAYS:
         raise RecordingError(
             path, f"holds more than {MOST_ARRAYS} arrays", "save each signal as one array"
         )
@@ -137,52 +143,27 @@ def _unreadable(path: Path, err: Exception) -> RecordingError:
     return RecordingError(path, what, "save it again")
 
 
-def _packed(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield kind and content of the elements of a file."""
-    order = "little" if data[126:128] == b"IM" else "big"
+_COMPRESSED = 15
+"""Kind of an element."""
+
+
+def _unpacked(data: bytes) -> Iterator[bytes]:
+    """Yield what the elements of a file hold, unpacked, a megabyte of packed ones at a time."""
+    order: Literal["little", "big"] = "little" if data[126:128] == b"IM" else "big"
     at = 128
     while at + 8 <= len(data):
-        kind = int.from_bytes(data[at : at + 4], order)  # type: ignore[arg-type]
-        size = int.from_bytes(data[at + 4 : at + 8], order)  # type: ignore[arg-type]
-        yield kind, data[at + 8 : at + 8 + size]
+        kind = int.from_bytes(data[at : at + 4], order)
+        size = int.from_bytes(data[at + 4 : at + 8], order)
+        content = data[at + 8 : at + 8 + size]
         at += 8 + size
-
-
-_COMPRESSED = 15
-
-
-def _inflated(content: bytes) -> bytes:
-    try:
-        return zlib.decompressobj().decompress(content, LARGEST + 1)
-    except zlib.error:
-        return b""
-
-
-def _unpacked(data: bytes) -> int:
-    """Return how many bytes a file has, unpacked, up to a little over `LARGEST`."""
-    total = len(data)
-    for kind, content in _packed(data):
         if kind != _COMPRESSED:
+            yield content
             continue
-        unpacking, left = zlib.decompressobj(), content
-        while left and total <= LARGEST:
-            try:
-                total += len(unpacking.decompress(left, 1 << 20))
-            except zlib.error:
-                break
-            left = unpacking.unconsumed_tail
-    return total
-
-
-def _arrays(data: bytes) -> int:
-    """Return at least how many arrays a file holds, those inside others too."""
-    tags = b"\x0e\0\0\0", b"\0\0\0\x0e"
-    return sum(
-        part.count(tag)
-        for kind, content in _packed(data)
-        for part in (_inflated(content) if kind == _COMPRESSED else content,)
-        for tag in tags
-    )
+        unpacking = zlib.decompressobj()
+        with contextlib.suppress(zlib.error):
+            while content:
+                yield unpacking.decompress(content, 1 << 20)
+                content = unpacking.unconsumed_tail
 
 
 def _load_hdf5(path: Path) -> Mapping[str, Any]:

@@ -74,7 +74,7 @@ class MicroSdRecording(Recording):
         self._data = path.read_bytes()
         header = _Header(path, self._data)
         self._events, self._unit = header.events(), header.unit
-        self._whole = _crc_is_right(self._data)
+        self._whole = zlib.crc32(self._data[:-4]) == int.from_bytes(self._data[-4:], "little")
         end = len(self._data) - (CHECKSUM if self._whole else 0)
         self._offsets, self._reached = _records(self._data, header.at, end, self._events)
         self._lost = end - self._reached
@@ -182,10 +182,6 @@ class _Header:
         return RecordingError(
             self._path, f"is no readable micro-SD log: its header has {what}", "record it again"
         )
-
-
-def _crc_is_right(data: bytes) -> bool:
-    return zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
 
 
 def _records(

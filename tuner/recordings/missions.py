@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.recordings.flight import Array, Series
+from tuner.recordings.interpolation import runs
 
 AT_REST = 1e-5
 """Reference motion below this, in m or m/s, is a reference at rest."""
@@ -104,7 +105,8 @@ def find_missions(series: Mapping[str, Series]) -> tuple[Mission, ...]:
         flying = [(max(up, spans[0][0]), min(down, spans[0][1])) for up, down in flying]
     for up, down in flying:
         begin, begins_with = _motion_or_flight(series, up, down)
-        end = min(down, last, _reference_end(series, last))
+        referred = series["reference_position"].time[-1] if "reference_position" in series else last
+        end = min(down, last, float(referred))
         missions.append(Mission(begin, end, begins_with))
     return _long_enough(missions)
 
@@ -118,27 +120,15 @@ def _long_enough(missions: list[Mission]) -> tuple[Mission, ...]:
     return tuple(m for m in missions if m.end - m.start >= SHORTEST)
 
 
-def _reference_end(series: Mapping[str, Series], last: float) -> float:
-    return float(series["reference_position"].time[-1]) if "reference_position" in series else last
-
-
 def _first_motion(series: Mapping[str, Series], start: float, end: float) -> float:
     """Return when the reference begins to move within a stretch; its start if it does not."""
-    firsts = []
+    firsts: list[float] = []
     for name in ("reference_position", "reference_velocity"):
-        if name not in series:
-            continue
-        samples = series[name]
-        inside = np.flatnonzero((samples.time >= start) & (samples.time <= end))
-        if len(inside) == 0:
-            continue
-        values = samples.values[inside]
-        known = np.isfinite(values).all(axis=1)
-        if not known.any():
-            continue
-        moving = np.abs(values - values[known][0]).max(axis=1) > AT_REST
-        if (moving & known).any():
-            firsts.append(float(samples.time[inside[np.argmax(moving & known)]]))
+        if name in series:
+            samples = series[name].between(start, end)
+            known = np.isfinite(samples.values).all(axis=1)
+            time, values = samples.time[known], samples.values[known]
+            firsts += time[np.abs(values - values[:1]).max(axis=1) > AT_REST][:1].tolist()
     return min(firsts, default=start)
 
 
@@ -160,15 +150,9 @@ def airborne(series: Mapping[str, Series]) -> list[tuple[float, float]]:
         return [(float(time[0]), float(time[-1]))]
     low = grounded | ~(height > _ground(time, height, grounded) + CLEAR)
     if not stands.any():  # the ground is a guess, and what passes it without a rest flies
-        for first, last in _runs(low):
+        for first, last in runs(low):
             low[first:last] = (grounded | rests)[first:last].any()
     return stretches(time, ~low)
-
-
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return where each run of true flags begins, and behind its end."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    return [(int(first), int(last)) for first, last in edges.reshape(-1, 2)]
 
 
 def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
@@ -191,7 +175,7 @@ def _rests(time: Array, positions: Array) -> NDArray[np.bool_]:
 def _lasting(time: Array, idle: NDArray[np.bool_], rests: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return where motors idle, but for moments inside a flight in which the vehicle moves on."""
     lasting = idle.copy()
-    for first, last in _runs(idle):
+    for first, last in runs(idle):
         inside = first > 0 and last < len(time)
         if inside and time[last - 1] - time[first] < PAUSE and not rests[first:last].any():
             lasting[first:last] = False
@@ -240,10 +224,9 @@ def _ground(time: Array, height: Array, idle: NDArray[np.bool_]) -> Array:
     where = np.flatnonzero(idle)
     before = np.clip(np.searchsorted(where, np.arange(len(time)), side="right") - 1, 0, None)
     gaps = np.diff(where) > 1
-    runs = np.split(height[where], np.flatnonzero(gaps) + 1)
-    levels = np.array([np.median(run) for run in runs])
+    levels = [np.median(run) for run in np.split(height[where], np.flatnonzero(gaps) + 1)]
     run_of = np.cumsum(np.concatenate([[0], gaps]))
-    return np.asarray(levels[run_of[before]])
+    return np.asarray(np.array(levels)[run_of[before]])
 
 
 def stretches(
@@ -253,8 +236,8 @@ def stretches(
     holds = time[up]
     if len(holds) == 0:
         return []
-    runs = np.split(holds, np.flatnonzero(np.diff(holds) > bridged) + 1)
-    return [(float(run[0]), float(run[-1])) for run in runs]
+    parts = np.split(holds, np.flatnonzero(np.diff(holds) > bridged) + 1)
+    return [(float(part[0]), float(part[-1])) for part in parts]
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ PX4's ``logged_topics.cpp``.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -76,11 +75,6 @@ USUAL: Mapping[str, Mapping[str, Usual]] = {
     "battery_status": {"battery_voltage": _fields("voltage_v")},
 }
 """Message, named as in a log -> signal -> where it is."""
-
-
-def log_name(ros_type: str) -> str:
-    """Return the name in a log of ``px4_msgs/msg/VehicleLocalPosition``."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", ros_type.rpartition("/")[2]).lower()
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,12 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Literal
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.columns import Found, recognised
+from tuner.recordings.columns import recognised
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.notes import Note, NoteCode, reason_in_words
-from tuner.recordings.recording import Clock, Recording
+from tuner.recordings.recording import Recording
 from tuner.recordings.topics import Source, TopicMap
 
 NAMED = 12
@@ -89,10 +88,8 @@ def locate(
 def _matching(recording: Recording, source: Source) -> list[str]:
     """Return the recorded topics of a name or pattern, the one with most messages first."""
     pattern = source.topic
-    if "*" not in pattern:
-        known = [topic for topic in recording.topics if topic.name == pattern and topic.count]
-    else:
-        known = [t for t in recording.topics if t.count and fnmatchcase(t.name, pattern)]
+    alike = fnmatchcase if "*" in pattern else str.__eq__
+    known = [topic for topic in recording.topics if topic.count and alike(topic.name, pattern)]
     return [topic.name for topic in sorted(known, key=lambda t: (-t.count, t.name))]
 
 
@@ -131,12 +128,6 @@ def unread(recording: Recording, topics: TopicMap, places: Mapping[str, Place]) 
     return (note,) if others else ()
 
 
-def source_of(name: str, columns: Found) -> Source:
-    """Return the source of a signal, or of an attitude in ``angles``, that some columns hold."""
-    order: Literal["wxyz", "rpy"] = "rpy" if name == "angles" else "wxyz"
-    return Source(fields=columns.fields, unit=columns.unit, quaternion=order)
-
-
 def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tuple[Note, ...]]:
     """Return a map of a table with the columns that it lacks and whose names say what they hold.
 
@@ -148,24 +139,22 @@ def with_guesses(recording: Recording, topics: TopicMap) -> tuple[TopicMap, tupl
     if not is_tabular(recording.format):
         return topics, ()
     columns = recording.fields("")
-    found = recognised(columns, recording.units)
+    time, found = recognised(columns, recording.units)
     held = locate(recording, topics)[0]
-    if not {"position", "attitude"} <= set(held) and len(found) > len(held):
+    if not {"position", "attitude"} <= set(held) and len(found) + bool(time) > len(held):
         topics = topics.replace(name="the columns' names", time=(), signals={})
     times = topics.time
-    if not any(clock.field in columns for clock in times) and "time" in found:
-        time = found["time"]
-        times = (Clock(field=time.fields[0], unit=time.unit),)  # type: ignore[arg-type]
+    if time is not None and not any(clock.field in columns for clock in times):
+        times = (time,)
     whole = topics.replace(time=times)
     places, _ = locate(recording, whole)
     taken = {field for place in places.values() for field in place.fields}
     signals, notes = dict(topics.signals), []
-    for name, columns_of in found.items():
-        signal = "attitude" if name == "angles" else name
-        if name == "time" or signal in places or taken & set(columns_of.fields):
-            continue
-        signals[signal] = (source_of(name, columns_of),)
-        notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *columns_of.fields)))
+    for signal, source in found.items():
+        fields = source.fields or ()
+        if signal not in places and not taken & set(fields):
+            signals[signal] = (source,)
+            notes.append(Note(NoteCode.COLUMNS_TAKEN, "info", names=(signal, *fields)))
     return whole.replace(signals=signals), tuple(notes)
 
 

@@ -1,36 +1,49 @@
-"""Tables: CSV and Parquet, one row a time, one column a number; how a text table is laid out."""
+"""Tables: CSV and Parquet, one row a time, one column a number; their times as nanoseconds.
+
+Nothing in a table says in which unit its times are. How often a flight is sampled does: between
+`SLOWEST` and `FASTEST` Hz exactly one of s, ms, µs and ns has any given step.
+"""
 
 from __future__ import annotations
 
-import csv
 import io
-import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import numpy as np
+import pyarrow
+from numpy.typing import NDArray
+from pyarrow import (
+    ArrowException,
+    ArrowInvalid,
+    ArrowNotImplementedError,
+    compute,
+    float64,
+    int64,
+    types,
+)
+from pyarrow import csv as arrow_csv
 
 from tuner.core.errors import RecordingError
+from tuner.recordings.flight import Array
+from tuner.recordings.layout import LONGEST_LINE, layout_of
 from tuner.recordings.notes import Cause, Damage, Note, NoteCode
-from tuner.recordings.recording import ROWS, Contents, Request, Samples, TabularRecording, reason_of
-from tuner.recordings.times import NEVER, numbers_of, read_times
-
-if TYPE_CHECKING:
-    import pyarrow
+from tuner.recordings.recording import (
+    NANOSECONDS,
+    ROWS,
+    Clock,
+    Contents,
+    Nanoseconds,
+    Request,
+    Samples,
+    TabularRecording,
+    reason_of,
+)
 
 #: Tables with more columns or cells are no flight.
 MOST_COLUMNS = 10_000
 MOST_CELLS = 500_000_000
-#: A longer line, in bytes, is no row of a table.
-LONGEST_LINE = 1 << 20
-MOST_LINES = 1000
-#: Marks at the beginning of a text, and the encodings that they stand for.
-MARKS = {
-    b"\xef\xbb\xbf": "utf-8-sig",
-    b"\xff\xfe": "utf-16",
-    b"\xfe\xff": "utf-16",
-}
-COMMENTS = ("#", "%", "//")
 
 
 class Table(TabularRecording):
@@ -53,7 +66,11 @@ class Table(TabularRecording):
         self.units: Mapping[str, str] = {}
         with path.open("rb") as stream:
             self._parquet = stream.read(4) == b"PAR1"
-        columns = self._parquet_columns() if self._parquet else self._csv_columns()
+        if self._parquet:
+            columns = self._parquet_columns()
+        else:
+            self._layout = layout_of(path)
+            self.units, columns = self._layout.units, list(self._layout.columns)
         if len(set(columns)) < 2 or len(columns) > MOST_COLUMNS:
             raise RecordingError(
                 path, f"{len(columns)} columns are no table of a flight", "check its first line"
@@ -80,13 +97,8 @@ class Table(TabularRecording):
         samples = Samples(time[kept], time[kept], fields)
         return Contents({ROWS: samples}, tuple(notes), tuple(damage))
 
-    def _csv_columns(self) -> list[str]:
-        self._layout = layout_of(self.path)
-        self.units = self._layout.units
-        return list(self._layout.columns)
-
     def _parquet_columns(self) -> list[str]:
-        from pyarrow import ArrowException, parquet  # noqa: PLC0415 (a third of a second)
+        from pyarrow import parquet  # noqa: PLC0415 (a third of a second)
 
         try:
             with parquet.ParquetFile(self.path) as file:
@@ -110,8 +122,6 @@ class Table(TabularRecording):
             raise RecordingError(self.path, _why(err), "write it again") from None
 
     def _read_csv(self, names: list[str]) -> pyarrow.Table:
-        import pyarrow  # noqa: PLC0415
-        from pyarrow import compute, csv  # noqa: PLC0415
 
         def skip(_: object) -> str:
             self._skipped += 1
@@ -119,20 +129,20 @@ class Table(TabularRecording):
 
         self._skipped = 0
         layout = self._layout
-        table = csv.read_csv(
+        table = arrow_csv.read_csv(
             self.path if layout.separator != " " else _single_blanks(self.path),
-            read_options=csv.ReadOptions(
+            read_options=arrow_csv.ReadOptions(
                 use_threads=False,
                 block_size=4 * LONGEST_LINE,
                 skip_rows=layout.lines_before,
                 column_names=self.columns,
                 encoding=layout.encoding,
             ),
-            parse_options=csv.ParseOptions(
+            parse_options=arrow_csv.ParseOptions(
                 delimiter=layout.separator, invalid_row_handler=skip, newlines_in_values=False
             ),
             # As text first: a stray word must not cost a column, nor a float a time's last digits.
-            convert_options=csv.ConvertOptions(
+            convert_options=arrow_csv.ConvertOptions(
                 include_columns=names,
                 column_types=dict.fromkeys(names, pyarrow.string()),
                 strings_can_be_null=False,
@@ -154,151 +164,194 @@ def _why(err: Exception) -> str:
     return f"is no readable table ({reason_of(err)})"
 
 
-#: Bytes and lines within which a table's rows have begun.
-HEAD = 4 * LONGEST_LINE
-_NUMBER = re.compile(r"^[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$|^[+-]?(nan|inf(inity)?)$", re.I)
-_UNIT = re.compile(r"^[\[(]?[a-zA-Zµ°%0-9/^*.·\-²³ ]{0,12}[\])]?$")
+#: Stands for a row without a time.
+NEVER = np.iinfo(np.int64).min
+#: Hz at which flights are sampled: a thousand apart, as the units of time are.
+SLOWEST, FASTEST = 3.0, 3000.0
+#: Rows that one stamp may be on, before it counts as one of too few digits.
+SHARED = 10
+#: Fields by whose samples the step is told.
+LOOKED_AT = 24
+UNIT_NAMES = {
+    "s": "in seconds",
+    "ms": "in milliseconds",
+    "us": "in microseconds",
+    "ns": "in nanoseconds",
+}
+
+_DATE = r"^\d{4}-\d{2}-\d{2}[T ]\d{2}:\d{2}:\d{2}(\.\d{1,9})?(Z|[+-]\d{2}(:?\d{2})?)?$"
+_TIME_OF_DAY = r"^\d{2}:\d{2}:\d{2}(\.\d{1,9})?$"
+_DAY = 24 * 3600 * NANOSECONDS["s"]
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What the first lines of a text table give away.
+def read_times(
+    path: Path, column: pyarrow.ChunkedArray, clock: Clock, fields: Iterable[Array]
+) -> tuple[Nanoseconds, tuple[Note, ...]]:
+    """Return the times (n,) of a table's rows in ns, `NEVER` where there is none.
 
-    Attributes
+    Parameters
     ----------
-    encoding
-        A codec's name.
-    separator
-        Between two cells.
-    decimal_comma
-        Whether numbers are written as ``1,5``.
-    columns
-        Their names, as they stand there without surrounding blanks; each once.
-    units
-        Column -> unit, of a row of units under the names.
-    lines_before
-        How many lines come before the first row of numbers.
-    """
+    path
+        The table, for errors.
+    column
+        As it stands in the table: whole numbers, floats, time stamps or text.
+    clock
+        What the topic map says of it; without a unit, that is told by the step.
+    fields
+        (n,) of the signals, NaN where a row holds no sample.
 
-    encoding: str
-    separator: str
-    decimal_comma: bool
-    columns: tuple[str, ...]
-    units: Mapping[str, str]
-    lines_before: int
-
-
-def encoding_of(start: bytes) -> str:
-    """Return the codec of a text by how it begins: latin-1, which reads all, without a mark."""
-    return next((codec for mark, codec in MARKS.items() if start.startswith(mark)), "latin-1")
-
-
-def text_of(start: bytes) -> str:
-    """Return the text that a file begins with."""
-    encoding = encoding_of(start)
-    return start.decode("utf-8" if encoding == "latin-1" else encoding, errors="replace")
-
-
-def is_table(start: bytes) -> bool:
-    """Return whether a file begins as a text with cells in its first line that is no comment."""
-    wide = encoding_of(start).startswith("utf-16")
-    text = text_of(start)
-    if not all(ord(letter) >= 32 or letter in "\r\n\t" for letter in text):
-        return False
-    if not wide and not all(byte >= 32 or byte in b"\r\n\t" for byte in start):
-        return False
-    lines = text.splitlines()[:MOST_LINES]
-    first = next((i for i, line in enumerate(lines) if not _is_comment(line)), 0)
-    line = lines[first] if lines else ""
-    behind = lines[first + 1] if first + 1 < len(lines) else line
-    separator = _separator(line)
-    return separator != " " or (len(_cells(line, " ")) > 3 and _is_row(behind, " "))
-
-
-def layout_of(path: Path) -> Layout:
-    """Return how a text table is laid out.
+    Returns
+    -------
+    tuple
+        The times, and a note on their unit where that was told and is not the usual one.
 
     Raises
     ------
     RecordingError
-        It has no line of column names.
+        It holds neither numbers nor dates, its unit is uncertain, or its stamps are too coarse.
     """
-    with path.open("rb") as stream:
-        head = stream.read(HEAD)
-    encoding = encoding_of(head)
-    lines = text_of(head).splitlines()[:MOST_LINES]
-    place = next((i for i, line in enumerate(lines) if not _is_comment(line)), len(lines) - 1)
-    separator = _separator(lines[place] if lines else "")
-    names = place
-    if names and _is_row(lines[place], separator) and _is_header(lines[place - 1], separator):
-        names -= 1  # the names stand in the last comment
-        place -= 1
-    elif lines and _is_row(lines[place], separator):
+    if types.is_timestamp(column.type):
+        whole = compute.cast(compute.cast(column, "timestamp[ns]"), int64())
+        return np.asarray(array_of(compute.fill_null(whole, NEVER)), dtype=np.int64), ()
+    numbers = numbers_of(column)
+    sampled = [np.isfinite(field) for field in list(fields)[:LOOKED_AT]] or [np.isfinite(numbers)]
+    if is_text(column) and not np.isfinite(numbers).any():
+        times, unit = _dates(path, column, clock.field), None
+    else:
+        unit = None if clock.unit else _unit(path, clock.field, numbers, sampled)
+        times = _whole(column, numbers, NANOSECONDS[clock.unit or unit or "s"])
+    _require_digits(path, column, times, sampled)
+    if unit is None or unit == "s":
+        return times, ()
+    names = (clock.field, UNIT_NAMES[unit])
+    return times, (Note(NoteCode.UNIT_READ, topic=ROWS, count=len(times), names=names),)
+
+
+def numbers_of(column: pyarrow.ChunkedArray) -> Array:
+    """Return a column as floats, NaN where a cell holds no number."""
+    try:
+        if is_text(column):
+            column = compute.utf8_trim_whitespace(column)
+            column = compute.replace_substring_regex(column, pattern=r"^$", replacement="nan")
+        return np.asarray(array_of(compute.cast(column, float64())), dtype=np.float64)
+    except (ArrowInvalid, ArrowNotImplementedError):
+        return np.array([_number(cell) for cell in column.to_pylist()], dtype=np.float64)
+
+
+def array_of(column: pyarrow.ChunkedArray) -> NDArray[Any]:
+    """Return a column's numbers, in a way that leaves pandas asleep (half a second) if it can."""
+    whole = column.combine_chunks()
+    if whole.null_count:
+        return np.asarray(whole.to_numpy(zero_copy_only=False))
+    return np.from_dlpack(whole)
+
+
+def is_text(column: pyarrow.ChunkedArray) -> bool:
+    """Return whether a column holds text."""
+    return bool(types.is_string(column.type))
+
+
+def _number(cell: object) -> float:
+    try:
+        return float(cell)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return float("nan")
+
+
+def _unit(path: Path, field: str, numbers: Array, sampled: list[NDArray[np.bool_]]) -> str | None:
+    """Return the unit in which samples follow each other as those of a flight do."""
+    steps = []
+    for there in sampled:
+        between = np.diff(numbers[there & np.isfinite(numbers)])
+        steps.append(float(np.median(between[between > 0])) if (between > 0).any() else np.nan)
+    if not np.isfinite(steps).any():
+        return None
+    step = float(np.nanmedian(steps))
+    for unit, factor in NANOSECONDS.items():
+        if SLOWEST <= NANOSECONDS["s"] / (step * factor) < FASTEST:
+            return unit
+    raise RecordingError(
+        path,
+        f"its '{field}' goes on by {step:g} from one sample to the next, which is no step of a "
+        "flight in s, ms, us or ns",
+        f"give its unit in a topic map (time: {{field: {field}, unit: ms}})",
+    )
+
+
+def _whole(column: pyarrow.ChunkedArray, numbers: Array, unit: int) -> Nanoseconds:
+    """Return a column of numbers in whole ns, with every digit that a text holds."""
+    known = np.isfinite(numbers) & (np.abs(numbers) < 9e18 / unit)
+    result = np.full(len(numbers), NEVER, dtype=np.int64)
+    if types.is_integer(column.type) and not column.null_count:
+        result[known] = np.asarray(array_of(column), dtype=np.int64)[known] * unit
+        return result
+    result[known] = np.rint(numbers[known] * unit)
+    if is_text(column) and known.any() and np.abs(numbers[known]).max() > 1e6:
+        # A float has some 16 digits, too few for nanoseconds since 1970.
+        try:
+            text = compute.utf8_trim_whitespace(column.combine_chunks())
+            parts = compute.split_pattern(text, ".", max_splits=1)
+            whole = compute.list_element(parts, 0)
+            start = np.from_dlpack(compute.cast(whole, int64()))
+        except ArrowInvalid:
+            return result
+        rest = np.zeros(len(numbers))
+        for i, cell in enumerate(text.to_pylist()):
+            rest[i] = _number(f"0.{cell.partition('.')[2]}") if "." in cell else 0.0
+        exact = known & np.isfinite(rest) & (start >= 0)
+        result[exact] = start[exact] * unit + np.rint(rest[exact] * unit).astype(np.int64)
+    return result
+
+
+def _dates(path: Path, column: pyarrow.ChunkedArray, field: str) -> Nanoseconds:
+    """Return dates and times of day in ns, since 1970 or since midnight."""
+    text = compute.utf8_trim_whitespace(column.combine_chunks())
+    text = compute.replace_substring(text, ",", ".")
+    text = compute.replace_substring(text, "/", "-")
+    of_day = compute.match_substring_regex(text, _TIME_OF_DAY)
+    only_of_day = bool(compute.any(of_day).as_py())
+    text = compute.if_else(of_day, compute.binary_join_element_wise("1970-01-01", text, " "), text)
+    dated = compute.match_substring_regex(text, _DATE)
+    cells = compute.if_else(dated, text, None)
+    for zone in (None, "UTC") if compute.any(dated).as_py() else ():
+        try:
+            stamps = compute.cast(cells, pyarrow.timestamp("ns", zone))
+        except ArrowInvalid:  # some have a zone and some have none
+            continue
+        whole = compute.fill_null(compute.cast(stamps, pyarrow.int64()), NEVER)
+        times = np.asarray(np.from_dlpack(whole), dtype=np.int64)
+        return _over_midnight(times) if only_of_day else times
+    first = next((cell for cell in text.to_pylist() if cell), "")
+    raise RecordingError(
+        path,
+        f"its '{field}' holds {first[:40]!r}, which is neither a number nor a date",
+        "write seconds, or dates as 2026-04-02T14:13:00.123",
+    )
+
+
+def _over_midnight(times: Nanoseconds) -> Nanoseconds:
+    known = times != NEVER
+    on = times[known]
+    days = np.concatenate([[0], np.cumsum(np.diff(on) < -_DAY // 2)])
+    result = times.copy()
+    result[known] = on + days * _DAY
+    return result
+
+
+def _require_digits(
+    path: Path,
+    column: pyarrow.ChunkedArray,
+    times: Nanoseconds,
+    sampled: list[NDArray[np.bool_]],
+) -> None:
+    """Refuse stamps that were written with so few digits that many rows share them."""
+    there = times[max(sampled, key=np.count_nonzero)]
+    there = there[there != NEVER]
+    different = len(np.unique(there))
+    if len(there) >= 2 * SHARED and different * SHARED <= len(there):
+        first = str(column[0].as_py()).strip()[:30]
         raise RecordingError(
             path,
-            "has no line of column names: it begins with numbers",
-            "write the names of its columns into the first line",
+            f"its {len(there)} rows have {different} different times: '{first}' has too few digits",
+            "write the time with its fraction of a second, or count from the recording's start",
         )
-    columns = _cells(lines[names].lstrip("#/ ") if lines else "", separator)
-    place = names + 1
-    units: dict[str, str] = {}
-    if place + 1 < len(lines) and _is_units(lines[place], separator, len(columns)):
-        units = dict(zip(columns, _cells(lines[place], separator), strict=False))
-        place += 1
-    first = lines[place] if place < len(lines) else ""
-    width = len(_cells(first, separator))
-    if width == len(columns) - 1 and not columns[-1]:
-        columns = columns[:-1]
-    columns += [""] * (width == len(columns) + 1)  # every row ends with a separator
-    rows = [row for row in lines[place : place + 20] if row]
-    comma = separator != "," and any(re.search(r"\d,\d", row) for row in rows)
-    return Layout(encoding, separator, comma, _each_once(columns), units, place)
-
-
-def _is_comment(line: str) -> bool:
-    text = line.strip().lstrip("\ufeff")
-    return not text or (text.startswith(COMMENTS) and not text.startswith("%time"))
-
-
-def _separator(line: str) -> str:
-    """Return what parts the cells of a line."""
-    best = max(",;\t", key=line.count)
-    return best if best in line else " "
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    text = line.strip("\r\n").lstrip("\ufeff")
-    if separator == " ":
-        return text.split()
-    return [cell.strip().strip('"') for cell in next(csv.reader([text], delimiter=separator), [])]
-
-
-def _is_row(line: str, separator: str) -> bool:
-    """Return whether a line holds numbers and no names."""
-    cells = [cell for cell in _cells(line, separator) if cell]
-    numbers = sum(bool(_NUMBER.match(cell)) for cell in cells)
-    return numbers > len(cells) / 2
-
-
-def _is_header(line: str, separator: str) -> bool:
-    cells = _cells(line.lstrip("#%/ "), separator)
-    return len(cells) > 1 and not any(_NUMBER.match(cell) for cell in cells)
-
-
-def _is_units(line: str, separator: str, count: int) -> bool:
-    """Return whether a line under the names holds units."""
-    cells = _cells(line, separator)
-    if not count - 1 <= len(cells) <= count or any(_NUMBER.match(cell) for cell in cells):
-        return False
-    return any(cells) and all(_UNIT.match(cell) for cell in cells)
-
-
-def _each_once(columns: Sequence[str]) -> tuple[str, ...]:
-    """Return names that differ: the empty ones by their place, repeated ones with a number."""
-    seen: dict[str, int] = {}
-    names = []
-    for place, column in enumerate(columns):
-        name = column or f"column {place + 1}"
-        seen[name] = seen.get(name, 0) + 1
-        names.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
-    return tuple(names)

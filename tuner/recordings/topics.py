@@ -20,7 +20,7 @@ from tuner.recordings import formats as recording_formats
 from tuner.recordings.flight import SIGNALS
 from tuner.recordings.formats import is_tabular
 from tuner.recordings.recording import Clock
-from tuner.recordings.units import ATTITUDES, UNITS
+from tuner.recordings.unit_detection import ATTITUDES, UNITS
 from tuner.vehicle.motor_orders import MotorOrder
 
 #: Maps may extend maps this often.

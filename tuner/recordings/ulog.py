@@ -168,7 +168,9 @@ def _definitions(path: Path) -> tuple[Formats, dict[str, float], int]:
     formats: Formats = {}
     parameters: dict[str, float] = {}
     start = 16
-    for kind, content in _messages(path, start):
+    blocks = ((buffer, pair) for buffer, at in _blocks(path, start) for pair in pairwise(at))
+    for buffer, (begin, behind) in blocks:
+        kind, content = buffer[begin + 2], buffer[begin + 3 : behind]
         if kind in b"ALCD":
             break
         start += 3 + len(content)
@@ -185,13 +187,6 @@ def _definitions(path: Path) -> tuple[Formats, dict[str, float], int]:
         if _size(formats, name, 0) > LONGEST_MESSAGE:
             raise RecordingError(path, f"the format of {name} is absurd", "record it again")
     return formats, parameters, start
-
-
-def _messages(path: Path, at: int) -> Iterator[tuple[int, bytes]]:
-    """Yield type and content of each message, until one is cut."""
-    for buffer, places in _blocks(path, at):
-        for begin, end in pairwise(places):
-            yield buffer[begin + 2], buffer[begin + 3 : end]
 
 
 def parameters_of(path: Path) -> dict[str, float]:

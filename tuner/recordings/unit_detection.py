@@ -1,6 +1,7 @@
-"""Units that no topic map gives, inferred from physics and from the range of the numbers.
+"""Recorded numbers into SI, ENU, FLU and (w, x, y, z), and units that no topic map gives.
 
-What is certain is read so; what is not stays as it is, and is asked for where it matters. The unit
+The latter are inferred from physics and from the range of the numbers. What is certain is read so;
+what is not stays as it is, and is asked for where it matters. The unit
 of lengths follows from gravity: a multirotor is pushed along its thrust and pulled down by gravity,
 so that its recorded attitude alone says how fast it accelerates:
 
@@ -19,14 +20,107 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_jax.constants import GRAVITY
 from tuner.core.errors import RecordingError
 from tuner.recordings.flight import Array
 from tuner.recordings.interpolation import upward
 from tuner.recordings.notes import Note, NoteCode
-from tuner.recordings.units import ATTITUDE_READINGS, UNITS, quaternion_of, to_si
+
+#: Unit name in a topic map -> (factor, offset): SI value = factor * recorded + offset.
+UNITS: Mapping[str, tuple[float, float]] = {
+    "si": (1.0, 0.0),
+    "rpm": (math.tau / 60, 0.0),
+    "hz": (math.tau, 0.0),
+    "deg": (math.pi / 180, 0.0),
+    "deg/s": (math.pi / 180, 0.0),
+    "g": (9.80665, 0.0),
+    "mg": (9.80665e-3, 0.0),
+    "mm": (1e-3, 0.0),
+    "cm": (1e-2, 0.0),
+    "mV": (1e-3, 0.0),
+    "percent": (1e-2, 0.0),
+    "pwm_us": (1e-3, -1.0),
+    "pwm_16bit": (1 / 65535, 0.0),
+    "signed": (0.5, 0.5),
+}
+
+#: Signals whose vectors are written in world or in body axes.
+WORLD = {
+    "position",
+    "velocity",
+    "reference_position",
+    "reference_velocity",
+    "reference_acceleration",
+}
+BODY = {"body_rate", "acceleration", "rate_setpoint", "commanded_torque"}
+#: Signals that are quaternions.
+ATTITUDES = {"attitude", "attitude_setpoint"}
+
+
+def to_si(values: Array, unit: str) -> Array:
+    """Convert recorded numbers of any shape to SI."""
+    factor, offset = UNITS[unit]
+    return factor * values + offset
+
+
+def to_enu_flu(values: Array, signal: str) -> Array:
+    """Turn (n, k) values of a signal from NED world and FRD body axes to ENU and FLU.
+
+    A quaternion from FRD to NED becomes one from FLU to ENU: the world turns by
+    (0, 1, 1, 0)/sqrt(2), the body by (0, 1, 0, 0).
+    """
+    if signal in WORLD:
+        north, east, down = values.T
+        return np.column_stack([east, north, -down])
+    if signal in BODY:
+        forward, right, down = values.T
+        return np.column_stack([forward, -right, -down])
+    if signal in ATTITUDES:
+        w, x, y, z = values.T
+        return np.column_stack([w + z, x + y, x - y, w - z]) / math.sqrt(2)
+    if signal == "thrust_setpoint":  # PX4's thrust points down
+        return -values
+    return values
+
+
+def quaternion_of(angles: Array) -> Array:
+    """Return (n, 4) quaternions of (n, 3) roll, pitch and yaw in rad, turned about z, y, then x."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(0.5 * angles.T), np.sin(0.5 * angles.T)
+    return np.column_stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Another way to read recorded numbers, and its name in a sentence."""
+
+    name: str
+    read: Callable[[Array], Array]
+
+
+def _scalar_last(q: Array) -> Array:
+    return q[:, [3, 0, 1, 2]]
+
+
+def _inverse(q: Array) -> Array:
+    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
+
+
+#: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
+ATTITUDE_READINGS = (
+    Reading("scalar-last", _scalar_last),
+    Reading("world to body", _inverse),
+    Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
+    Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
+)
+
 
 LENGTHS = {"position": False, "velocity": True}
 """Signals of lengths that may come in another unit than metres; whether they are speeds."""
@@ -181,8 +275,7 @@ def scale_of(lengths: Stamped, attitude: Stamped, *, speeds: bool = False) -> Sc
     speeds
         Whether the lengths are speeds.
     """
-    middle = np.median(attitude.time) if len(attitude.time) else 0.0
-    lengths, attitude = _around(lengths, middle), _around(attitude, middle)
+    lengths, attitude = _near(lengths, attitude)
     if not len(lengths.time) or not len(attitude.time):
         return Scale()
     readings = (attitude.values, *(r.read(attitude.values) for r in ATTITUDE_READINGS))
@@ -245,8 +338,7 @@ def _best_known(scales: Iterable[Scale]) -> Scale:
 
 def _share_a_unit(position: Stamped, speed: Stamped) -> bool:
     """Return whether the position changes about as fast as a recorded speed says."""
-    middle = np.median(speed.time) if len(speed.time) else 0.0
-    position, speed = _around(position, middle), _around(speed, middle)
+    position, speed = _near(position, speed)
     if not len(position.time) or not len(speed.time):
         return False
     centres = _centres(position, speed)
@@ -268,9 +360,12 @@ def _centres(*signals: Stamped) -> Array:
     return np.asarray(first + BIN * (np.arange(int((last - first) / BIN) + 1) + 0.5))
 
 
-def _around(samples: Stamped, middle: float) -> Stamped:
-    near: NDArray[np.bool_] = np.abs(samples.time - middle) < LOOKED_AT
-    return Stamped(samples.time[near], samples.values[near])
+def _near(*signals: Stamped) -> list[Stamped]:
+    """Return signals' samples about the middle stamp of the last; those far off are wrong."""
+    last = signals[-1].time
+    middle = np.median(last) if len(last) else 0.0
+    near = [np.abs(samples.time - middle) < LOOKED_AT for samples in signals]
+    return [Stamped(s.time[n], s.values[n]) for s, n in zip(signals, near, strict=True)]
 
 
 def _binned(samples: Stamped, centres: Array) -> Array:
@@ -334,16 +429,6 @@ def _command(values: Array) -> str | None:
     return None
 
 
-def _rates(values: Array) -> str | None:
-    """Return degrees per second where no gyro measures so many radians."""
-    often = float(np.quantile(np.linalg.norm(values, axis=1), 0.9))
-    return "deg/s" if often > FASTEST_TURN else None
-
-
-def _voltage(values: Array) -> str | None:
-    return "mV" if 2000 < float(np.median(values)) < 100_000 else None
-
-
 def _force(values: Array) -> str | None:
     """Return the unit in which the mean is gravity, which turns with the body but little."""
     low, high = FORCE
@@ -356,9 +441,12 @@ def _force(values: Array) -> str | None:
 
 _RULES: Mapping[str, Callable[[Array], str | None]] = {
     "command": _command,
-    "battery_voltage": _voltage,
+    "battery_voltage": lambda v: "mV" if 2000 < float(np.median(v)) < 100_000 else None,
     "acceleration": _force,
-    "body_rate": _rates,
+    # no gyro measures so many radians
+    "body_rate": lambda w: (
+        "deg/s" if np.quantile(np.linalg.norm(w, axis=1), 0.9) > FASTEST_TURN else None
+    ),
 }
 
 

@@ -16,8 +16,8 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp
 
 from tuner.core.errors import InputError
+from tuner.core.runtime import installed
 from tuner.core.validation import first_complaint
-from tuner.core.versions import installed
 from tuner.service.errors import ServiceError
 from tuner.service.http import api, watching
 from tuner.service.metrics import Metrics

@@ -19,7 +19,7 @@ from starlette.requests import ClientDisconnect
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import file_name
 from tuner.core.errors import InputError
-from tuner.core.versions import installed
+from tuner.core.runtime import installed
 from tuner.service import jobs, recordings
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
 from tuner.service.history import history

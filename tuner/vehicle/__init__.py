@@ -21,7 +21,7 @@ from tuner.vehicle.vehicle import (  # isort: skip
     vehicle_text,
     write_vehicle,
 )
-from tuner.vehicle.values import check_names, initial_values, values_of, with_values  # isort: skip
+from tuner.vehicle.vehicle import check_names, initial_values, values_of, with_values  # isort: skip
 
 __all__ = [
     "COEFFICIENTS",

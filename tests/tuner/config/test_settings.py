@@ -3,8 +3,8 @@ import shutil
 import pytest
 
 from tuner.config import Options, find_job_file, settle
+from tuner.core.disk import find_flights
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.recording_paths import find_flights
 from tuner.core.shipped import configs_folder
 
 

@@ -12,13 +12,12 @@ import pytest
 
 from tests.tuner.uncertainty import making
 from tuner.core.errors import InputError
-from tuner.design import candidates as proposed
-from tuner.design.candidates import CLEARANCE, Arena, candidates
+from tuner.design import ranking as proposed
 from tuner.design.proposals import (
     Proposals,
     proposals_in_words,
 )
-from tuner.design.ranking import rank_next_flights
+from tuner.design.ranking import CLEARANCE, Arena, candidates, rank_next_flights
 from tuner.objective import flown
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted

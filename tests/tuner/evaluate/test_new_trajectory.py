@@ -8,7 +8,7 @@ import pytest
 
 from sim_jax.trajectory import Shape
 from tuner.cli import main
-from tuner.design.candidates import Arena, candidates
+from tuner.design.ranking import Arena, candidates
 
 SQUIRCLE = '''
 """A rounded square."""

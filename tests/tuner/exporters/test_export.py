@@ -6,9 +6,9 @@ import pytest
 from tests.tuner.exporters.conftest import MODELS, as_the_run_says, rmse
 from tuner.config.job import ExportSettings
 from tuner.core.errors import ExportError, InputError
-from tuner.exporters.draft import Draft, write
 from tuner.exporters.export import export, exports_of_job
 from tuner.exporters.gates import check
+from tuner.exporters.target import Draft, write
 from tuner.report.result_texts import export_sentence
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
 from tuner.vehicle import read_vehicle

@@ -7,11 +7,9 @@ from tuner.cli import main
 from tuner.config import JobFile
 from tuner.core.errors import ExportError
 from tuner.evaluate.comparison import Comparison
-from tuner.exporters import effective_of_run
-from tuner.exporters import refly as refly_module
-from tuner.exporters.effective_of_run import kept_effective
+from tuner.exporters import effective
+from tuner.exporters.effective import kept_effective, refly
 from tuner.exporters.export import export
-from tuner.exporters.refly import refly
 from tuner.exporters.simulators import GZ_SIM
 from tuner.result import (
     CoefficientResult,
@@ -101,8 +99,8 @@ def test_recordings_are_read_as_the_run_read_them(run, monkeypatch):
         seen.append(settings.vehicle)
         return reading(settings, fits=fits)
 
-    seen, reading = [], refly_module.read_usable
-    monkeypatch.setattr(refly_module, "read_usable", read)
+    seen, reading = [], effective.read_usable
+    monkeypatch.setattr(effective, "read_usable", read)
     refly(run, with_values(run.vehicle, {"motor_constant": 2e-5}))
     (began_with,) = seen  # by it commands follow from a commanded wrench, and inlets are chosen
     assert values_of(began_with)["rotor_drag_coefficient"] == 4e-4
@@ -168,14 +166,14 @@ def test_a_simulator_gets_coefficients_of_its_own_and_flies_as_it_computes(run, 
         export(run, "gz-sim", refly=refly, today=today)
     done = export(run, "gz-sim", refly=refly, refit=kept_effective, today=today)
     assert all(gate.passed for gate in done.gates)
-    vehicle, effective = kept_effective(run, GZ_SIM)
-    assert effective.rmse_effective.position < effective.rmse_unfitted.position
-    assert {term.group for term in effective.lost} >= {"max_relative_airspeed"}
+    vehicle, found = kept_effective(run, GZ_SIM)
+    assert found.rmse_effective.position < found.rmse_unfitted.position
+    assert {term.group for term in found.lost} >= {"max_relative_airspeed"}
     assert vehicle == GZ_SIM.flown(vehicle)
     assert "effective coefficients, not physical ones: gz-sim lacks" in done.path.read_text()
 
     def fail(*_):
         raise AssertionError("it is kept")
 
-    monkeypatch.setattr(effective_of_run, "effective_in", fail)
-    assert kept_effective(run, GZ_SIM) == (vehicle, effective)
+    monkeypatch.setattr(effective, "effective_in", fail)
+    assert kept_effective(run, GZ_SIM) == (vehicle, found)

@@ -11,9 +11,7 @@ from lxml import etree
 
 from tests.tuner.exporters.conftest import MODELS
 from tuner.core.errors import ExportError
-from tuner.exporters.draft import write
-from tuner.exporters.sdf.composite import Inertial, Pose, base_for, pose_of, together
-from tuner.exporters.sdf.model import read_model
+from tuner.exporters.sdf.model import Inertial, Pose, base_for, pose_of, read_model, together
 from tuner.exporters.sdf.patch import sdf_draft
 from tuner.exporters.sdf.spans import (
     Edit,
@@ -27,7 +25,7 @@ from tuner.exporters.sdf.spans import (
 )
 from tuner.exporters.sdf.tags import carried_values, composite, values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM
-from tuner.exporters.target import Choices, not_carried, target_of
+from tuner.exporters.target import Choices, not_carried, target_of, write
 from tuner.exporters.targets.sdf import TARGET, snippet_draft
 from tuner.vehicle import REGISTRY, Written, values_of
 

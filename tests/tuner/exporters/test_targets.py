@@ -10,12 +10,10 @@ from tuner.cli import main
 from tuner.core.errors import ExportError
 from tuner.core.shipped import EXPORT_TARGETS, configs_folder
 from tuner.evaluate.comparison import Comparison
-from tuner.exporters.draft import write
 from tuner.exporters.export import export_vehicle
 from tuner.exporters.flier import flier
-from tuner.exporters.hover import hover_command, thrust_to_weight
-from tuner.exporters.simulators import SIMULATORS
-from tuner.exporters.target import Choices, target_of
+from tuner.exporters.simulators import SIMULATORS, hover_command, thrust_to_weight
+from tuner.exporters.target import Choices, target_of, write
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
 

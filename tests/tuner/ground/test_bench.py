@@ -11,8 +11,8 @@ import yaml
 
 from tuner.cli import main
 from tuner.config import TrajectorySettings
+from tuner.exporters.effective import refly
 from tuner.exporters.export import export
-from tuner.exporters.refly import refly
 from tuner.job.ground import bench
 from tuner.report import render
 from tuner.result import read_run

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.tuner.ground import rigs
+from tuner.ground.bench_json import combine
 from tuner.ground.bifilar import bifilar
-from tuner.ground.combination import combine
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import scaled_of
 from tuner.ground.propeller import propeller

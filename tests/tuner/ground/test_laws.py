@@ -5,14 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tuner.ground.laws import (
-    bifilar_inertia,
-    fast_pair_speed,
-    hover_motor_constant,
-    propeller_moment_constant,
-    propeller_motor_constant,
-    spin_drag_over_torque,
-)
+from tuner.ground.bifilar import bifilar_inertia
+from tuner.ground.hovers import fast_pair_speed, hover_motor_constant, spin_drag_over_torque
+from tuner.ground.propeller import propeller_moment_constant, propeller_motor_constant
 
 MASS, RADIUS, THRUST, TORQUE = 2.243, 0.25, 1.45e-5, 0.033
 

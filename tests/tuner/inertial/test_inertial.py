@@ -12,7 +12,7 @@ from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
 from tuner.evaluate.simulate import simulate
 from tuner.findings.findings import Code, one_line
-from tuner.ground.combination import Combination
+from tuner.ground.bench_json import Combination
 from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed, vehicle_of
@@ -264,7 +264,6 @@ def test_lags_near_zero_that_combine_to_less_are_zero(tmp_path):
         scaled=np.array([-0.002]),
         information=np.array([[1e6]]),
         covariance=np.array([[1e-6]]),
-        determined=np.array([True]),
         chi_square=0.0,
         degrees_of_freedom=1,
         p_value=1.0,

@@ -16,7 +16,7 @@ from tuner.core.shipped import configs_folder
 from tuner.recordings import SIGNALS, load_flight
 from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.recordings.topics import load_topic_map, read_sidecar, shipped_maps
-from tuner.recordings.units import UNITS, to_enu_flu
+from tuner.recordings.unit_detection import UNITS, to_enu_flu
 
 
 def test_every_shipped_map_is_valid_and_named_after_its_file() -> None:

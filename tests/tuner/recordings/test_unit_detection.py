@@ -15,8 +15,7 @@ from tests.tuner.recordings import making
 from tuner.recordings import load_flight
 from tuner.recordings.flight import Array, Flight
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.unit_detection import Scale, Stamped, scale_of, scales_of, unit_of
-from tuner.recordings.units import to_enu_flu
+from tuner.recordings.unit_detection import Scale, Stamped, scale_of, scales_of, to_enu_flu, unit_of
 
 REAL = Path(os.environ.get("TUNE_REAL_FLIGHTS", Path(__file__).parents[4] / "shared" / "flights"))
 FILES = sorted((REAL / "nanobench").glob("*.csv"))

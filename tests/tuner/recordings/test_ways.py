@@ -21,9 +21,9 @@ from tuner.objective.motor_order import order_findings
 from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
 from tuner.recordings.inertial import read_inertial
+from tuner.recordings.inspector import suggested_map
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode, note_in_words
-from tuner.recordings.suggestion import suggested_map
 from tuner.search.job_flights import read_recordings
 from tuner.vehicle import read_vehicle, with_values
 

@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from docs.generate.pages import markdown_table
 from tuner.config import JobFile
 from tuner.config.job import CoefficientSettings
 from tuner.core.errors import ConfigError
@@ -20,7 +21,6 @@ from tuner.vehicle import (
     read_vehicle,
     with_values,
 )
-from tuner.vehicle.coefficient_table import markdown_table
 from tuner.vehicle.controller import Filters
 from tuner.vehicle.model import coefficients_in, model_of, with_coefficients
 

@@ -1,17 +1,135 @@
-"""What a model file holds of a multirotor: its links, motor plugins and control channels."""
+"""What a model file holds of a multirotor: links, their mass together, motors, control channels.
+
+Poses and tensors are in the model's frame unless stated otherwise; SI units.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.composite import IDENTITY, Inertial, Pose, pose_of
-from tuner.exporters.sdf.includes import MERGED, model_in
-from tuner.exporters.sdf.spans import Element, content, number, parse
+from tuner.exporters.sdf.spans import (
+    MERGED,
+    Element,
+    content,
+    model_in,
+    number,
+    parse,
+    pose_numbers,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Position (3,) m and rotation (3, 3) of a frame in another."""
+
+    position: Array
+    rotation: Array
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        """Return the pose of a frame that is posed in this one."""
+        return Pose(self.position + self.rotation @ inner.position, self.rotation @ inner.rotation)
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """A body: mass in kg, where its centre of mass lies, its inertia about that point.
+
+    ``pose`` places the inertial frame; ``inertia`` (3, 3) kg m² is along that frame's axes.
+    """
+
+    mass: float
+    pose: Pose
+    inertia: Array
+
+    @property
+    def in_model(self) -> Array:
+        """The inertia along the model's axes."""
+        return self.pose.rotation @ self.inertia @ self.pose.rotation.T
+
+
+def pose_of(numbers: Sequence[float]) -> Pose:
+    """Return SDF's ``x y z roll pitch yaw`` (m, rad; fixed axes) as a pose."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415 (slow to import)
+
+    rotation = Rotation.from_euler("xyz", numbers[3:]).as_matrix()
+    return Pose(np.array(numbers[:3], dtype=np.float64), rotation)
+
+
+IDENTITY = Pose(np.zeros(3), np.eye(3))
+
+
+def together(bodies: Sequence[Inertial]) -> Inertial:
+    """Return rigidly joined bodies as one, about their common centre, along the model's axes."""
+    mass = sum(body.mass for body in bodies)
+    centre = sum((body.mass * body.pose.position for body in bodies), np.zeros(3)) / mass
+    inertia = sum((_about(centre, body) for body in bodies), np.zeros((3, 3)))
+    return Inertial(mass, Pose(centre, np.eye(3)), inertia)
+
+
+def base_for(
+    whole_mass: float,
+    whole_inertia: Array,
+    base: Pose,
+    others: Sequence[Inertial],
+    *,
+    centre: Array | None = None,
+) -> Inertial:
+    """Return the base body that makes, with the others, the wanted whole.
+
+    Parameters
+    ----------
+    whole_mass
+        kg.
+    whole_inertia
+        (3, 3) kg m², about the common centre of mass, along the model's axes.
+    base
+        Inertial frame of the base, which stays where it is unless a centre is wanted.
+    others
+        The other bodies.
+    centre
+        (3,) where the common centre of mass shall lie; None leaves it where it comes to lie.
+
+    Raises
+    ------
+    ValueError
+        No such body exists: the others are too heavy or reach too far.
+    """
+    mass = whole_mass - sum(other.mass for other in others)
+    if mass <= 0:
+        raise ValueError(
+            f"the links beside the base weigh {whole_mass - mass:.6g} kg, the vehicle only "
+            f"{whole_mass:.6g} kg"
+        )
+    if centre is not None:
+        moment = sum((other.mass * other.pose.position for other in others), np.zeros(3))
+        base = Pose((whole_mass * centre - moment) / mass, base.rotation)
+    bare = Inertial(mass, base, np.zeros((3, 3)))
+    centre = together((bare, *others)).pose.position
+    rest = _about(centre, bare) + sum((_about(centre, other) for other in others), np.zeros((3, 3)))
+    in_model = whole_inertia - rest
+    moments = np.linalg.eigvalsh(in_model)
+    if moments[0] <= 0 or moments[2] > moments[0] + moments[1]:
+        raise ValueError(
+            "the links beside the base carry more inertia than the vehicle's allows: "
+            f"the base would have the principal moments {moments.round(9).tolist()} kg m²"
+        )
+    return Inertial(mass, base, base.rotation.T @ in_model @ base.rotation)
+
+
+def _about(point: Array, body: Inertial) -> Array:
+    """Return a body's inertia about a point, along the model's axes."""
+    arm = body.pose.position - point
+    shift: Array = arm @ arm * np.eye(3) - np.outer(arm, arm)
+    return body.in_model + body.mass * shift
+
 
 #: How each of the two simulators calls its motor model and its control channels.
 _CLASSIC_MOTOR = "gazebo_motor_model"
@@ -44,11 +162,7 @@ class Model:
     @property
     def links(self) -> list[Element]:
         """Every link of the model itself, and of what it takes in."""
-        return [element for element, _ in self._members() if element.tag == "link"]
-
-    def _members(self) -> Iterator[tuple[Element, Pose]]:
-        """Yield what the model holds, and the frame that it counts from."""
-        return _inside(self.root, IDENTITY)
+        return [element for element, _ in _inside(self.root, IDENTITY) if element.tag == "link"]
 
     @property
     def included(self) -> list[str]:
@@ -126,63 +240,32 @@ class Model:
         inertial = link.find("inertial")
         return self.pose_of_link(link) @ (self._written(inertial) if inertial else IDENTITY)
 
-    def inertial_of(self, link: Element) -> Inertial | None:
-        """Return a link's mass and inertia in the model's frame; None for a link without."""
-        inertial = link.find("inertial")
-        if inertial is None:
-            return None
-        mass = self._number_in(inertial, "mass")
-        if mass is None:
-            raise ExportError(
-                self.path,
-                f"link '{link.attributes.get('name')}' has no mass that is a number",
-                "write it as one",
-            )
-        tensor = inertial.find("inertia")
-        entry = {
-            axes: (self._number_in(tensor, axes) or 0.0) if tensor else 0.0
-            for axes in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-        }
-        matrix = np.array(
-            [
-                [entry["ixx"], entry["ixy"], entry["ixz"]],
-                [entry["ixy"], entry["iyy"], entry["iyz"]],
-                [entry["ixz"], entry["iyz"], entry["izz"]],
-            ]
-        )
-        return Inertial(mass, self.pose_of_inertial(link), matrix)
-
     def _written(self, element: Element) -> Pose:
         """Return an element's ``<pose>`` as it is written, in whatever frame it counts from."""
-        pose = element.find("pose")
-        words = content(pose, self.text).split() if pose else []
-        if pose is None or not words:
+        pose, numbers = element.find("pose"), pose_numbers(element, self.text, self.path)
+        if pose is None or not numbers:
             return IDENTITY
         if pose.attributes.get("rotation_format", "euler_rpy") != "euler_rpy":
             raise ExportError(
                 self.path, "has a pose that is not in euler_rpy", "write it as x y z roll pitch yaw"
             )
-        try:
-            numbers = np.array([float(word) for word in words]).reshape(6)
-        except ValueError:
-            raise ExportError(
-                self.path, f"has the pose '{' '.join(words)}'", "write six numbers"
-            ) from None
         if pose.attributes.get("degrees", "false") == "true":
-            numbers[3:] = np.deg2rad(numbers[3:])
-        return pose_of(numbers.tolist())
+            numbers[3:] = np.deg2rad(numbers[3:]).tolist()
+        return pose_of(numbers)
 
     def _placed(self, element: Element, passed: tuple[str, ...]) -> Pose:
         pose = element.find("pose")
         named = pose.attributes.get("relative_to", "") if pose else ""
         frame = named or element.attributes.get("attached_to", "")
         if frame in {"", "__model__"}:
-            within = next((at for member, at in self._members() if member is element), IDENTITY)
+            within = next(
+                (at for member, at in _inside(self.root, IDENTITY) if member is element), IDENTITY
+            )
             return within @ self._written(element)
         return self._frame(frame, passed) @ self._written(element)
 
     def _frame(self, name: str, passed: tuple[str, ...]) -> Pose:
-        for element, _ in self._members():
+        for element, _ in _inside(self.root, IDENTITY):
             same = element.attributes.get("name") == name
             if same and element.tag in {"link", "frame"} and name not in passed:
                 return self._placed(element, (*passed, name))
@@ -247,8 +330,26 @@ def _base(root: Element, links: list[Element]) -> Element:
 
 
 def inertials(model: Model) -> Iterator[tuple[Element, Inertial]]:
-    """Yield each link that has mass, with its inertial."""
+    """Yield each link that has mass, with its mass and inertia in the model's frame."""
     for link in model.links:
-        inertial = model.inertial_of(link)
-        if inertial is not None:
-            yield link, inertial
+        inertial = link.find("inertial")
+        if inertial is None:
+            continue
+        values = {child.tag: number(child, model.text) for child in reversed(inertial.children)}
+        mass = values.get("mass")
+        if mass is None:
+            raise ExportError(
+                model.path,
+                f"link '{link.attributes.get('name')}' has no mass that is a number",
+                "write it as one",
+            )
+        tensor = inertial.find("inertia")
+        given = (
+            {c.tag: number(c, model.text) or 0.0 for c in reversed(tensor.children)}
+            if tensor
+            else {}
+        )
+        matrix = np.array(
+            [[given.get(f"i{min(a, b)}{max(a, b)}", 0.0) for b in "xyz"] for a in "xyz"]
+        )
+        yield link, Inertial(mass, model.pose_of_inertial(link), matrix)

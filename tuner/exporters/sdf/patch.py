@@ -10,21 +10,19 @@ import numpy as np
 from pydantic import ValidationError
 
 from tuner.core.errors import ExportError
-from tuner.exporters.draft import Draft, Gate, differences, read_file
-from tuner.exporters.hover import rotor_speed
 from tuner.exporters.sdf import spans, tags
-from tuner.exporters.sdf.composite import Inertial, base_for, together
-from tuner.exporters.sdf.includes import MERGED, Whole, assembled
-from tuner.exporters.sdf.model import Model, inertials, read_model
-from tuner.exporters.sdf.spans import Edit, Element, blanked, rendered
+from tuner.exporters.sdf.model import Inertial, Model, base_for, inertials, read_model, together
+from tuner.exporters.sdf.spans import MERGED, Edit, Element, Whole, assembled, blanked, rendered
 from tuner.exporters.sdf.tags import rotor_origin, values_in
 from tuner.exporters.simulators import (
     FASTEST_GZ,
     GAZEBO_CLASSIC,
     GZ_SIM,
     gz_unit,
+    rotor_speed,
     with_speeds_in,
 )
+from tuner.exporters.target import Draft, Gate, differences, read_file
 from tuner.vehicle import VehicleFile
 
 #: Products of inertia below this part of the trace are taken as none.
@@ -71,7 +69,13 @@ def sdf_draft(path: Path, vehicle: VehicleFile, provenance: str) -> Draft:
         edits += _pose_edits(model, whole, base)
     edits = [_through_variable(text, blank, edit, path) for edit in edits]
     edits = list(dict.fromkeys(edits))
-    _refuse_contradictions(edits, path)
+    places = [(edit.start, edit.end) for edit in edits if edit.end > edit.start]
+    if len(set(places)) < len(places):
+        raise ExportError(
+            path,
+            "sets the motorConstant of all rotors at once, and this vehicle's differ",
+            "give each rotor's plugin a number of its own",
+        )
     patched = _patched(pieces, edits, model, provenance)
 
     def read(file: Path, instead: Mapping[Path, Path] | None = None) -> str:
@@ -116,7 +120,8 @@ def _patched(
     """Return each file that changes -> its new text, with a comment where its model begins."""
     comments = {}
     for element in (*model.root.all(MERGED), model.root):  # the outermost of a file is the last
-        path = pieces.path_at(element.children[0].start)
+        place = element.children[0].start
+        ((path, _),) = pieces.by_file([Edit(place, place, "")]).items()
         comments[path] = element
     by_file, patched = pieces.by_file(edits), {}
     for path in by_file if len(pieces.files) > 1 else pieces.files:
@@ -194,23 +199,6 @@ def _pose_edits(model: Model, whole: Model, base: Inertial) -> Iterator[Edit]:
         yield spans.append_child(inertial, model.text, "pose", written)
     elif spans.content(pose, model.text) != written:
         yield spans.set_value(pose, model.text, written)
-
-
-def _refuse_contradictions(edits: Sequence[Edit], path: Path) -> None:
-    """Refuse a model that says once what differs from rotor to rotor.
-
-    Raises
-    ------
-    ExportError
-        Two edits of the same place differ.
-    """
-    places = [(edit.start, edit.end) for edit in edits if edit.end > edit.start]
-    if len(set(places)) < len(places):
-        raise ExportError(
-            path,
-            "sets the motorConstant of all rotors at once, and this vehicle's differ",
-            "give each rotor's plugin a number of its own",
-        )
 
 
 def _motor_edits(model: Model, vehicle: VehicleFile) -> Iterator[Edit]:

@@ -14,8 +14,7 @@ import numpy as np
 from lxml import etree
 
 from tuner.core.errors import ExportError
-from tuner.exporters.sdf.composite import Array, Inertial, together
-from tuner.exporters.sdf.model import Model, inertials, read_model
+from tuner.exporters.sdf.model import Array, Inertial, Model, inertials, read_model, together
 from tuner.exporters.sdf.spans import without_comments
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of, with_values
 

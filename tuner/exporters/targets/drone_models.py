@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from sim_jax.constants import GRAVITY
 from tuner.core.disk import file_name
 from tuner.core.yaml_document import commented
-from tuner.exporters.draft import Draft, Gate, differences, read_file
 from tuner.exporters.flier import flier
-from tuner.exporters.hover import rotor_speed, thrust_at
-from tuner.exporters.simulators import DRONE_MODELS
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
+from tuner.exporters.target import Choices, Draft, Gate, Target, differences, read_file
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
@@ -39,7 +37,7 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
         "gravity_vec": [0.0, 0.0, -GRAVITY],
         "mass": vehicle.mass,
         "L": abs(vehicle.rotors[0].position[0]),
-        "J": _diagonal([inertia.xx, inertia.yy, inertia.zz]),
+        "J": np.diag([inertia.xx, inertia.yy, inertia.zz]).tolist(),
         "rpm2thrust": [0.0, 0.0, thrust],
         "rpm2torque": [0.0, 0.0, thrust * aero.moment_constant],
         "thrust2torque": aero.moment_constant,
@@ -49,15 +47,11 @@ def params(vehicle: VehicleFile) -> dict[str, Any]:
             [-side for side in x],
             [-1.0 if rotor.spin == "ccw" else 1.0 for rotor in vehicle.rotors],
         ],
-        "drag_matrix": _diagonal(drag),
+        "drag_matrix": np.diag(drag).tolist(),
         "thrust_min": thrust_at(vehicle, rotor_speed(vehicle, 0.0)),
         "thrust_max": thrust_at(vehicle, rotor_speed(vehicle, 1.0)),
         "prop_inertia": vehicle.effects.get("rotor_inertia", 0.0),
     }
-
-
-def _diagonal(values: list[float]) -> list[list[float]]:
-    return [[v if i == j else 0.0 for j in range(3)] for i, v in enumerate(values)]
 
 
 def flattened(content: dict[str, Any]) -> dict[str, float]:
@@ -130,7 +124,9 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
                     s[:3], s[3:7], s[7:10], s[10:13], asked / RPM, s[13:], J_inv=inverse, **arrays
                 )
                 found = list(found)
-                found[1] = _turning(s[3:7], s[10:13])
+                rate, vector, scalar = s[10:13], s[3:6], s[6]  # its own change of attitude is wrong
+                turn = scalar * rate + np.cross(vector, rate)
+                found[1] = 0.5 * np.append(turn, -vector @ rate)
                 return np.concatenate(found)
 
             state, period = self.state, self.period
@@ -147,13 +143,6 @@ def _flier(content: dict[str, Any]) -> Callable[..., Any] | None:
             return self.state[13:] * RPM
 
     return flier(Flying)
-
-
-def _turning(attitude: Array, rate: Array) -> Array:
-    """Return the change of a quaternion (x, y, z, w); that of drone-models is not to be used."""
-    vector, scalar = attitude[:3], attitude[3]
-    change = scalar * rate + np.cross(vector, rate)
-    return 0.5 * np.append(change, -vector @ rate)
 
 
 TARGET = Target(

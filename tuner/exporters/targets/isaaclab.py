@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import math
 from pathlib import Path
 from typing import Any
 
 from tuner.core.yaml_document import commented
-from tuner.exporters.draft import Draft, differences, read_file
-from tuner.exporters.hover import hover_speed, rotor_speed, thrust_at
-from tuner.exporters.simulators import ISAAC_LAB
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.simulators import ISAAC_LAB, hover_speed, rotor_speed, thrust_at
+from tuner.exporters.target import Choices, Draft, Target, assigned, differences
 from tuner.exporters.targets.drone_models import flattened
 from tuner.vehicle import VehicleFile
 
@@ -72,15 +69,6 @@ def configuration(vehicle: VehicleFile) -> dict[str, dict[str, Any]]:
     }
 
 
-def read_configuration(path: Path) -> dict[str, dict[str, Any]]:
-    """Read what this target wrote; nothing is run."""
-    return {
-        statement.targets[0].id: ast.literal_eval(statement.value)
-        for statement in ast.parse(read_file(path)).body
-        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name)
-    }
-
-
 def _numbers(content: dict[str, dict[str, Any]]) -> dict[str, float]:
     return {
         f"{section}.{name}": number
@@ -106,7 +94,7 @@ def isaaclab_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
     wanted = configuration(flown)
 
     def faults(path: Path) -> list[str]:
-        return differences(_numbers(wanted), _numbers(read_configuration(path)))
+        return differences(_numbers(wanted), _numbers(assigned(path)))
 
     return Draft(isaaclab_text(wanted, provenance), flown, (), faults)
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tuner.exporters.draft import Draft, differences, read_file
-from tuner.exporters.hover import full_thrust, hover_command, hover_speed, thrust_to_weight
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.simulators import full_thrust, hover_command, hover_speed, thrust_to_weight
+from tuner.exporters.target import Choices, Draft, Target, differences, read_file
 from tuner.vehicle import COEFFICIENTS, VehicleFile, Written, values_of
 
 

@@ -12,11 +12,9 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from tuner.core.errors import ExportError
-from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.flier import flier
-from tuner.exporters.hover import full_thrust, rotor_speed, thrust_at
-from tuner.exporters.simulators import MUJOCO, drag_at_hover
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.simulators import MUJOCO, drag_at_hover, full_thrust, rotor_speed, thrust_at
+from tuner.exporters.target import Choices, Draft, Target, differences, read_file
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]

@@ -10,23 +10,24 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 from tuner.core.errors import ExportError
 from tuner.core.yaml_document import commented
-from tuner.exporters.draft import Draft, Gate, read_file
-from tuner.exporters.hover import full_thrust, hover_command, hover_speed, rotor_speed
 from tuner.exporters.simulators import (
     FASTEST_GZ,
     GZ_SIM,
     SIH,
     Simulator,
     drag_at_hover,
+    full_thrust,
     gz_unit,
+    hover_command,
+    hover_speed,
+    rotor_speed,
 )
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.target import Choices, Draft, Gate, Target, read_file
 from tuner.vehicle import VehicleFile
 
 DIGITS = 1e-8
@@ -37,8 +38,8 @@ INT32, FLOAT = 6, 9
 """MAVLink's numbers of parameter types, as ground stations write them."""
 
 
-def parameters(vehicle: VehicleFile, simulator: Simulator = SIH) -> tuple[Parameter, ...]:
-    """Return the vehicle's parameters for a simulator that reads them.
+def parameters(vehicle: VehicleFile, simulator: Simulator = SIH) -> dict[str, float | int]:
+    """Return the vehicle's parameters for a simulator that reads them: an int is an INT32.
 
     Raises
     ------
@@ -54,35 +55,34 @@ def parameters(vehicle: VehicleFile, simulator: Simulator = SIH) -> tuple[Parame
             f"{rotor_speed(flown, 0):.0f} to {rotor_speed(flown, 1):.0f}",
             "check mass, motor_constant and input_scaling",
         )
-    own = _sih(flown) if simulator is SIH else gz_parameters(flown)
-    return (*_allocation(flown), *own, Parameter("MPC_THR_HOVER", hover))
+    own = _sih(flown) if simulator is SIH else _speeds(flown)
+    return {**_allocation(flown), **own, "MPC_THR_HOVER": hover}
 
 
-def _allocation(vehicle: VehicleFile) -> list[Parameter]:
+def _allocation(vehicle: VehicleFile) -> dict[str, float | int]:
     """Return where the rotors are and what they give: thrust = CT·u², torque = KM·thrust."""
-    allocation: list[Parameter] = [Parameter("CA_ROTOR_COUNT", len(vehicle.rotors))]
+    allocation: dict[str, float | int] = {"CA_ROTOR_COUNT": len(vehicle.rotors)}
     for index, rotor in enumerate(vehicle.rotors):
         x, y, z = rotor.position
-        sign = 1.0 if rotor.spin == "ccw" else -1.0
-        values = {
-            "CT": full_thrust(vehicle),
-            "KM": sign * vehicle.aerodynamics.moment_constant,
-            "PX": x,
-            "PY": -y,
-            "PZ": -z,
+        name, sign = f"CA_ROTOR{index}", 1.0 if rotor.spin == "ccw" else -1.0
+        allocation |= {
+            f"{name}_CT": full_thrust(vehicle),
+            f"{name}_KM": sign * vehicle.aerodynamics.moment_constant,
+            f"{name}_PX": x,
+            f"{name}_PY": -y,
+            f"{name}_PZ": -z,
         }
-        allocation += [Parameter(f"CA_ROTOR{index}_{key}", value) for key, value in values.items()]
     return allocation
 
 
-def _sih(vehicle: VehicleFile) -> list[Parameter]:
+def _sih(vehicle: VehicleFile) -> dict[str, float | int]:
     """Return mass, inertia, full thrust and torque, arms, drag and lag of PX4's own simulator.
 
     ``vehicle`` is as it flies it. Its drag is -KDV·v in all directions, its damping -KDW·ω.
     """
     inertia, full = vehicle.inertia, full_thrust(vehicle)
     arms = [max(abs(rotor.position[axis]) for rotor in vehicle.rotors) for axis in (1, 0)]
-    values = {
+    return {
         "SIH_MASS": vehicle.mass,
         "SIH_IXX": inertia.xx,
         "SIH_IYY": inertia.yy,
@@ -98,18 +98,16 @@ def _sih(vehicle: VehicleFile) -> list[Parameter]:
         "SIH_KDW": vehicle.effects.get("angular_drag_x", 0.0),
         "SIH_T_TAU": vehicle.motor.time_constant_up,
     }
-    return [Parameter(name, value) for name, value in values.items()]
 
 
-def gz_parameters(vehicle: VehicleFile) -> list[Parameter]:
+def _speeds(vehicle: VehicleFile) -> dict[str, float | int]:
     """Return the rotor speeds in whole rad/s between which the gz-sim bridge maps commands."""
-    unit = gz_unit(vehicle)
+    unit, numbers = gz_unit(vehicle), range(1, len(vehicle.rotors) + 1)
     low, high = (round(unit * rotor_speed(vehicle, command)) for command in (0.0, 1.0))
-    numbers = range(1, len(vehicle.rotors) + 1)
-    return [
-        *(Parameter(f"SIM_GZ_EC_MIN{number}", low) for number in numbers),
-        *(Parameter(f"SIM_GZ_EC_MAX{number}", high) for number in numbers),
-    ]
+    return {
+        **{f"SIM_GZ_EC_MIN{number}": low for number in numbers},
+        **{f"SIM_GZ_EC_MAX{number}": high for number in numbers},
+    }
 
 
 def px4_draft(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
@@ -126,13 +124,11 @@ def px4_draft(vehicle: VehicleFile, provenance: str, choices: Choices) -> Draft:
     notes = _notes(vehicle, flown, simulator)
 
     def faults(path: Path) -> list[str]:
-        there = {parameter.name: parameter.value for parameter in read_parameters(path)}
+        there = read_parameters(path)
         return [
-            f"{parameter.name} is {there.get(parameter.name)}, not {parameter.value}"
-            for parameter in wanted
-            if not math.isclose(
-                there.get(parameter.name, math.nan), parameter.value, rel_tol=DIGITS
-            )
+            f"{name} is {there.get(name)}, not {value}"
+            for name, value in wanted.items()
+            if not math.isclose(there.get(name, math.nan), value, rel_tol=DIGITS)
         ]
 
     header = f"{provenance}\nfor {simulator.title} ({simulator.version})"
@@ -206,34 +202,31 @@ Source: module.yaml of control_allocator, mc_pos_control, simulator_sih and gz_b
 _SIGNED = re.compile(r"SIH_I(XY|XZ|YZ)")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A PX4 parameter: an int is an INT32, a float a FLOAT."""
-
-    name: str
-    value: float | int
-
-
-def outside_range(parameters: Iterable[Parameter]) -> tuple[str, ...]:
+def outside_range(parameters: Mapping[str, float | int]) -> tuple[str, ...]:
     """Return a clause for each parameter that PX4 does not accept."""
     clauses = []
-    for parameter in parameters:
+    for name, value in parameters.items():
         for pattern, (low, high) in RANGES.items():
-            known = re.fullmatch(pattern, parameter.name) and not _SIGNED.match(parameter.name)
-            if known and not low <= parameter.value <= high:
+            known = re.fullmatch(pattern, name) and not _SIGNED.match(name)
+            if known and not low <= value <= high:
                 limit = f"{low:g} to {high:g}" if math.isfinite(high) else f"at least {low:g}"
-                clauses.append(f"{parameter.name} {parameter.value:.4g}: PX4 accepts {limit}")
+                clauses.append(f"{name} {value:.4g}: PX4 accepts {limit}")
     return tuple(clauses)
 
 
-def parameters_text(parameters: Iterable[Parameter], header: str) -> str:
+def parameters_text(parameters: Mapping[str, float | int], header: str) -> str:
     """Return a ``.params`` file as ground stations load it, floats with nine digits."""
-    lines = [f"1\t1\t{p.name}\t{_value(p)}\t{_kind(p)}\n" for p in parameters]
+    lines = [
+        f"1\t1\t{name}\t{value}\t{INT32}\n"
+        if isinstance(value, int)
+        else f"1\t1\t{name}\t{value:.9g}\t{FLOAT}\n"
+        for name, value in parameters.items()
+    ]
     columns = commented("Vehicle-Id Component-Id Name Value Type")
     return commented(header) + columns + "".join(lines)
 
 
-def read_parameters(path: Path) -> tuple[Parameter, ...]:
+def read_parameters(path: Path) -> dict[str, float | int]:
     """Read a ``.params`` file.
 
     Raises
@@ -241,25 +234,15 @@ def read_parameters(path: Path) -> tuple[Parameter, ...]:
     ExportError
         A line is no parameter.
     """
-    parameters = []
+    parameters: dict[str, float | int] = {}
     for line in read_file(path).splitlines():
         if line.strip() and not line.startswith("#"):
             try:
                 _, _, name, value, kind = line.split()
-                parameters.append(
-                    Parameter(name, int(value) if int(kind) == INT32 else float(value))
-                )
+                parameters[name] = int(value) if int(kind) == INT32 else float(value)
             except ValueError:
                 raise ExportError(path, f"has the line '{line}'", "was it edited?") from None
-    return tuple(parameters)
-
-
-def _value(parameter: Parameter) -> str:
-    return str(parameter.value) if _kind(parameter) == INT32 else format(parameter.value, ".9g")
-
-
-def _kind(parameter: Parameter) -> int:
-    return INT32 if isinstance(parameter.value, int) else FLOAT
+    return parameters
 
 
 TARGET = Target("px4", ".params", px4_draft, SIH.entry, simulator=SIH, others=(GZ_SIM,))

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuner.core.yaml_document import commented
-from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.flier import flier
-from tuner.exporters.hover import rotor_speed
-from tuner.exporters.simulators import ROTORPY
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.simulators import ROTORPY, rotor_speed
+from tuner.exporters.target import Choices, Draft, Target, assigned, differences
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]
@@ -51,15 +47,6 @@ def quad_params(vehicle: VehicleFile) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def read_params(path: Path) -> dict[str, Any]:
-    """Read ``quad_params`` of a module that this target wrote; nothing is run."""
-    for statement in ast.parse(read_file(path)).body:
-        if isinstance(statement, ast.Assign) and getattr(statement.targets[0], "id", "") == "_P":
-            params: dict[str, Any] = ast.literal_eval(statement.value)
-            return params
-    return {}
-
-
 def rotorpy_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
     """Return a Python module that RotorPy's ``Multirotor`` takes ``quad_params`` from."""
     flown = ROTORPY.flown(vehicle)
@@ -76,7 +63,7 @@ def rotorpy_draft(vehicle: VehicleFile, provenance: str, _: Choices) -> Draft:
         text,
         flown,
         (),
-        lambda path: differences(wanted, read_params(path)),
+        lambda path: differences(wanted, assigned(path).get("_P", {})),
         flier=_flier(params),
     )
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined
 
-from tuner.exporters.draft import Draft, differences, read_file
 from tuner.exporters.sdf import tags
 from tuner.exporters.sdf.patch import sdf_draft, simulator_of
 from tuner.exporters.sdf.tags import values_in
 from tuner.exporters.simulators import GAZEBO_CLASSIC, GZ_SIM, Simulator, gz_unit, with_speeds_in
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.target import Choices, Draft, Target, differences, read_file
 from tuner.vehicle import VehicleFile
 
 TEMPLATE = Path(__file__).parents[1] / "sdf" / "snippet.sdf.jinja"

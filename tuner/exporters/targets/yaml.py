@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tuner.exporters.draft import Draft
-from tuner.exporters.target import Choices, Target
+from tuner.exporters.target import Choices, Draft, Target
 from tuner.vehicle import VehicleFile, Written, read_vehicle, vehicle_text
 
 

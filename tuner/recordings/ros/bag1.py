@@ -9,10 +9,11 @@ chunks are read whole and messages located with array operations.
 
 from __future__ import annotations
 
+import contextlib
 import re
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
@@ -22,17 +23,14 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.notes import Cause, Damage
+from tuner.recordings.notes import Cause
 from tuner.recordings.ros.container import (
-    LARGEST_CHUNK,
-    NEAR,
     Chunk,
     ChunkedFile,
     Connection,
     DamagedError,
-    read_wanted,
-    u32,
-    unpack,
+    Entries,
+    unsigned,
 )
 from tuner.recordings.ros.wire import Block, Bytes, Index
 
@@ -43,23 +41,11 @@ LONGEST_HEADER = 1 << 16
 LONGEST_DATA = 1 << 24
 
 
-@dataclass(frozen=True)
-class _Chunk(Chunk):
-    """A chunk, whose position is that of its data; they are ``size`` bytes when unpacked.
-
-    ``compression`` says how they are packed.
-    """
-
-    size: int = 0
-    compression: str = ""
-
-
 @dataclass
-class Bag1(ChunkedFile[_Chunk]):
-    """A ROS 1 bag."""
+class Bag1(ChunkedFile):
+    """A ROS 1 bag, whose chunks' positions are those of their data."""
 
     aligned: bool = False
-    _indexed: bool = True
 
     def __post_init__(self) -> None:
         with self.path.open("rb") as stream:
@@ -75,7 +61,7 @@ class Bag1(ChunkedFile[_Chunk]):
         if not self.connections:
             raise RecordingError(self.path, "holds no messages", "record it again")
 
-    def _lost(self, chunks: Sequence[_Chunk], wanted: Collection[int]) -> int:
+    def _lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int:
         return sum(chunk.held.get(number, 0) for chunk in chunks for number in wanted)
 
     def _read_index(self, stream: BinaryIO) -> None:
@@ -95,8 +81,7 @@ class Bag1(ChunkedFile[_Chunk]):
         counts: Counter[int] = Counter()
         for position, info in infos:
             stream.seek(position)
-            header = _header(stream, CHUNK)
-            (packed,) = struct.unpack("<I", _read(stream, 4))
+            header, packed = _header(stream, CHUNK)
             self._chunks.append(replace(_chunk(header, stream.tell(), packed), **info))
             counts.update(info["held"])
         self.connections = {record.id: record for record in records}
@@ -104,94 +89,63 @@ class Bag1(ChunkedFile[_Chunk]):
 
     def _walk(self, stream: BinaryIO, first: int, cause: Cause) -> None:
         """Learn connections and chunks from front to end, as far as records can be followed."""
-        self._indexed = False
         self._chunks, self.connections = [], {}
-        counts: Counter[int] = Counter()
         size = self.path.stat().st_size
         stream.seek(first)
         reached, unread = first, 0
-        last = None
-        while reached < size:
+        with contextlib.suppress(DamagedError):
+            while reached < size:
+                header, length = _header(stream, None)
+                position = stream.tell()
+                if header.get(b"op") == bytes([CHUNK]):
+                    chunk = _chunk(header, position, min(length, size - position))
+                    unread += self._add(stream, chunk)
+                reached = min(position + length, size)
+                stream.seek(reached)
+        self._salvaged(cause, size - reached + unread, {})
+
+    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:  # noqa: ARG002
+        return chunk.compression, chunk.position, chunk.length, chunk.size
+
+    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
+        stream.seek(chunk.position + chunk.length)
+        return dict(_entries(stream) for _ in range(len(chunk.held)))
+
+    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
+        messages: dict[int, list[tuple[int, int]]] = {}
+        at = read = 0
+        while at + 8 <= len(content):
+            (size,) = struct.unpack_from("<I", content, at)
+            start = at + 8 + size
+            if size > LONGEST_HEADER or start > len(content):
+                break
             try:
-                header = _header(stream, None)
-                (length,) = struct.unpack("<I", _read(stream, 4))
+                header = _fields(content[at + 4 : start - 4])
             except DamagedError:
                 break
-            position = stream.tell()
-            if header.get(b"op") == bytes([CHUNK]):
-                chunk = _chunk(header, position, min(length, size - position))
-                try:
-                    chunk, read = self._scan(self._content(stream, chunk), chunk)
-                except DamagedError:
-                    read = 0
-                unread += chunk.length - read if chunk.compression in ("none", "") else 0
-                last = last if chunk.end is None else max(last or 0.0, chunk.end)
-                self._chunks.append(chunk)
-                counts.update(chunk.held)
-            reached = min(position + length, size)
-            stream.seek(reached)
-        self._count(counts)
-        self.damage.append(
-            Damage(
-                cause,
-                salvaged=sum(counts.values()),
-                bytes_lost=size - reached + unread,
-                start=last,
-            )
-        )
-
-    def _scan(self, content: Bytes, chunk: _Chunk) -> tuple[_Chunk, int]:
-        """Learn connections and count messages inside a chunk; return it and the bytes read."""
-        counts: Counter[int] = Counter()
-        last, read = None, 0
-        for header, start, end in _inside(content):
-            op = header.get(b"op")
-            if op == bytes([CONNECTION]):
-                record = _connection(header, content[start:end].tobytes())
+            (length,) = struct.unpack_from("<I", content, start - 4)
+            if start + length > len(content):
+                break
+            if header.get(b"op") == bytes([CONNECTION]):
+                record = _connection(header, content[start : start + length])
                 self.connections.setdefault(record.id, record)
-            elif op == bytes([MESSAGE]):
-                number = _number(header, b"conn", 4)
-                counts[number] += 1
-                last = max(last or 0, _time(header.get(b"time", b"")))
-            read = end
-        return replace(chunk, held=counts, end=None if last is None else last * 1e-9), read
+            elif header.get(b"op") == bytes([MESSAGE]):
+                time = _time(header.get(b"time", b""))
+                messages.setdefault(_number(header, b"conn", 4), []).append((time, at))
+            at = read = start + length
+        return messages, read
 
-    def _content(self, stream: BinaryIO, chunk: _Chunk) -> Bytes:
-        if chunk.length > LARGEST_CHUNK:
-            raise DamagedError(f"a chunk claims {chunk.length} bytes")
-        stream.seek(chunk.position)
-        packed = stream.read(chunk.length)
-        return np.frombuffer(unpack(chunk.compression, packed, chunk.size), dtype=np.uint8)
-
-    def _locate(
-        self, stream: BinaryIO, chunk: _Chunk, wanted: list[int]
-    ) -> list[tuple[int, Block]]:
-        if self._indexed:
-            try:
-                stream.seek(chunk.position + chunk.length)
-                entries = dict(_index(stream) for _ in range(len(chunk.held)))
-            except DamagedError:
-                entries = {}
-            if entries:
-                if chunk.compression != "none" or chunk.length < 4 * NEAR:
-                    content = self._content(stream, chunk)
-                else:  # only the wanted pieces of one that may hold images unpacked
-                    content, entries = read_wanted(
-                        stream, chunk.position, chunk.length, entries, wanted
-                    )
-                return [(n, _block(content, n, *entries[n])) for n in entries if n in wanted]
-        located: dict[int, list[tuple[int, int, int]]] = {number: [] for number in wanted}
-        content = self._content(stream, chunk)
-        for header, start, end in _inside(content):
-            if header.get(b"op") == bytes([MESSAGE]):
-                number = _number(header, b"conn", 4)
-                if number in located:
-                    located[number].append((start, end, _time(header.get(b"time", b""))))
-        return [
-            (number, Block(content, *np.array(rows, dtype=np.int64).T))
-            for number, rows in located.items()
-            if rows
-        ]
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+        length = len(content)
+        inside = (offset >= 0) & (offset + 4 <= length)
+        offset, time = offset[inside], time[inside]
+        size = unsigned(content, offset, 4)
+        inside = (offset + 8 + size <= length) & (size < LONGEST_HEADER)
+        offset, time, size = offset[inside], time[inside], size[inside]
+        start = offset + 8 + size
+        end = start + unsigned(content, start - 4, 4)
+        inside = (end <= length) & _belongs(content, number, offset + 4, size)
+        return Block(content, start[inside], end[inside], time[inside])
 
 
 def _read(stream: BinaryIO, size: int) -> bytes:
@@ -215,19 +169,19 @@ def _fields(raw: bytes) -> dict[bytes, bytes]:
     return fields
 
 
-def _header(stream: BinaryIO, op: int | None) -> dict[bytes, bytes]:
+def _header(stream: BinaryIO, op: int | None) -> tuple[dict[bytes, bytes], int]:
+    """Read the header of a record, and how long its data are."""
     (size,) = struct.unpack("<I", _read(stream, 4))
     if size > LONGEST_HEADER:
         raise DamagedError("a record header is absurdly long")
     fields = _fields(_read(stream, size))
     if op is not None and fields.get(b"op") != bytes([op]):
         raise DamagedError("its index points nowhere")
-    return fields
+    return fields, int.from_bytes(_read(stream, 4), "little")
 
 
 def _record(stream: BinaryIO, op: int) -> tuple[dict[bytes, bytes], bytes]:
-    header = _header(stream, op)
-    (size,) = struct.unpack("<I", _read(stream, 4))
+    header, size = _header(stream, op)
     if size > LONGEST_DATA:
         raise DamagedError("a record is absurdly long")
     return header, _read(stream, size)
@@ -268,13 +222,13 @@ def _chunk_info(header: dict[bytes, bytes], data: bytes) -> tuple[int, dict[str,
     return _number(header, b"chunk_pos", 8), {"held": held, "start": start, "end": end}
 
 
-def _chunk(header: dict[bytes, bytes], position: int, packed: int) -> _Chunk:
+def _chunk(header: dict[bytes, bytes], position: int, packed: int) -> Chunk:
     compression = header.get(b"compression", b"").decode(errors="replace")
     size = _number(header, b"size", 4)
-    return _Chunk(position, packed, {}, size=size, compression=compression)
+    return Chunk(position, packed, {}, compression=compression, size=size)
 
 
-def _index(stream: BinaryIO) -> tuple[int, tuple[Index, Index]]:
+def _entries(stream: BinaryIO) -> tuple[int, tuple[Index, Index]]:
     """Read the index of one connection in a chunk: its number, times and offsets."""
     header, data = _record(stream, INDEX)
     if len(data) % 12:
@@ -282,20 +236,6 @@ def _index(stream: BinaryIO) -> tuple[int, tuple[Index, Index]]:
     entries = np.frombuffer(data, dtype="<u4").reshape(-1, 3).astype(np.int64)
     time = entries[:, 0] * 1_000_000_000 + entries[:, 1]
     return _number(header, b"conn", 4), (time, entries[:, 2])
-
-
-def _block(content: Bytes, connection: int, time: Index, offset: Index) -> Block:
-    """Find the payloads of a connection's messages, whose records begin at offsets of a chunk."""
-    length = len(content)
-    inside = (offset >= 0) & (offset + 4 <= length)
-    offset, time = offset[inside], time[inside]
-    size = u32(content, offset)
-    inside = (offset + 8 + size <= length) & (size < LONGEST_HEADER)
-    offset, time, size = offset[inside], time[inside], size[inside]
-    start = offset + 8 + size
-    end = start + u32(content, start - 4)
-    inside = (end <= length) & _belongs(content, connection, offset + 4, size)
-    return Block(content, start[inside], end[inside], time[inside])
 
 
 def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDArray[np.bool_]:
@@ -310,25 +250,5 @@ def _belongs(content: Bytes, connection: int, header: Index, size: Index) -> NDA
         first = content[header[rows[0]] : header[rows[0]] + length].tobytes()
         at = first.find(name)
         if at >= 0:
-            belongs[rows] = u32(content, header[rows] + at + 5) == connection
+            belongs[rows] = unsigned(content, header[rows] + at + 5, 4) == connection
     return belongs
-
-
-def _inside(content: Bytes) -> Iterator[tuple[dict[bytes, bytes], int, int]]:
-    """Yield header, start and end of the data of each record in a chunk, until one is cut."""
-    raw = content.tobytes()
-    at = 0
-    while at + 8 <= len(raw):
-        (size,) = struct.unpack_from("<I", raw, at)
-        behind = at + 4 + size
-        if size > LONGEST_HEADER or behind + 4 > len(raw):
-            return
-        try:
-            header = _fields(raw[at + 4 : behind])
-        except DamagedError:
-            return
-        (length,) = struct.unpack_from("<I", raw, behind)
-        if behind + 4 + length > len(raw):
-            return
-        yield header, behind + 4, behind + 4 + length
-        at = behind + 4 + length

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, Generic, Protocol, TypeVar
+from typing import Any, BinaryIO
 
 import numpy as np
 from rosbags.interfaces import MessageDefinition
@@ -33,27 +35,35 @@ class Connection:
     count: int
 
 
-class Container(Protocol):
-    """A file that holds serialised messages."""
+@dataclass
+class Container(ABC):
+    """A file, or a folder of them, that holds serialised messages.
 
-    @property
-    def connections(self) -> Mapping[int, Connection]:
-        """The connections by their number."""
-        ...
+    Attributes
+    ----------
+    path
+        Where it lies.
+    aligned
+        Whether messages are CDR (ROS 2), else ROS 1.
+    connections
+        By their number.
+    damage
+        What could not be read so far.
 
-    @property
-    def aligned(self) -> bool:
-        """Whether messages are CDR (ROS 2), else ROS 1."""
-        ...
+    Raises
+    ------
+    RecordingError
+        It is no such container, or nothing of it can be read.
+    """
 
-    @property
-    def damage(self) -> Sequence[Damage]:
-        """What could not be read so far."""
-        ...
+    path: Path
+    aligned: bool = True
+    connections: dict[int, Connection] = field(default_factory=dict)
+    damage: list[Damage] = field(default_factory=list)
 
+    @abstractmethod
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, each block of one connection."""
-        ...
 
 
 class DamagedError(Exception):
@@ -108,32 +118,22 @@ def zstd() -> Any:
     return importlib.import_module("backports.zstd")
 
 
-def u16(buffer: Bytes, at: Index) -> Index:
-    """Read little-endian unsigned 16-bit numbers at positions that lie inside a buffer."""
-    return _numbers(buffer, at, 2)
-
-
-def u32(buffer: Bytes, at: Index) -> Index:
-    """Read little-endian unsigned 32-bit numbers at positions that lie inside a buffer."""
-    return _numbers(buffer, at, 4)
-
-
-def u64(buffer: Bytes, at: Index) -> Index:
-    """Read little-endian unsigned 64-bit numbers at positions that lie inside a buffer."""
-    return _numbers(buffer, at, 8)
-
-
-def _numbers(buffer: Bytes, at: Index, size: int) -> Index:
+def unsigned(buffer: Bytes, at: Index, size: int) -> Index:
+    """Read little-endian numbers of some bytes at positions that lie inside a buffer."""
     spread = buffer[at[:, None] + np.arange(size)]
     return np.asarray(spread.view(f"<u{size}")[:, 0].astype(np.int64), dtype=np.int64)
 
 
-def joined(times: list[int], payloads: list[bytes]) -> Block:
+def joined(times: Sequence[int], payloads: Sequence[bytes]) -> Block:
     """Return a block of messages that were read one by one."""
     lengths = np.array([len(payload) for payload in payloads], dtype=np.int64)
     end = np.cumsum(lengths)
     content = np.frombuffer(b"".join(payloads), dtype=np.uint8)
     return Block(content, end - lengths, end, np.array(times, dtype=np.int64))
+
+
+Entries = Mapping[int, tuple[Index, Index]]
+"""Connection -> times (n,) ns and offsets (n,) of its messages' records in a chunk."""
 
 
 @dataclass(frozen=True)
@@ -148,52 +148,56 @@ class Chunk:
         Connection -> the messages in the chunk, or what else says that there are any.
     start, end
         s since 1970 of the first and the last message; None where no index says so.
+    compression, size
+        How its data are packed, and their bytes when unpacked, where that is known beforehand.
+    entries
+        Its messages, where the chunk was walked; empty leaves them to its index.
     """
 
     position: int
     length: int
-    held: dict[int, int]
+    held: Mapping[int, int]
     start: float | None = None
     end: float | None = None
-
-
-C = TypeVar("C", bound=Chunk)
+    compression: str = ""
+    size: int = 0
+    entries: Entries = field(default_factory=dict)
 
 
 @dataclass
-class ChunkedFile(ABC, Generic[C]):
-    """A container of chunks.
+class ChunkedFile(Container):
+    """A container of chunks: read by its indexes, or walked from the front where they are lost."""
 
-    Raises
-    ------
-    RecordingError
-        The file is no such container, or nothing of it can be read.
-    """
-
-    path: Path
-    aligned: bool = True
-    connections: dict[int, Connection] = field(default_factory=dict)
-    damage: list[Damage] = field(default_factory=list)
-    _chunks: list[C] = field(default_factory=list)
+    _chunks: list[Chunk] = field(default_factory=list)
 
     @abstractmethod
-    def _locate(self, stream: BinaryIO, chunk: C, wanted: list[int]) -> Iterable[tuple[int, Block]]:
-        """Return the blocks of a chunk, by the indexes behind it or by walking it."""
+    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
+        """Return how a chunk's records are packed, where they lie, and their two sizes."""
 
-    def _lost(self, chunks: Sequence[C], wanted: Collection[int]) -> int | None:  # noqa: ARG002
+    @abstractmethod
+    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
+        """Return the messages of a chunk as the index behind it has them."""
+
+    @abstractmethod
+    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
+        """Learn the connections in a chunk; return its messages, and how many bytes make sense."""
+
+    @abstractmethod
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+        """Find the payloads of a connection's messages, whose records begin at some offsets."""
+
+    def _lost(self, chunks: Sequence[Chunk], wanted: Collection[int]) -> int | None:  # noqa: ARG002
         """Return how many wanted messages some chunks held, where that is known."""
         return None
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, chunk by chunk."""
-        lost: list[C] = []
+        lost: list[Chunk] = []
         with self.path.open("rb") as stream:
             for chunk in self._chunks:
                 present = [number for number in wanted if number in chunk.held]
-                if not present:
-                    continue
                 try:
-                    located = list(self._locate(stream, chunk, present))
+                    located = self._locate(stream, chunk, present) if present else []
                 except DamagedError:
                     lost.append(chunk)
                     continue
@@ -210,6 +214,62 @@ class ChunkedFile(ABC, Generic[C]):
                 )
             )
 
+    def _locate(self, stream: BinaryIO, chunk: Chunk, wanted: list[int]) -> list[tuple[int, Block]]:
+        """Return the blocks of a chunk, by the index behind it or by walking it."""
+        try:
+            entries = chunk.entries or self._index(stream, chunk)
+        except DamagedError:
+            entries = self._walked(stream, chunk)[0].entries
+        compression, position, packed, _ = self._place(stream, chunk)
+        if compression not in ("none", "") or packed < 4 * NEAR:
+            content = self._content(stream, chunk)
+        else:  # only the wanted pieces of one that may hold images unpacked
+            content, entries = read_wanted(stream, position, packed, entries, wanted)
+        return [(n, self._block(content, n, *entries[n])) for n in entries if n in wanted]
+
+    def _content(self, stream: BinaryIO, chunk: Chunk) -> Bytes:
+        """Return the unpacked records of a chunk."""
+        compression, position, packed, size = self._place(stream, chunk)
+        if packed > LARGEST_CHUNK:
+            raise DamagedError(f"a chunk claims {packed} bytes")
+        stream.seek(position)
+        return np.frombuffer(unpack(compression, stream.read(packed), size), dtype=np.uint8)
+
+    def _walked(self, stream: BinaryIO, chunk: Chunk) -> tuple[Chunk, int]:
+        """Return a chunk with what walking it finds in it, and how many bytes make no sense."""
+        content = self._content(stream, chunk).tobytes()
+        rows, read = self._scan(content)
+        entries = {number: _columns(held) for number, held in rows.items()}
+        last = max((int(time.max()) for time, _ in entries.values()), default=None)
+        known = replace(
+            chunk,
+            held={number: len(held) for number, held in rows.items()},
+            end=None if last is None else last * 1e-9,
+            entries=entries,
+        )
+        return known, len(content) - read
+
+    def _add(self, stream: BinaryIO, chunk: Chunk) -> int:
+        """Add a chunk that a walk came upon; return how many bytes of it make no sense."""
+        missed = chunk.length
+        with contextlib.suppress(DamagedError):
+            chunk, missed = self._walked(stream, chunk)
+        self._chunks.append(chunk)
+        return missed
+
+    def _salvaged(
+        self, cause: Cause, lost: int, loose: Mapping[int, list[tuple[int, int, int]]]
+    ) -> None:
+        """Count what a walk found in chunks and outside, times first, and note the damage."""
+        counts = Counter({number: len(rows) for number, rows in loose.items()})
+        for chunk in self._chunks:
+            counts.update(chunk.held)
+        ends = [chunk.end for chunk in self._chunks if chunk.end is not None]
+        ends += [max(rows)[0] * 1e-9 for rows in loose.values()]
+        self._count(counts)
+        salvaged, start = sum(counts.values()), max(ends, default=None)
+        self.damage.append(Damage(cause, salvaged=salvaged, bytes_lost=lost, start=start))
+
     def _count(self, counts: Mapping[int, int]) -> None:
         """Tell the connections how many messages each has."""
         self.connections = {
@@ -218,13 +278,14 @@ class ChunkedFile(ABC, Generic[C]):
         }
 
 
+def _columns(rows: list[tuple[int, int]]) -> tuple[Index, Index]:
+    table = np.array(rows, dtype=np.int64)
+    return table[:, 0], table[:, 1]
+
+
 def read_wanted(
-    stream: BinaryIO,
-    origin: int,
-    size: int,
-    entries: Mapping[int, tuple[Index, Index]],
-    wanted: Collection[int],
-) -> tuple[Bytes, dict[int, tuple[Index, Index]]]:
+    stream: BinaryIO, origin: int, size: int, entries: Entries, wanted: Collection[int]
+) -> tuple[Bytes, Entries]:
     """Read the wanted connections' records of an unpacked chunk.
 
     Parameters
@@ -232,7 +293,7 @@ def read_wanted(
     stream, origin, size
         As of `read_pieces`.
     entries
-        Connection -> times (n,) ns and offsets (n,) of its records in the chunk.
+        Of the chunk.
     wanted
         Connections among them.
 

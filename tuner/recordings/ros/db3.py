@@ -12,7 +12,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,11 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.ros.container import LARGEST_CHUNK, Connection, joined
+from tuner.recordings.ros.container import LARGEST_CHUNK, Connection, Container, joined
 from tuner.recordings.ros.wire import Block
 
 #: Messages that are decoded together, and their bytes.
-AT_ONCE = 4096
+AT_ONCE = 16384
 BYTES_AT_ONCE = 16 << 20
 #: Steps of the database's machine, in millions, after which a query is no honest one.
 PATIENCE = 5_000
@@ -39,19 +39,8 @@ _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
 
 
 @dataclass
-class Db3:
-    """One ``.db3`` file of a ROS 2 recording.
-
-    Raises
-    ------
-    RecordingError
-        The file is no such database, or nothing of it can be read.
-    """
-
-    path: Path
-    aligned: bool = True
-    connections: dict[int, Connection] = field(default_factory=dict)
-    damage: list[Damage] = field(default_factory=list)
+class Db3(Container):
+    """One ``.db3`` file of a ROS 2 recording."""
 
     def __post_init__(self) -> None:
         try:
@@ -76,21 +65,22 @@ class Db3:
 
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, some thousands at a time, in one pass."""
-        pending = {number: _Pending() for number in wanted}
-        marks = ", ".join("?" for _ in pending)
+        marks = ", ".join("?" for _ in wanted)
         rows = self._rows(
             f"topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) AND "
             "typeof(timestamp) = 'integer' AND typeof(data) = 'blob' "
             f"AND length(data) < {LARGEST_CHUNK} AND",
-            tuple(pending),
+            tuple(wanted),
         )
+        held: dict[int, list[tuple[int, bytes]]] = {}
+        count, size = 0, 0
         for number, time, blob in rows:
-            pending[number].add(time, blob)
-            if pending[number].full:
-                yield number, pending[number].block()
-        for number, rest in pending.items():
-            if rest.times:
-                yield number, rest.block()
+            held.setdefault(number, []).append((time, blob))
+            count, size = count + 1, size + len(blob)
+            if count >= AT_ONCE or size >= BYTES_AT_ONCE:
+                yield from ((n, joined(*zip(*some, strict=True))) for n, some in held.items())
+                held, count, size = {}, 0, 0
+        yield from ((n, joined(*zip(*some, strict=True))) for n, some in held.items())
 
     def _rows(self, query: str, values: tuple[int, ...]) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query in the order of their number.
@@ -174,27 +164,3 @@ def _is_cut(path: Path) -> bool:
     page = int.from_bytes(header[16:18], "big")
     pages = int.from_bytes(header[28:32], "big")
     return path.stat().st_size < pages * (page if page > 1 else 65_536)
-
-
-@dataclass
-class _Pending:
-    """Messages of one connection that wait to be decoded together."""
-
-    times: list[int] = field(default_factory=list)
-    blobs: list[bytes] = field(default_factory=list)
-    held: int = 0
-
-    def add(self, time: int, blob: bytes) -> None:
-        self.times.append(time)
-        self.blobs.append(blob)
-        self.held += len(blob)
-
-    @property
-    def full(self) -> bool:
-        return len(self.times) >= AT_ONCE or self.held >= BYTES_AT_ONCE
-
-    def block(self) -> Block:
-        """Hand over what waited."""
-        block = joined(self.times, self.blobs)
-        self.times, self.blobs, self.held = [], [], 0
-        return block

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import contextlib
 import struct
-from collections import Counter
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import BinaryIO
 
 import numpy as np
@@ -21,19 +20,16 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys.msg import normalize_msgtype
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.notes import Cause, Damage
+from tuner.recordings.notes import Cause
 from tuner.recordings.ros.container import (
     LARGEST_CHUNK,
-    NEAR,
     Chunk,
     ChunkedFile,
     Connection,
     DamagedError,
+    Entries,
     read_pieces,
-    read_wanted,
-    u16,
-    u64,
-    unpack,
+    unsigned,
 )
 from tuner.recordings.ros.wire import Block, Bytes, Index
 
@@ -56,11 +52,11 @@ _FORMATS = {
 
 
 @dataclass
-class Mcap(ChunkedFile[Chunk]):
+class Mcap(ChunkedFile):
     """An MCAP file with ROS messages.
 
     Its chunks' positions are those of their records, and ``held`` says where the index of a
-    channel's messages lies; 0 where there is none.
+    channel's messages lies.
     """
 
     _loose: dict[int, list[tuple[int, int, int]]] = field(default_factory=dict)
@@ -80,10 +76,15 @@ class Mcap(ChunkedFile[Chunk]):
     def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
         """Yield the messages of some connections, chunk by chunk, then those outside of chunks."""
         yield from super().blocks(wanted)
+        size = self.path.stat().st_size
         with self.path.open("rb") as stream:
             for number in wanted:
-                if self._loose.get(number):
-                    yield from self._loose_blocks(stream, number)
+                loose = np.array(self._loose.get(number, []), dtype=np.int64).reshape(-1, 3)
+                for rows in np.array_split(loose, -(-len(loose) // 4096)) if len(loose) else ():
+                    time, starts, ends = rows.T
+                    bounds = np.unique([*starts, *ends])
+                    content, moved = read_pieces(stream, 0, size, starts, bounds)
+                    yield number, self._block(content, number, time, moved)
 
     def _read_summary(self, stream: BinaryIO) -> None:
         """Learn channels and chunks from the end of the file."""
@@ -115,10 +116,8 @@ class Mcap(ChunkedFile[Chunk]):
     def _walk(self, stream: BinaryIO, cause: Cause) -> None:
         """Learn channels and messages from front to end, as far as records can be followed."""
         self._chunks, self.connections = [], {}
-        counts: Counter[int] = Counter()
         size = self.path.stat().st_size
         at, unread = len(MAGIC), 0
-        last: float | None = None
         while at + 9 <= size:
             stream.seek(at)
             op, length = struct.unpack("<BQ", stream.read(9))
@@ -126,52 +125,28 @@ class Mcap(ChunkedFile[Chunk]):
             if op in (FOOTER, DATA_END) or op == 0 or (end > size and op != CHUNK):
                 break
             if op == CHUNK:
-                chunk, in_chunk, missed = self._scan(
-                    stream, Chunk(at, min(length, size - at - 9), {})
-                )
-                unread += missed
-                last = last if chunk.end is None else max(last or 0.0, chunk.end)
-                self._chunks.append(chunk)
-                counts.update(in_chunk)
+                unread += self._add(stream, Chunk(at, min(length, size - at - 9), {}))
             elif op == MESSAGE and length >= 22:
                 number, _, time = _HEAD.unpack(stream.read(14))
-                self._loose.setdefault(number, []).append((at, end, time))
-                last = max(last or 0.0, time * 1e-9)
-                counts[number] += 1
+                self._loose.setdefault(number, []).append((time, at, end))
             elif op in (SCHEMA, CHANNEL) and length < LARGEST_CHUNK:
                 with contextlib.suppress(DamagedError):
                     self._learn(op, stream.read(length))
             at = end
-        self._count(counts)
-        self.damage.append(
-            Damage(
-                cause,
-                salvaged=sum(counts.values()),
-                bytes_lost=max(size - at, 0) + unread,
-                start=last,
-            )
-        )
+        self._salvaged(cause, max(size - at, 0) + unread, self._loose)
 
-    def _scan(self, stream: BinaryIO, chunk: Chunk) -> tuple[Chunk, dict[int, int], int]:
-        """Learn the channels inside a chunk; return also its messages and the bytes not read."""
-        try:
-            content = self._content(stream, chunk)
-        except DamagedError:
-            return chunk, {}, chunk.length
-        counts: Counter[int] = Counter()
-        last, read = None, 0
+    def _scan(self, content: bytes) -> tuple[Mapping[int, list[tuple[int, int]]], int]:
+        messages: dict[int, list[tuple[int, int]]] = {}
+        read = 0
         for op, at, end in _records(content):
             read = end
             if op == MESSAGE and end - at >= 22:
                 number, _, time = _HEAD.unpack_from(content, at)
-                counts[number] += 1
-                last = max(last or 0, time)
+                messages.setdefault(number, []).append((time, at - 9))
             elif op in (SCHEMA, CHANNEL):
                 with contextlib.suppress(DamagedError):
                     self._learn(op, content[at:end])
-        known = dict.fromkeys(counts, 0)
-        seconds = None if last is None else last * 1e-9
-        return replace(chunk, held=known, end=seconds), counts, len(content) - read
+        return messages, read
 
     def _learn(self, op: int, content: bytes) -> None:
         """Take in a schema or a channel."""
@@ -197,46 +172,28 @@ class Mcap(ChunkedFile[Chunk]):
         except (struct.error, ValueError):
             raise DamagedError("a channel makes no sense") from None
 
-    def _content(self, stream: BinaryIO, chunk: Chunk) -> bytes:
-        """Return the unpacked records of a chunk."""
-        compression, position, packed, size = _chunk_header(stream, chunk)
-        stream.seek(position)
-        return unpack(compression, stream.read(packed), size)
+    def _place(self, stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
+        stream.seek(chunk.position + 9)
+        head = stream.read(40 + 16)
+        try:
+            (size,) = struct.unpack_from("<Q", head, 16)
+            compression, at = _string(head, 28)
+            (packed,) = struct.unpack_from("<Q", head, at)
+        except (struct.error, ValueError):
+            raise DamagedError("a chunk makes no sense") from None
+        packed = min(packed, max(0, chunk.length - at - 8))
+        return compression, chunk.position + 9 + at + 8, packed, size
 
-    def _locate(
-        self, stream: BinaryIO, chunk: Chunk, wanted: list[int]
-    ) -> Iterator[tuple[int, Block]]:
-        if all(chunk.held.values()):
-            entries = {n: _index(stream, at, n) for n, at in chunk.held.items()}
-            compression, position, packed, _ = _chunk_header(stream, chunk)
-            if compression or packed < 4 * NEAR:
-                content = np.frombuffer(self._content(stream, chunk), dtype=np.uint8)
-            else:  # only the wanted pieces of one that may hold images unpacked
-                content, entries = read_wanted(stream, position, packed, entries, wanted)
-            for number in wanted:
-                yield number, _block(content, number, *entries[number])
-            return
-        raw = self._content(stream, chunk)
-        rows: dict[int, list[tuple[int, int]]] = {number: [] for number in wanted}
-        for op, at, end in _records(raw):
-            if op == MESSAGE and end - at >= 22:
-                number, _, time = _HEAD.unpack_from(raw, at)
-                if number in rows:
-                    rows[number].append((time, at - 9))
-        content = np.frombuffer(raw, dtype=np.uint8)
-        for number, entries_of in rows.items():
-            if entries_of:
-                yield number, _block(content, number, *_columns(entries_of))
+    def _index(self, stream: BinaryIO, chunk: Chunk) -> Entries:
+        return {number: _entries(stream, at, number) for number, at in chunk.held.items()}
 
-    def _loose_blocks(self, stream: BinaryIO, number: int) -> Iterator[tuple[int, Block]]:
-        """Yield messages that lie in no chunk."""
-        loose = np.array(self._loose[number], dtype=np.int64)
-        for rows in np.array_split(loose, max(1, len(loose) // 4096)):
-            starts, ends, time = rows.T
-            content, moved = read_pieces(
-                stream, 0, self.path.stat().st_size, starts, np.unique([*starts, *ends])
-            )
-            yield number, _block(content, number, time, moved)
+    def _block(self, content: Bytes, number: int, time: Index, offset: Index) -> Block:
+        inside = (offset >= 0) & (offset + BEFORE_PAYLOAD <= len(content))
+        offset, time = offset[inside], time[inside]
+        end = offset + 9 + unsigned(content, offset + 1, 8)
+        inside = (content[offset] == MESSAGE) & (unsigned(content, offset + 9, 2) == number)
+        inside &= (end >= offset + BEFORE_PAYLOAD) & (end <= len(content))
+        return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])
 
 
 def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
@@ -275,24 +232,7 @@ def _counts(content: bytes) -> dict[int, int]:
     return dict(struct.iter_unpack("<HQ", content[46:]))
 
 
-def _chunk_header(stream: BinaryIO, chunk: Chunk) -> tuple[str, int, int, int]:
-    """Return a chunk's compression, where its records lie, how long they are, packed and not."""
-    stream.seek(chunk.position + 9)
-    head = stream.read(40 + 16)
-    try:
-        (size,) = struct.unpack_from("<Q", head, 16)
-        compression, at = _string(head, 28)
-        (packed,) = struct.unpack_from("<Q", head, at)
-    except (struct.error, ValueError):
-        raise DamagedError("a chunk makes no sense") from None
-    position = chunk.position + 9 + at + 8
-    packed = min(packed, max(0, chunk.length - at - 8))
-    if packed > LARGEST_CHUNK:
-        raise DamagedError(f"a chunk claims {packed} bytes")
-    return compression, position, packed, size
-
-
-def _index(stream: BinaryIO, position: int, number: int) -> tuple[Index, Index]:
+def _entries(stream: BinaryIO, position: int, number: int) -> tuple[Index, Index]:
     """Read the times and offsets of one channel's messages in a chunk."""
     stream.seek(position)
     head = stream.read(15)
@@ -306,18 +246,3 @@ def _index(stream: BinaryIO, position: int, number: int) -> tuple[Index, Index]:
         raise DamagedError("an index is cut")
     entries = np.frombuffer(data, dtype="<i8").reshape(-1, 2)
     return entries[:, 0].copy(), entries[:, 1].copy()
-
-
-def _columns(rows: list[tuple[int, int]]) -> tuple[Index, Index]:
-    table = np.array(rows, dtype=np.int64)
-    return table[:, 0], table[:, 1]
-
-
-def _block(content: Bytes, number: int, time: Index, offset: Index) -> Block:
-    """Find the payloads of a channel's messages, whose records begin at some offsets."""
-    inside = (offset >= 0) & (offset + BEFORE_PAYLOAD <= len(content))
-    offset, time = offset[inside], time[inside]
-    end = offset + 9 + u64(content, offset + 1)
-    inside = (content[offset] == MESSAGE) & (u16(content, offset + 9) == number)
-    inside &= (end >= offset + BEFORE_PAYLOAD) & (end <= len(content))
-    return Block(content, offset[inside] + BEFORE_PAYLOAD, end[inside], time[inside])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -78,9 +78,9 @@ class Definitions:
         text = self.texts.get(kind)
         if text is not None and text.format is not MessageDefinitionFormat.NONE:
             self._known.update(_parse(self.path, text, kind))
-        for path in _message_files(self.files):
-            for name, fields in _parse(path, _read(path), _type_of(path)).items():
-                self._known.setdefault(name, fields)
+        for given in self.files:
+            for path in sorted(given.rglob("*.msg")) if given.is_dir() else [given]:
+                self._known = _parse(path, _read(path), _type_of(path)) | self._known
         if self.standard and kind not in self._known and kind in MOTION_CAPTURE:
             text = MessageDefinition(MessageDefinitionFormat.MSG, MOTION_CAPTURE[kind])
             self._known[kind] = _parse(self.path, text, kind)[kind]
@@ -114,11 +114,6 @@ def _types(form: MessageDefinitionFormat, text: str, kind: str) -> dict[str, Fie
     idl = form is MessageDefinitionFormat.IDL
     types = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
     return {name: fields for name, (_, fields) in types.items()}
-
-
-def _message_files(files: Iterable[Path]) -> Iterable[Path]:
-    for path in files:
-        yield from sorted(path.rglob("*.msg")) if path.is_dir() else [path]
 
 
 def _type_of(path: Path) -> str:

@@ -1,16 +1,23 @@
-"""A ROS recording of any container: topics, and their wanted fields as arrays."""
+"""A ROS recording of any container, or a folder of them: topics, and wanted fields as arrays."""
 
 from __future__ import annotations
 
+import re
+import shutil
+import weakref
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.core.errors import RecordingError
+from tuner.core.disk import file_name
+from tuner.core.errors import ConfigError, RecordingError
+from tuner.core.yaml_document import read_yaml
 from tuner.recordings import px4
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
@@ -24,10 +31,127 @@ from tuner.recordings.recording import (
     Usual,
 )
 from tuner.recordings.ros.bag1 import Bag1
-from tuner.recordings.ros.container import Connection, Container
-from tuner.recordings.ros.folder import Folder, open_file
+from tuner.recordings.ros.container import (
+    LARGEST_CHUNK,
+    Connection,
+    Container,
+    DamagedError,
+    joined,
+    unpack,
+    zstd,
+)
+from tuner.recordings.ros.db3 import Db3
+from tuner.recordings.ros.mcap import Mcap
 from tuner.recordings.ros.messages import USUAL, Definitions
-from tuner.recordings.ros.wire import UnknownFieldError, Walk, decode, missing_fields, plan
+from tuner.recordings.ros.wire import Block, UnknownFieldError, Walk, decode, missing_fields, plan
+
+#: Files compressed as a whole are unpacked beside the others up to this size.
+LARGEST_UNPACKED = 32 << 30
+
+
+@dataclass
+class Folder(Container):
+    """A folder with one or more ``.db3`` or ``.mcap`` files."""
+
+    _files: list[Container] = field(default_factory=list)
+    _numbers: dict[int, tuple[int, int]] = field(default_factory=dict)
+    _compressed: bool = False
+    _unpacked: Path | None = None
+
+    def __post_init__(self) -> None:
+        names, mode = self._metadata()
+        self._compressed = mode == "message"
+        errors = []
+        for name in names:
+            path = self.path / Path(name).name
+            try:
+                self._files.append(
+                    open_file(self._unpack(path) if path.suffix == ".zstd" else path)
+                )
+            except (RecordingError, DamagedError, OSError) as err:
+                errors.append(str(err))
+                size = path.stat().st_size if path.is_file() else None
+                self.damage.append(Damage(Cause.FILE_UNREADABLE, path.name, bytes_lost=size))
+        if not self._files:
+            reason = errors[0] if errors else "holds no .db3 or .mcap file"
+            raise RecordingError(self.path, reason, "give the folder with metadata.yaml")
+        for i, container in enumerate(self._files):
+            self.damage += container.damage
+            for connection in container.connections.values():
+                number = len(self._numbers)
+                self._numbers[number] = (i, connection.id)
+                self.connections[number] = replace(connection, id=number)
+        known = {c.type: c.definition for c in self.connections.values() if c.definition.data}
+        self.connections = {  # of a connection without a definition, that of its type elsewhere
+            number: replace(c, definition=known.get(c.type, c.definition))
+            for number, c in self.connections.items()
+        }
+
+    def blocks(self, wanted: Collection[int]) -> Iterator[tuple[int, Block]]:
+        """Yield the messages of some connections, file by file."""
+        for i, container in enumerate(self._files):
+            here = {inner: n for n, (file, inner) in self._numbers.items() if file == i}
+            inside = [inner for inner, number in here.items() if number in wanted]
+            known = len(container.damage)
+            for inner, block in container.blocks(inside):
+                yield here[inner], self._unpacked_block(block) if self._compressed else block
+            self.damage += container.damage[known:]
+
+    def _metadata(self) -> tuple[list[str], str]:
+        """Return the files and the compression mode, from the metadata or from what lies there."""
+        path = self.path / "metadata.yaml"
+        try:
+            about: Any = read_yaml(path).data
+            about = about["rosbag2_bagfile_information"]
+            names, mode = about["relative_file_paths"], about.get("compression_mode") or ""
+            if names and all(isinstance(name, str) for name in (*names, mode)):
+                return names, mode.lower()
+            raise ValueError("it names no file")
+        except (ConfigError, ValueError, KeyError, TypeError, AttributeError):
+            names = sorted(
+                file.name
+                for file in self.path.iterdir()
+                if file.suffix in (".db3", ".mcap") or file.name.endswith(".db3.zstd")
+            )
+            self.damage.append(Damage(Cause.METADATA_MISSING, path.name))
+            return names, ""
+
+    def _unpack(self, path: Path) -> Path:
+        """Unpack a file that was compressed as a whole."""
+        if self._unpacked is None:
+            self._unpacked = Path(mkdtemp(prefix="tune-"))
+            weakref.finalize(self, shutil.rmtree, self._unpacked, True)
+        target = self._unpacked / file_name(path.stem)
+        written = 0
+        try:
+            with zstd().open(path, "rb") as packed, target.open("wb") as stream:
+                while part := packed.read(1 << 20):
+                    written += len(part)
+                    if written > LARGEST_UNPACKED:
+                        raise DamagedError(f"{path.name} unpacks to an absurd size")
+                    stream.write(part)
+        except (zstd().ZstdError, EOFError) as err:
+            raise DamagedError(f"{path.name} cannot be unpacked ({err})") from None
+        return target
+
+    def _unpacked_block(self, block: Block) -> Block:
+        """Unpack messages that were compressed one by one; a damaged one becomes empty."""
+        payloads = []
+        for start, end in zip(block.start, block.end, strict=True):
+            try:
+                packed = block.buffer[start:end].tobytes()
+                payloads.append(unpack("zstd", packed, LARGEST_CHUNK))
+            except DamagedError:
+                payloads.append(b"")
+        return joined(block.time.tolist(), payloads)
+
+
+def open_file(path: Path) -> Container:
+    """Open one data file of a ROS 2 recording by what it begins with."""
+    with path.open("rb") as stream:
+        magic = stream.read(16)
+    return Db3(path) if magic.startswith(b"SQLite format 3") else Mcap(path)
+
 
 _SECONDS, _NANOSECONDS = "header.stamp.sec", "header.stamp.nanosec"
 
@@ -48,17 +172,15 @@ class RosRecording(Recording):
     ----------
     path
         The recording.
-    container
-        Its opened container.
     messages
         ``.msg`` files for types that the container does not define.
     """
 
     format = "ros"
 
-    def __init__(self, path: Path, container: Container, messages: tuple[Path, ...] = ()) -> None:
+    def __init__(self, path: Path, messages: tuple[Path, ...] = ()) -> None:
         self.path = path
-        self._container = container
+        self._container = container = open_container(path)
         texts = {c.type: c.definition for c in container.connections.values()}
         self._definitions = Definitions(path, texts, messages, standard=container.aligned)
         counts: Counter[tuple[str, str]] = Counter()
@@ -68,16 +190,12 @@ class RosRecording(Recording):
             Topic(name, kind, count) for (name, kind), count in sorted(counts.items())
         )
 
-    @property
-    def damage(self) -> tuple[Damage, ...]:
-        """What of the container could not be read so far."""
-        return tuple(self._container.damage)
-
     def usual(self, topic: str, signal: str) -> Usual | None:
         """Return where messages of this topic's type hold a signal."""
         kind = self._kind(topic)
         if kind.startswith("px4_msgs/"):
-            return px4.USUAL.get(px4.log_name(kind), {}).get(signal)
+            in_log = re.sub(r"(?<!^)(?=[A-Z])", "_", kind.rpartition("/")[2]).lower()
+            return px4.USUAL.get(in_log, {}).get(signal)
         return USUAL.get(kind, {}).get(signal)
 
     def fields(self, topic: str) -> list[str]:
@@ -126,7 +244,7 @@ class RosRecording(Recording):
             if count
         ]
         samples = {name: _joined(rows) for name, rows in parts.items() if rows}
-        return Contents(samples, damage=(*self.damage, *cut))
+        return Contents(samples, damage=(*self._container.damage, *cut))
 
     def _has(self, kind: str, path: str) -> bool:
         return not missing_fields(self._definitions, kind, (path,))

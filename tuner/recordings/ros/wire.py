@@ -75,13 +75,8 @@ class _Number:
 
 
 @dataclass(frozen=True)
-class _Text:
-    """A string: its length, then its bytes."""
-
-
-@dataclass(frozen=True)
 class _Numbers:
-    """A sequence of numbers, its length before it."""
+    """A sequence of numbers, its length before it; a string is one of bytes."""
 
     kind: str
     wanted: Mapping[int, str]
@@ -98,7 +93,7 @@ class _Structures:
     rest: tuple[_Step, ...]
 
 
-_Step = _Number | _Text | _Numbers | _Structures
+_Step = _Number | _Numbers | _Structures
 
 
 class UnknownFieldError(Exception):
@@ -177,7 +172,7 @@ class _Planner:
             for name, inner in self.definitions.fields(detail):
                 yield from self.steps(inner, f"{path}.{name}" if path else name, depth + 1)
         elif node == Nodetype.BASE and detail[0] == "string":
-            yield _Text()
+            yield _Numbers("u1", {})
         elif node == Nodetype.BASE:
             yield _Number(_kind(detail[0]), 1, {0: path} if path in self.wanted else {})
         else:
@@ -229,33 +224,26 @@ def decode(walk: Walk, block: Block) -> tuple[dict[str, NDArray[Any]], NDArray[n
     is not whole; its numbers mean nothing.
     """
     count = len(block.start)
-    whole = np.ones(count, dtype=np.bool_)
+    whole, little, head = np.ones(count, dtype=np.bool_), np.ones(count, dtype=np.uint8), 0
+    if walk.aligned:  # CDR: four bytes before the payload give the byte order, and do not count
+        head = 4
+        whole = (block.end - block.start >= head) & (block.start >= 0)
+        whole &= block.end <= len(block.buffer)
+        little[whole] = block.buffer[block.start[whole] + 1]
+        whole &= little <= 1
     columns: dict[str, NDArray[Any]] = {}
-    if not walk.aligned:
-        _Walker(block.buffer, "<", False, columns, whole).run(walk.steps, block.start, block.end)
-        return _complete(walk, columns, count), whole
-    # CDR: four bytes before the payload give the byte order; offsets count from behind them.
-    headed = (block.end - block.start >= 4) & (block.start >= 0) & (block.end <= len(block.buffer))
-    little = np.zeros(count, dtype=np.uint8)
-    little[headed] = block.buffer[block.start[headed] + 1]
-    whole &= headed & (little <= 1)
     for order, flag in (("<", 1), (">", 0)):
         rows = np.flatnonzero(whole & (little == flag))
         if len(rows) == 0:
             continue
-        part: dict[str, NDArray[Any]] = {}
-        part_whole = np.ones(len(rows), dtype=np.bool_)
-        walker = _Walker(block.buffer, order, True, part, part_whole)
-        walker.run(walk.steps, block.start[rows] + 4, block.end[rows])
-        whole[rows] = part_whole
-        for name, values in part.items():
-            native = values.astype(values.dtype.newbyteorder("="))
+        walker = _Walker(block.buffer, order, walk.aligned, {}, np.ones(len(rows), dtype=np.bool_))
+        start, end = block.start[rows] + head, block.end[rows]
+        walker.walk(walk.steps, start, end, 0, np.arange(len(rows)))
+        whole[rows] = walker.whole
+        for name, values in walker.columns.items():
+            native = values.astype(values.dtype.newbyteorder("="), copy=False)
             columns.setdefault(name, np.zeros(count, dtype=native.dtype))[rows] = native
-    return _complete(walk, columns, count), whole
-
-
-def _complete(walk: Walk, columns: dict[str, NDArray[Any]], count: int) -> dict[str, NDArray[Any]]:
-    return {name: columns.get(name, np.full(count, np.nan)) for name in walk.fields}
+    return {name: columns.get(name, np.full(count, np.nan)) for name in walk.fields}, whole
 
 
 @dataclass
@@ -269,13 +257,10 @@ class _Walker:
     whole: NDArray[np.bool_]
     left: int = 100_000
 
-    def run(self, steps: Sequence[_Step], start: Index, end: Index) -> None:
-        """Walk every message from the start of its payload."""
-        self._walk(steps, start, end, 0, np.arange(len(start)))
-
-    def _walk(
+    def walk(
         self, steps: Sequence[_Step], start: Index, end: Index, cursor: Cursor, rows: Index
     ) -> Cursor:
+        """Walk messages from a place behind their starts; return the place behind the steps."""
         for step in steps:
             self.left -= 1
             if self.left < 0:
@@ -283,9 +268,6 @@ class _Walker:
                 break
             if isinstance(step, _Number):
                 cursor = self._number(step, start, end, cursor, rows)
-            elif isinstance(step, _Text):
-                length, cursor = self._length(start, end, cursor, rows)
-                cursor = self._advance(cursor, length, start, end, rows)
             elif isinstance(step, _Numbers):
                 cursor = self._numbers(step, start, end, cursor, rows)
             else:
@@ -333,7 +315,7 @@ class _Walker:
         for i in range(int(count.max(initial=0))):
             has = np.flatnonzero(count > i)
             steps = step.elements[i] if i < len(step.elements) else step.rest
-            at[has] = self._walk(steps, start[has], end[has], at[has], rows[has])
+            at[has] = self.walk(steps, start[has], end[has], at[has], rows[has])
         return at
 
     def _length(
