@@ -13,8 +13,6 @@ import os
 import shutil
 import tempfile
 import uuid
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -100,11 +98,10 @@ class ContentStore:
         except OSError:  # another disk, or a file system without links
             shutil.copyfile(self.path(digest), target)
 
-    @contextmanager
-    def reading(self, digest: str) -> Iterator[IO[bytes]]:
+    def reading(self, digest: str) -> IO[bytes]:
         """Open the content of a digest."""
-        with self._files.open(self.path(digest), "rb") as file:
-            yield file
+        file: IO[bytes] = self._files.open(self.path(digest), "rb")
+        return file
 
     def read(self, digest: str) -> bytes:
         """Return some content that is what its digest says.

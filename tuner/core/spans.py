@@ -102,19 +102,20 @@ def span(name: str) -> Iterator[None]:
 
     Whoever watches the run is told the stage, and at its end the one that it was in.
     """
-    watcher = _WATCHER.get()
-    if watcher is None:
-        with _counted(name):
-            yield
-        return
-    outer = _STAGE.set(name)
-    watcher(name)
+    watcher, recorder = _WATCHER.get(), _RECORDER.get()
+    outer = None if watcher is None else _STAGE.set(name)
+    begin, used = (0.0, 0.0) if recorder is None else (recorder.now(), time.process_time())
+    if watcher is not None:
+        watcher(name)
     try:
-        with _counted(name):
-            yield
+        yield
     finally:
-        _STAGE.reset(outer)
-        watcher(_STAGE.get())
+        if recorder is not None:
+            spent = time.process_time() - used
+            recorder.spans.append(Span(name, begin, recorder.now(), processor=spent))
+        if watcher is not None and outer is not None:
+            _STAGE.reset(outer)
+            watcher(_STAGE.get())
 
 
 @contextmanager
@@ -125,20 +126,6 @@ def watching(on_stage: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         _WATCHER.reset(token)
-
-
-@contextmanager
-def _counted(name: str) -> Iterator[None]:
-    recorder = _RECORDER.get()
-    if recorder is None:
-        yield
-        return
-    begin, used = recorder.now(), time.process_time()
-    try:
-        yield
-    finally:
-        spent = time.process_time() - used
-        recorder.spans.append(Span(name, begin, recorder.now(), processor=spent))
 
 
 @contextmanager

@@ -83,9 +83,11 @@ def read_yaml(path: str | Path) -> Document:
         The file is missing, too large, not YAML, has a key twice, or expands without bound.
     """
     path = Path(path)
-    text = _read_text(path)
+    if exists(path) and path.is_dir():
+        raise ConfigError(path, "is a folder", "give the path of a YAML file")
+    raw = read_bytes(path, most=MAX_BYTES, remedy="give the path of a YAML file")
     try:
-        loader = _Loader(text)
+        loader = _Loader(raw.decode("utf-8-sig"))
         node = loader.get_single_node()
         if node is None:
             return Document(path, {}, {})
@@ -99,6 +101,8 @@ def read_yaml(path: str | Path) -> Document:
         raise ConfigError(
             path, f"{at}{error.problem or error.context}", "correct the YAML"
         ) from None
+    except UnicodeDecodeError:
+        raise ConfigError(path, "is not UTF-8 text", "give a YAML file") from None
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(path, f"is not YAML ({error})", "correct the file") from None
     except RecursionError:
@@ -123,16 +127,6 @@ def _set_style(node: yaml.Node, depth: int) -> None:
         node.flow_style = depth > 1
     for child in _children(node):
         _set_style(child, depth + 1)
-
-
-def _read_text(path: Path) -> str:
-    if exists(path) and path.is_dir():
-        raise ConfigError(path, "is a folder", "give the path of a YAML file")
-    raw = read_bytes(path, most=MAX_BYTES, remedy="give the path of a YAML file")
-    try:
-        return raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConfigError(path, "is not UTF-8 text", "give a YAML file") from None
 
 
 def _check_size(path: Path, root: yaml.Node) -> None:

@@ -243,12 +243,16 @@ def refitted(
         objective=replace(fitted.objective, model=model, space=space),
         point=Point(np.asarray(space.initial), _without_conditions(fitted, lost).offsets),
     )
-    movable = np.array([_moves(p) and p.name not in fitted.held for p in parameters], bool)
+    rows = [COEFFICIENTS[parameter.name] for parameter in parameters]
+    own = [row.scope == "vehicle" and not row.is_effect for row in rows]
+    movable = np.array(
+        [o and r.name not in fitted.held for o, r in zip(own, rows, strict=True)], bool
+    )
     end = _polished(job, start, movable, on_progress)
     try:
         return end, _vehicle_at(bare, end, movable)
     except ConfigError:  # together the moments are no rigid body's
-        movable &= np.array([COEFFICIENTS[p.name].place[0] != "inertia" for p in parameters], bool)
+        movable &= np.array([row.place[0] != "inertia" for row in rows], bool)
         end = _polished(job, start, movable, on_progress)
         return end, _vehicle_at(bare, end, movable)
 
@@ -266,11 +270,6 @@ def _polished(
         on_progress=lambda progress: on_progress(job, progress),
         stages=STAGES,
     )
-
-
-def _moves(parameter: Parameter) -> bool:
-    row = COEFFICIENTS[parameter.name]
-    return row.scope == "vehicle" and not row.is_effect
 
 
 def _vehicle_at(bare: VehicleFile, end: Fitted, movable: NDArray[np.bool_]) -> VehicleFile:

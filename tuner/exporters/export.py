@@ -365,7 +365,17 @@ def exported_vehicle(run: Run, today: date) -> tuple[VehicleFile, tuple[str, ...
         for name, row in run.result.coefficients.items()
         if row.fitted and row.identifiable is False
     )
-    return run.vehicle.replace(source=_source(run, today)), notes
+    result = run.result
+    source: dict[str, JsonValue] = {
+        "run": str(run.folder.resolve()),
+        "date": today.isoformat(),
+        "versions": dict(result.versions),
+        "flights": {
+            flight.name: f"{flight.split}, sha256 {flight.sha256}" for flight in result.flights
+        },
+        "coefficients": {name: _confidence(run, name) for name in result.coefficients},
+    }
+    return run.vehicle.replace(source=source), notes
 
 
 def provenance(run: Run, today: date, accepted: str = "") -> str:
@@ -392,19 +402,6 @@ def provenance_of_file(
     return " ".join(line.split()), sources
 
 
-def _source(run: Run, today: date) -> dict[str, JsonValue]:
-    result = run.result
-    return {
-        "run": str(run.folder.resolve()),
-        "date": today.isoformat(),
-        "versions": dict(result.versions),
-        "flights": {
-            flight.name: f"{flight.split}, sha256 {flight.sha256}" for flight in result.flights
-        },
-        "coefficients": {name: _confidence(run, name) for name in result.coefficients},
-    }
-
-
 def _confidence(run: Run, name: str) -> dict[str, JsonValue]:
     coefficient = run.result.coefficients[name]
     if not coefficient.fitted:
@@ -429,7 +426,9 @@ def in_simulator(
     physical coefficients. Without ``refit``, what was found for Gazebo stands in for others.
     """
     simulator, found = target.simulator, None
-    if simulator is None or _wanted(run) == "physical":
+    job = run.result.settings.get("job")
+    wanted = job.get("target") if isinstance(job, dict) else None
+    if simulator is None or wanted == "physical":
         return run, None
     effective, flying = run.result.effective, run.effective
     if effective is not None and flying is not None:
@@ -462,8 +461,3 @@ def in_simulator(
     )
     result = run.result.model_copy(update={"coefficients": coefficients, "flights": flights})
     return run.model_copy(update={"vehicle": flying, "result": result}), effective
-
-
-def _wanted(run: Run) -> str:
-    job = run.result.settings.get("job")
-    return str(job.get("target", "gazebo")) if isinstance(job, dict) else "gazebo"

@@ -109,14 +109,10 @@ def _scalar_last(q: Array) -> Array:
     return q[:, [3, 0, 1, 2]]
 
 
-def _inverse(q: Array) -> Array:
-    return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]), dtype=np.float64)
-
-
 #: How attitudes are recorded that are not (w, x, y, z) from FLU to ENU; the likelier first.
 ATTITUDE_READINGS = (
     Reading("scalar-last", _scalar_last),
-    Reading("world to body", _inverse),
+    Reading("world to body", lambda q: q * np.array([1.0, -1.0, -1.0, -1.0])),
     Reading("NED and FRD", lambda q: to_enu_flu(q, "attitude")),
     Reading("scalar-last, NED and FRD", lambda q: to_enu_flu(_scalar_last(q), "attitude")),
 )

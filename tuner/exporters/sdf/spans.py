@@ -52,12 +52,9 @@ class Element:
                 yield child
             yield from child.all(tag)
 
-    def find(self, *tags: str) -> Element | None:
-        """Return the element at a path of tags from here, the first of each; None without one."""
-        element: Element | None = self
-        for tag in tags:
-            element = next((c for c in element.children if c.tag == tag), None) if element else None
-        return element
+    def find(self, tag: str) -> Element | None:
+        """Return the first element of a tag directly inside; None without one."""
+        return next((child for child in self.children if child.tag == tag), None)
 
 
 @dataclass(frozen=True)
