@@ -255,7 +255,7 @@ class ChunkedFile(Container):
         with contextlib.suppress(DamagedError):
             chunk, missed = self._walked(stream, chunk)
         self._chunks.append(chunk)
-        return missed
+        return missed if chunk.compression in ("none", "") else 0  # of the file, not unpacked
 
     def _salvaged(
         self, cause: Cause, lost: int, loose: Mapping[int, list[tuple[int, int, int]]]
