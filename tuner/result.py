@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal, Self
@@ -251,12 +252,21 @@ class RunResult(ResultFile):
     sources: dict[str, Sources] = Field(default_factory=dict)
 
 
-class GateRecord(Part):
-    """A condition of an export: what it is, what stood against it, and whether it was looked at."""
+@dataclass(frozen=True)
+class Gate:
+    """A condition of an export: what it is, and what stands against it (nothing if it is met).
+
+    One that could not be looked at has not ``ran``.
+    """
 
     name: str
     objections: tuple[str, ...] = ()
     ran: bool = True
+
+    @property
+    def passed(self) -> bool:
+        """Whether it was looked at and nothing stands against it."""
+        return self.ran and not self.objections
 
 
 class ExportRecord(Part):
@@ -276,7 +286,7 @@ class ExportRecord(Part):
 
     format: str
     file: str = ""
-    gates: tuple[GateRecord, ...] = ()
+    gates: tuple[Gate, ...] = ()
     refused: str = ""
 
 

@@ -19,7 +19,6 @@ from tuner.exporters.simulators import GAZEBO_CLASSIC, ISAAC_LAB, Simulator
 from tuner.exporters.target import (
     Choices,
     Draft,
-    Gate,
     Target,
     check_every_coefficient,
     not_carried,
@@ -33,7 +32,7 @@ from tuner.result import (
     EffectiveResult,
     ExportRecord,
     ExportRecords,
-    GateRecord,
+    Gate,
     Run,
     read_run,
 )
@@ -145,9 +144,8 @@ def export(
     write(draft, *places)
     notes = (*decided, *flown, *draft.notes, *not_carried(vehicle, target))
     if places[0].is_relative_to(run.folder):
-        checked = tuple(GateRecord(name=g.name, objections=g.objections, ran=g.ran) for g in gates)
         file = places[0].relative_to(run.folder).as_posix()
-        _record(run.folder, ExportRecord(format=kind, file=file, gates=checked))
+        _record(run.folder, ExportRecord(format=kind, file=file, gates=gates))
     return Exported(places[0], gates, notes)
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from tuner.core.errors import InputError
 from tuner.evaluate.records import RMSE_UNITS, AxesRmse
 from tuner.exporters.simulators import hover_command, thrust_to_weight
-from tuner.exporters.target import Draft, Gate
-from tuner.result import Run
+from tuner.exporters.target import Draft
+from tuner.result import Gate, Run
 from tuner.vehicle import VehicleFile
 
 #: Flies every flight of a run with a vehicle; flight name to RMSE, None in it where it crashed.

@@ -17,28 +17,12 @@ from tuner.core.errors import ConfigError, ExportError, did_you_mean
 from tuner.core.files import read_bytes
 from tuner.exporters import targets
 from tuner.exporters.simulators import Entry, Simulator
+from tuner.result import Gate
 from tuner.vehicle import COEFFICIENTS, Coefficient, NotCarried, VehicleFile, values_of
 
 MAX_BYTES = 10_000_000
 #: Numbers are written with twelve digits; mass and inertia may go through sums of links.
 TOLERANCE = 1e-9
-
-
-@dataclass(frozen=True)
-class Gate:
-    """One condition: what it is, and what stands against it (nothing if it is met).
-
-    One that could not be looked at has not ``ran``.
-    """
-
-    name: str
-    objections: tuple[str, ...]
-    ran: bool = True
-
-    @property
-    def passed(self) -> bool:
-        """Whether it was looked at and nothing stands against it."""
-        return self.ran and not self.objections
 
 
 @dataclass(frozen=True)

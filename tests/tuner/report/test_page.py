@@ -16,7 +16,7 @@ from tuner.report import render
 from tuner.report.contents import read_contents
 from tuner.report.record import SearchRecord
 from tuner.report.sections import sections_of
-from tuner.result import ExportRecord, ExportRecords, GateRecord, read_run
+from tuner.result import ExportRecord, ExportRecords, Gate, read_run
 from tuner.uncertainty.directions import Direction
 
 WITH_MASS = (
@@ -157,7 +157,7 @@ def test_warnings_stand_with_the_outcome_and_remarks_are_folded(tmp_path: Path) 
 
 def test_exports_are_linked_with_their_conditions(tmp_path: Path) -> None:
     making.write_run(tmp_path, FREE, ROLLING)
-    gates = (GateRecord(name="it hovers"), GateRecord(name="it flies", objections=("it crashed",)))
+    gates = (Gate(name="it hovers"), Gate(name="it flies", objections=("it crashed",)))
     made = ExportRecord(format="sdf", file="export/quad.sdf", gates=gates)
     refused = ExportRecord(format="px4", refused="no thrust")
     ExportRecords(exports={"sdf": made, "px4": refused}).write(tmp_path)

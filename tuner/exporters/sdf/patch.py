@@ -22,7 +22,8 @@ from tuner.exporters.simulators import (
     rotor_speed,
     with_speeds_in,
 )
-from tuner.exporters.target import Draft, Gate, differences, read_file
+from tuner.exporters.target import Draft, differences, read_file
+from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
 #: Products of inertia below this part of the trace are taken as none.

@@ -16,7 +16,8 @@ from tuner.core.disk import file_name
 from tuner.core.yaml_document import commented
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import DRONE_MODELS, rotor_speed, thrust_at
-from tuner.exporters.target import Choices, Draft, Gate, Target, differences, read_file
+from tuner.exporters.target import Choices, Draft, Target, differences, read_file
+from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
 Array = NDArray[np.float64]

@@ -27,7 +27,8 @@ from tuner.exporters.simulators import (
     hover_speed,
     rotor_speed,
 )
-from tuner.exporters.target import Choices, Draft, Gate, Target, read_file
+from tuner.exporters.target import Choices, Draft, Target, read_file
+from tuner.result import Gate
 from tuner.vehicle import VehicleFile
 
 DIGITS = 1e-8
