@@ -20,7 +20,8 @@ from benchmarks.table import Section, figure
 from benchmarks.timing import ROOT
 from tuner.config import Options, settle
 from tuner.core.errors import InputError
-from tuner.evaluate.predict import UNITS, Predictions, predict, summary
+from tuner.evaluate.predict import Predictions, predict, summary
+from tuner.findings.composed import PREDICTED
 from tuner.job.run import run
 from tuner.objective.inlets import INLETS
 from tuner.result import BEST_FIT_FILE, RunResult
@@ -38,7 +39,7 @@ HELD_OUT: Mapping[str, tuple[str, ...]] = {
 
 def measure() -> Section:
     """Fit and predict every set that is there."""
-    head = ["set", "predictor", "steps", *(f"{name} [{unit}]" for name, unit in UNITS.items())]
+    head = ["set", "predictor", "steps", *(f"{name} [{unit}]" for name, unit in PREDICTED.items())]
     rows: list[list[str]] = []
     notes = []
     for folder in sorted(path for path in FLIGHTS.glob("*") if path.is_dir()):
@@ -68,7 +69,7 @@ def _rows(name: str, contest: Contest) -> Iterator[list[str]]:
     for predictor, predictions in contest.predictions.items():
         for steps in STEPS:
             means = summary(predictions, steps / 100.0)
-            yield [name, predictor, str(steps), *(_cell(means[key]) for key in UNITS)]
+            yield [name, predictor, str(steps), *(_cell(means[key]) for key in PREDICTED)]
 
 
 def _cell(mean: float) -> str:

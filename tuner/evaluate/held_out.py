@@ -12,9 +12,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.predict import UNITS, Predictions, hold, predict
+from tuner.evaluate.predict import Predictions, hold, predict
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, Pose
+from tuner.findings.composed import PREDICTED
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import OFFSET_UNIT, units_of
 from tuner.objective.inlets import INLETS
@@ -329,11 +330,11 @@ def holding_better(job: Job, validation: Validation) -> tuple[Finding, ...]:
         )
         for best, held in pairs:
             numbers = {"seconds": best.seconds}
-            for quantity in UNITS:
+            for quantity in PREDICTED:
                 of_best, of_held = getattr(best, quantity), getattr(held, quantity)
                 if of_best is not None and of_held is not None and of_best > of_held:
                     numbers |= {quantity: of_best, f"{quantity}_held": of_held}
-            lost = tuple(quantity for quantity in UNITS if quantity in numbers)
+            lost = tuple(quantity for quantity in PREDICTED if quantity in numbers)
             if lost:
                 findings.append(Finding(Code.HOLDING_BETTER, "warning", name, numbers, lost))
     return tuple(findings)

@@ -17,6 +17,7 @@ from sim_jax.constants import GRAVITY
 from sim_jax.crash import AIRBORNE
 from sim_jax.schedule import Schedule
 from tuner.config.job import InletName
+from tuner.findings.composed import PREDICTED
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.flight import MOTION
 from tuner.objective.flown import fly
@@ -28,13 +29,6 @@ from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, VehicleFile
 from tuner.vehicle.model import Model, model_of, schedule_of
 
-UNITS: Mapping[str, str] = {
-    "position": "m",
-    "velocity": "m/s",
-    "attitude": "rad",
-    "body_rate": "rad/s",
-}
-"""What is predicted, with its unit."""
 AT_ONCE = 4096
 """Predictions that are simulated side by side."""
 
@@ -50,9 +44,9 @@ class Predictions:
     ahead
         (S,) s after that at which they are compared.
     errors
-        Quantity of `UNITS` -> (S, n): Euclidean distance from the recorded one, for an attitude the
-        angle of the rotation between both; what the inlet follows, and does not predict, is left
-        out.
+        Quantity of `PREDICTED` -> (S, n): Euclidean distance from the recorded one, for an attitude
+        the angle of the rotation between both; what the inlet follows, and does not predict, is
+        left out.
     """
 
     begins: Array
@@ -63,7 +57,7 @@ class Predictions:
         """Return each quantity's mean error so many s ahead, NaN of what is not predicted."""
         (step,) = np.flatnonzero(np.isclose(self.ahead, seconds, atol=1e-6))
         means = {name: float(np.nanmean(errors[step])) for name, errors in self.errors.items()}
-        return dict.fromkeys(UNITS, np.nan) | means
+        return dict.fromkeys(PREDICTED, np.nan) | means
 
 
 def predict(
@@ -148,7 +142,7 @@ def errors_of(
 ) -> dict[str, Array]:
     """Return quantity -> (S, n) distances of what was reached (S, n, k) from recorded states."""
     errors = {}
-    for name in UNITS:
+    for name in PREDICTED:
         there = getattr(recorded, name).reshape(*shape, -1)
         if name == "attitude":
             along = np.abs(np.sum(reached[name] * there, axis=-1))
@@ -167,7 +161,7 @@ def _simulated(
     for first in range(0, segments.count, AT_ONCE):
         chosen = np.arange(first, min(first + AT_ONCE, segments.count))
         parts.append(_reached(model, _taken(segments, chosen), ahead, schedule, samples))
-    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in UNITS}
+    return {name: np.concatenate([part[name] for part in parts], axis=1) for name in PREDICTED}
 
 
 def _reached(
@@ -206,7 +200,7 @@ def hold(flight: Flight, begins: Array, ahead: Array) -> Predictions:
     shape = (len(ahead), len(begins))
     reached = {
         name: np.broadcast_to(getattr(start, name), (*shape, getattr(start, name).shape[-1]))
-        for name in UNITS
+        for name in PREDICTED
     }
     recorded = states_at(flight.series, (begins + ahead[:, None]).ravel())
     return Predictions(begins, ahead, errors_of(reached, recorded, shape))
@@ -217,7 +211,8 @@ def summary(predictions: Sequence[Predictions], seconds: float) -> dict[str, flo
     counts = [len(p.begins) for p in predictions]
     means = [p.mean(seconds) for p in predictions]
     return {
-        name: float(np.average([mean[name] for mean in means], weights=counts)) for name in UNITS
+        name: float(np.average([mean[name] for mean in means], weights=counts))
+        for name in PREDICTED
     }
 
 

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 GREY = "#8a8a8a"
 
+SMALLEST = 1e-3
+"""mm or degrees below which an error is drawn as this on a logarithmic axis."""
+
 Scale = Literal["linear", "log"]
 Dash = Literal["solid", "dot", "dash"]
 

@@ -17,6 +17,7 @@ from tuner.report.chart import (
     GREY,
     PALETTE,
     RECORDED,
+    SMALLEST,
     Bars,
     Chart,
     Heat,
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     from tuner.evaluate.simulate import Simulation
 
 
-SMALLEST = 1e-3
-"""mm below which an error is drawn as this on a logarithmic axis."""
 MOST = 8
 """Flights that a figure compares: more panels cannot be read."""
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from tuner.evaluate.comparison import Comparison
-from tuner.evaluate.predict import UNITS, hold, predict, summary
+from tuner.evaluate.predict import hold, predict, summary
+from tuner.findings.composed import PREDICTED
 from tuner.recordings.flight import Series
 from tuner.recordings.states import AROUND
 from tuner.search.job_flights import Recording
@@ -20,7 +21,7 @@ def truth(full_flight, updated):
 
 def test_the_vehicle_that_flew_predicts_its_flight_better_than_one_that_holds(truth, full_flight):
     naive = hold(full_flight, truth.begins, truth.ahead)
-    for name in UNITS:
+    for name in PREDICTED:
         assert truth.mean(0.5)[name] < 0.05 * naive.mean(0.5)[name], name
     assert truth.errors["position"].shape == (50, len(truth.begins))
     assert truth.begins[-1] + 0.5 <= full_flight.duration

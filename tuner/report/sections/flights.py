@@ -15,6 +15,7 @@ from tuner.report.chart import (
     INITIAL,
     PALETTE,
     RECORDED,
+    SMALLEST,
     Chart,
     Dash,
     Line,
@@ -43,8 +44,6 @@ PER_AXIS = {axis: (1e3, "mm") if unit == "m" else (1.0, "°") for axis, unit in 
 """Axis -> what its RMSE is multiplied by for a table, and the unit then."""
 WORSE = 1.05
 """Times the error before beyond which it is marked as worse."""
-SMALLEST = 1e-3
-"""Errors below this, mm or degrees, are drawn as this on a logarithmic axis."""
 TIME = "time since the mission's start [s]"
 PREFIX = "acting_"
 CLOCK = "time"
