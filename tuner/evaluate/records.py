@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 from tuner.core.files import FiniteOrNone, Part
 
 RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 """Axis -> unit of its RMSE."""
+AXES = {"position": ("x", "y", "z"), "attitude": ("roll", "pitch", "yaw")}
+"""Signal -> its axes."""
 
 
 class AxesRmse(Part):
@@ -20,6 +24,11 @@ class AxesRmse(Part):
     roll: FiniteOrNone
     pitch: FiniteOrNone
     yaw: FiniteOrNone
+
+    def together(self, signal: str) -> float | None:
+        """Return the RMSE over the axes of position or attitude; None if one has none."""
+        parts = [getattr(self, axis) for axis in AXES[signal]]
+        return None if None in parts else math.hypot(*parts)
 
 
 class PredictedErrors(Part):

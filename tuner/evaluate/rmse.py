@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuner.evaluate.forces import Forces
-from tuner.evaluate.records import RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
 from tuner.recordings.flight import Array, Flight
 
 Pose = Literal["position", "attitude"]
@@ -85,8 +85,7 @@ class FlightErrors:
     def length(self, signal: Pose) -> float:
         """Return the RMSE over a signal's axes together, m or degrees; infinite for a crash."""
         rmse = self.rmse
-        axes = ("x", "y", "z") if signal == "position" else ("roll", "pitch", "yaw")
-        values = [getattr(rmse, axis) for axis in axes]
+        values = [getattr(rmse, axis) for axis in AXES[signal]]
         known = [value for value in values if value is not None]
         return float(np.linalg.norm(known)) if known else np.inf
 

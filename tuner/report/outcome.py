@@ -11,7 +11,6 @@ from enum import StrEnum
 from pathlib import Path
 
 from tuner.core.phrases import listed, listed_within
-from tuner.evaluate.records import AxesRmse
 from tuner.findings.findings import Code, Finding, remedy, sentence
 from tuner.ground.bench_json import BenchRecord, bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks
@@ -29,7 +28,6 @@ UNCHANGED = 0.8
 """Share of what it was above which an error is called unchanged."""
 Errors = tuple[float | None, float | None, float | None]
 """Before and after a fit, and of the noise."""
-POSITION, ATTITUDE = ("x", "y", "z"), ("roll", "pitch", "yaw")
 DOUBTS = frozenset(
     {
         Code.MODEL_UNMATCHED,
@@ -221,8 +219,7 @@ def _cells(errors: Errors, write: Callable[[float], str]) -> list[str]:
 
 
 def _met(flight: FlightResult, result: RunResult) -> Met:
-    position = _errors(flight, POSITION, _noise(result, "position", 1.0))
-    attitude = _errors(flight, ATTITUDE, _noise(result, "attitude", math.degrees(1.0)))
+    position, attitude = (_errors(flight, result, signal) for signal in ("position", "attitude"))
     codes = {found.code for found in result.findings if found.subject == flight.name}
     return Met(
         flight.name, flight.split == "holdout", position, attitude, _word(position, attitude, codes)
@@ -245,21 +242,13 @@ def _word(
     return "better" if before is None or after < UNCHANGED * before else "unchanged"
 
 
-def _errors(flight: FlightResult, axes: Sequence[str], noise: float | None) -> Errors:
-    return length(flight.rmse_initial, axes), length(flight.rmse_best, axes), noise
-
-
-def length(rmse: AxesRmse, axes: Sequence[str]) -> float | None:
-    """Return an RMSE of several axes together; None where one has none."""
-    parts = [getattr(rmse, axis) for axis in axes]
-    return None if None in parts else math.hypot(*parts)
-
-
-def _noise(result: RunResult, channel: str, unit: float) -> float | None:
-    """Return the measurement noise of three axes together, estimated by the fit."""
+def _errors(flight: FlightResult, result: RunResult, signal: str) -> Errors:
+    """Return how far a signal is missed before and after, and its noise as the fit estimated it."""
     noise = result.settings.get("noise")
-    value = noise.get(channel) if isinstance(noise, dict) else None
-    return math.sqrt(3.0) * unit * value if isinstance(value, float) else None
+    of_axis = noise.get(signal) if isinstance(noise, dict) else None
+    unit = math.sqrt(3.0) * (math.degrees(1.0) if signal == "attitude" else 1.0)
+    before, after = flight.rmse_initial.together(signal), flight.rmse_best.together(signal)
+    return before, after, unit * of_axis if isinstance(of_axis, float) else None
 
 
 def _standing(result: RunResult, checks: Sequence[Met], met: Sequence[Met]) -> Standing:

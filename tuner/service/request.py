@@ -12,7 +12,7 @@ from pydantic import AfterValidator, ConfigDict, Field, JsonValue
 
 from tuner.config import settle
 from tuner.config.job import JobFile
-from tuner.config.settings import is_among
+from tuner.config.settings import JOB_FILE, is_among
 from tuner.core.disk import inside
 from tuner.core.errors import ConfigError, InputError, did_you_mean
 from tuner.core.shipped import Kind, configs_folder
@@ -23,7 +23,6 @@ from tuner.recordings.topics import TopicMap
 from tuner.service.names import last_part, recording_name, stems
 from tuner.vehicle import ControllerFile, VehicleFile
 
-JOB_FILE = "tune.yaml"
 FLIGHTS = "flights"
 #: Keys of `tune.yaml` that name a file there, and a shipped file or its content here.
 _KINDS: Mapping[str, Kind] = {

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tuner.evaluate.records import RMSE_UNITS, AxesRmse
+from tuner.evaluate.records import AXES, RMSE_UNITS, AxesRmse
 from tuner.findings.composed import PREDICTED
 from tuner.recordings.flight import Array
 from tuner.report.chart import (
@@ -36,10 +36,7 @@ CURVES = {
     "fitted": ("_best", FITTED),
     "simulated": ("_simulated", FITTED),
 }
-QUANTITIES = {
-    "position": (("x", "y", "z"), "m"),
-    "attitude": (("roll", "pitch", "yaw"), "°"),
-}
+DRAWN_IN = {"position": "m", "attitude": "°"}
 PER_AXIS = {axis: (1e3, "mm") if unit == "m" else (1.0, "°") for axis, unit in RMSE_UNITS.items()}
 """Axis -> what its RMSE is multiplied by for a table, and the unit then."""
 WORSE = 1.05
@@ -47,7 +44,7 @@ WORSE = 1.05
 TIME = "time since the mission's start [s]"
 PREFIX = "acting_"
 CLOCK = "time"
-AXES = ("forward", "left", "up")
+BODY = ("forward", "left", "up")
 FAINTEST = 1e-9
 """N or N m below which a curve is no more than rounding."""
 DASHES: tuple[Dash, ...] = ("solid", "dash", "dot")
@@ -122,11 +119,11 @@ def _of_flight(
 
 
 def _over_time(name: str, title: str, quantity: str, arrays: Mapping[str, Array]) -> Chart:
-    axes, unit = QUANTITIES[quantity]
+    unit = DRAWN_IN[quantity]
     time = rounded(arrays[f"{quantity}_time"], 3)
     digits = 4 if quantity == "position" else 3
     panels = []
-    for column, axis in enumerate(axes):
+    for column, axis in enumerate(AXES[quantity]):
         curves = [
             Line(which, time, rounded(arrays[quantity + suffix][:, column], digits), look)
             for which, (suffix, look) in CURVES.items()
@@ -283,7 +280,7 @@ def _chart(
             ],
             y_title=f"{title} [{unit}]",
         )
-        for axis, title in enumerate(AXES)
+        for axis, title in enumerate(BODY)
     ]
     title = f"{flight}: {quantity}"
     return Chart(
