@@ -105,7 +105,7 @@ def test_the_terminal_says_in_thirty_lines_that_it_can_be_used(finished, capsys)
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= LINES
     assert [line for line in lines if len(line) > WIDTH and str(finished[0]) not in line] == []
-    assert lines[0].startswith("Usable. 12 coefficients were fitted to 4 flights")
+    assert lines[0].startswith("Usable. 12 coefficients were fitted to 4 simulated flights")
     (held,) = (line for line in lines if line.startswith("circle_4mps, held out"))
     assert held.split()[-1] == "matched"
     assert sum(line.startswith("! ") for line in lines) == 2
