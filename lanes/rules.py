@@ -6,6 +6,7 @@ Operands are scalars or vectors of one width; a rule does not see which.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any, TypeAlias
 
 import jax
@@ -61,8 +62,14 @@ def constant(kind: ir.Type, number: float | int | bool) -> ir.Constant:
     scalar = base(kind)
     plain = float(number) if isinstance(scalar, ir.FloatType | ir.DoubleType) else int(number)
     if isinstance(kind, ir.VectorType):
-        return ir.Constant(kind, [plain] * kind.count)
-    return ir.Constant(kind, plain)
+        return _of_every_lane(scalar, kind.count, plain, repr(plain))
+    return ir.Constant(scalar, plain)
+
+
+@cache
+def _of_every_lane(scalar: ir.Type, count: int, number: float, _: str) -> ir.Constant:
+    """Return a constant vector, written lane by lane once; the text tells -0 from 0."""
+    return ir.Constant(ir.VectorType(scalar, count), [number] * count)
 
 
 class Emitter:
@@ -71,6 +78,7 @@ class Emitter:
     def __init__(self, module: ir.Module, width: int) -> None:
         self.module, self.width = module, width
         self.b = ir.IRBuilder()
+        self._splats: dict[tuple[ir.Block, ir.Value], ir.Value] = {}
 
     def vector(self, kind: ir.Type) -> ir.VectorType:
         """Return the type of a number for every lane."""
@@ -82,11 +90,14 @@ class Emitter:
             return value
         kind = self.vector(value.type)
         if isinstance(value, ir.Constant):
-            return ir.Constant(kind, [value.constant] * self.width)
-        undefined = ir.Constant(kind, ir.Undefined)
-        first = self.b.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-        zeros = ir.Constant(ir.VectorType(ir.IntType(32), self.width), [0] * self.width)
-        return self.b.shuffle_vector(first, undefined, zeros)
+            return constant(kind, value.constant)
+        where = self.b.block, value
+        if where not in self._splats:
+            undefined = ir.Constant(kind, ir.Undefined)
+            first = self.b.insert_element(undefined, value, constant(ir.IntType(32), 0))
+            zeros = constant(ir.VectorType(ir.IntType(32), self.width), 0)
+            self._splats[where] = self.b.shuffle_vector(first, undefined, zeros)
+        return self._splats[where]
 
     def alike(self, *values: ir.Value) -> tuple[ir.Value, ...]:
         """Return values all as vectors, if one is."""

@@ -55,7 +55,7 @@ GATE = 4.0
 """Standard deviations beyond which an innovation corrects no further: an outlier."""
 WIDER = 4.0
 """Times, each innovation in a row that lies beyond."""
-AT_ONCE = 6
+AT_ONCE = 4
 """Columns of derivatives in one pass over a block of segments."""
 WIDEST = 5
 """In a row beyond which the gate grows no further."""
@@ -98,14 +98,18 @@ class Gains(eqx.Module):
         not sampled any number.
     factors
         (F, T, m, m) L, lower triangular.
+    rate
+        Hz of the physics that was filtered. In steps so many times finer as many times as many
+        commands are on their way to the motors: each stands for those of its time.
     """
 
     gain: Float[Either, "F T m n"]
     factors: Float[Either, "F T m m"]
+    rate: int = eqx.field(static=True)
 
     def among(self, flights: NDArray[np.intp]) -> Gains:
         """Return those of some flights."""
-        return Gains(np.asarray(self.gain)[flights], np.asarray(self.factors)[flights])
+        return replace(self, gain=self.gain[flights], factors=self.factors[flights])
 
 
 class Filtered(eqx.Module):
@@ -146,19 +150,6 @@ def _shortly_delayed(schedule: Schedule, expected: Expected) -> tuple[Schedule, 
     return replace(schedule, longest_actuator_latency=count * schedule.step), count
 
 
-def stepped(gains: Gains, schedule: Schedule, expected: Expected, times: int) -> Gains:
-    """Return the gains of a schedule for the same in so many times finer steps of physics.
-
-    Then so many times as many commands are on their way to the motors.
-    """
-    in_flight = _shortly_delayed(schedule, expected)[1]
-    size, rotors = gains.gain.shape[-1], len(expected.tunable.model.vehicle.rotors)
-    first = size - COUNT - in_flight * rotors
-    commands = np.arange(first, size - COUNT).reshape(in_flight, rotors).repeat(times, axis=0)
-    rows = np.concatenate([np.arange(first), commands.ravel(), np.arange(size - COUNT, size)])
-    return replace(gains, gain=gains.gain[..., rows])
-
-
 def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool = True) -> Filtered:
     """Return the Kalman gains, the innovations, and how likely they are.
 
@@ -174,7 +165,8 @@ def filtered(schedule: Schedule, feed: Feed, expected: Expected, *, gains: bool 
     wanted = (*[True] * 3, *[gains] * 2)
     *rows, gain, factors = _run(_given(feed, expected), static, wanted=wanted).values
     white, root, loss = (np.moveaxis(each, 0, -1) for each in rows)
-    return Filtered(white, root, loss, Gains(gain, factors) if gains else None)
+    kept = Gains(gain, factors, schedule.physics_rate) if gains else None
+    return Filtered(white, root, loss, kept)
 
 
 def innovations(
@@ -406,7 +398,16 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Arr
     observer, first = _observer(given, static)
     gains, factors = given.gains.gain, given.gains.factors
     wide, size = gains.shape[1:]
-    in_flight = commands_in_flight(first, size - COUNT)
+    in_flight, finer = commands_in_flight(first, size - COUNT), 1
+    if in_flight:
+        finer = static.schedule.physics_rate // given.gains.rate
+
+    def for_each_step(change: Array) -> Array:
+        """Return a correction of all commands on their way from that of the filter's steps."""
+        begin = size - COUNT - in_flight * len(first.rotor_speed)
+        commands = change[begin:-COUNT].reshape(in_flight, -1)
+        commands = jnp.repeat(commands, finer, axis=0).ravel()
+        return jnp.concatenate([change[:begin], commands, change[-COUNT:]])
 
     def tick(carried: Any, number: Array) -> tuple[Any, tuple[Array, Array]]:
         state, pushed, before, beyond = carried
@@ -432,7 +433,9 @@ def _innovations(given: _Given, static: _Static, ticks: int) -> tuple[Array, Arr
         white = lax.fori_loop(0, count, whitened, jnp.zeros(wide))
         corrects, beyond = gated(white, beyond)
         change = lax.fori_loop(0, count, corrected, jnp.zeros(size))
-        state = observer.corrected(state, change[:-COUNT], number, in_flight)
+        if finer > 1:
+            change = for_each_step(change)
+        state = observer.corrected(state, change[:-COUNT], number, in_flight * finer)
         pushed = pushed + change[-COUNT:]
         before = observer.seen(state, number)
         after = observer.next(state, pushed, number)

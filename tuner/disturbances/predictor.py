@@ -16,7 +16,7 @@ from sim_jax.inlet import ReferenceInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import robust_sd
 from tuner.disturbances.disturbances import COMMAND_NOISE, STRENGTHS, USUAL
-from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations, stepped
+from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
 from tuner.disturbances.information import hidden
 from tuner.disturbances.observer import CHANNELS, Expected, Feed
 from tuner.disturbances.recorded import (
@@ -32,7 +32,9 @@ from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
+from tuner.objective.tunable import tunable_of
 from tuner.recordings.flight import Flight
+from tuner.vehicle.model import with_terms_computed
 
 Array = NDArray[np.float64]
 
@@ -66,6 +68,8 @@ class Predictor:
         (7,) of the disturbances, and of the noise of commands.
     noise
         Channel -> factor on the samples' standard deviations.
+    computed
+        Terms that are flown even where a model lacks them, so that one program serves all models.
     found
         What the filter makes of the recordings: None before it has run.
     """
@@ -75,10 +79,16 @@ class Predictor:
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
     noise: Mapping[str, float]
+    computed: tuple[str, ...] = ()
     found: Filtered | None = None
 
     @staticmethod
-    def of(objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor | None:
+    def of(
+        objective: Objective,
+        point: Point,
+        flights: Sequence[Flight],
+        computed: tuple[str, ...] = (),
+    ) -> Predictor | None:
         """Return the predictor of some flights before anything is learnt.
 
         None where their set-points were not all recorded, or not all in closed loop. The flight
@@ -90,6 +100,8 @@ class Predictor:
             Whole flights, and where their clocks stand.
         flights
             F flights in the order of the segments.
+        computed
+            Terms to be flown even where a model lacks them.
         """
         segments, schedule = objective.segments, objective.schedule
         offsets = np.array(point.offsets)
@@ -119,6 +131,7 @@ class Predictor:
             rows={name: rows for name, (_, rows) in laid.items()},
             strengths=USUAL,
             noise=dict.fromkeys(channels, 1.0),
+            computed=computed,
         )
 
     def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
@@ -126,7 +139,7 @@ class Predictor:
 
         Before it has run.
         """
-        laid = Predictor.of(objective, point, flights)
+        laid = Predictor.of(objective, point, flights, self.computed)
         assert laid is not None
         return replace(laid, strengths=self.strengths, noise=self.noise)
 
@@ -204,6 +217,12 @@ class Predictor:
         """Half the sum of squares of the whitened innovations, those beyond the gate as at it."""
         return 0.5 * float(sum(np.sum(np.minimum(size, GATE) ** 2) for _, size in self._sizes()))
 
+    @property
+    def without_gains(self) -> Predictor:
+        """The same without the gains, which take most of its memory."""
+        assert self.found is not None
+        return replace(self, found=replace(self.found, gains=None))
+
     def at(self, objective: Objective, point: Point) -> Predictor:
         """Return the predictor once its filter has run at a point."""
         feed = self._fed(point)
@@ -234,13 +253,15 @@ class Predictor:
         factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
-        return Expected(
-            objective.tunable, *map(jnp.asarray, (point.coefficients, strengths, noise))
-        )
+        model = with_terms_computed(objective.model, self.computed)
+        tunable = tunable_of(model, objective.space)
+        return Expected(tunable, *map(jnp.asarray, (point.coefficients, strengths, noise)))
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:
         """Return the predictor of some flights alone."""
         assert self.found is not None
+        if len(flights) == self.feed.offsets.shape[-1]:
+            return self  # gains are large, and would be copied
         gains = self.found.gains
         feed, found = jax.tree.map(
             lambda leaf: np.asarray(leaf)[..., flights],
@@ -269,7 +290,7 @@ class Predictor:
         own = Point(point.coefficients, self.feed.offsets)
         jacobian = self.jacobian(objective, own, [*moved, *offsets])
         changed = {
-            name: dict[str, Any](self._stepped(other, own).jacobian(other, own, []).residuals)
+            name: dict[str, Any](self._stepped(other).jacobian(other, own, []).residuals)
             for name, other in otherwise.items()
         }
         if by_strengths is not None:
@@ -283,14 +304,11 @@ class Predictor:
             objective, own, unscaled(criterion), jacobian, otherwise=changed
         )
 
-    def _stepped(self, other: Objective, point: Point) -> Predictor:
+    def _stepped(self, other: Objective) -> Predictor:
         """Return the predictor of another problem: finer steps, pushed along, other stamps."""
-        segments, found = self.feed.segments, self.found
-        assert found is not None
-        assert found.gains is not None
+        segments = self.feed.segments
         times = other.schedule.physics_rate // self.schedule.physics_rate
         inlet = jax.tree.map(lambda rows: np.repeat(rows, times, axis=0), segments.inlet)
-        gains = stepped(found.gains, self.schedule, self._expected(other, point), times)
         return replace(
             self,
             schedule=other.schedule,
@@ -302,7 +320,6 @@ class Predictor:
                     for name in self.feed.samples
                 },
             ),
-            found=replace(found, gains=gains),
         )
 
     def _placed(self, name: str, time: Any) -> Sampled:

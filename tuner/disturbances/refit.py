@@ -74,9 +74,13 @@ def with_least_innovations(
     laid, rate = point.offsets, float(objective.schedule.log_rate)
     predictor = predictor.at(objective, point)
     for _ in range(steps):
-        lower = _lower(predictor, objective, point, criterion, free)
-        if lower is None:
+        equations = _equations(predictor, objective, point, criterion, free)
+        if equations.step(objective.space, point) is None:
             break
+        predictor = predictor.without_gains  # those of two points at a time are too much
+        lower = _lower(equations, predictor, objective, point, criterion)
+        if lower is None:
+            return predictor.at(objective, point), point
         predictor, point = lower
         if np.abs(point.offsets - laid)[: len(CLOCKS)].max() * OFFSET_UNIT * rate > ASIDE:
             laid = point.offsets
@@ -103,10 +107,31 @@ def _loss(predictor: Predictor, objective: Objective, point: Point, criterion: C
 
 
 class _Equations(NamedTuple):
-    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths."""
+    """Gradient (P + 7,) and Hessian of the loss, by P parameters and then by the strengths.
+
+    And which of them may move.
+    """
 
     gradient: Array
     hessian: Array
+    free: Mask
+
+    def step(self, space: Space, point: Point, damping: float = 0.0) -> Array | None:
+        """Return the Gauss-Newton step in which what would leave its bounds stays where it is.
+
+        A share of the Hessian's diagonal is added to it. None where it is not worth taking.
+        """
+        free = self.free.copy()
+        hessian = self.hessian + damping * np.diag(np.diag(self.hessian))
+        while True:
+            moves = np.flatnonzero(free)
+            change = np.zeros(len(self.gradient))
+            change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], self.gradient[moves])
+            share = _share_after(space, point, change)
+            leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
+            if not len(leaves):
+                return None if -0.5 * (self.gradient @ change) < ENOUGH else change
+            free[leaves] = False
 
 
 def _equations(
@@ -114,12 +139,14 @@ def _equations(
     objective: Objective,
     point: Point,
     criterion: Criterion,
-    moved: Sequence[int],
+    free: Mask,
 ) -> _Equations:
-    """Return gradient and Hessian at a point; ``moved`` of its coefficients and offsets enter."""
+    """Return gradient and Hessian at a point where some of the P parameters are free."""
     space, flight = objective.space, np.asarray(objective.segments.flight)
     (kinds, flights), count = point.offsets.shape, len(space)
     size = count + kinds
+    by_kind = free[count:].reshape(kinds, flights).any(axis=1)
+    moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
     jacobian = predictor.jacobian(objective, point, moved)
     slopes = predictor.slopes(objective, point)
     by_strengths = gathered(slopes.moved, predictor.feed.widths, predictor.rows)
@@ -150,53 +177,35 @@ def _equations(
     of_flights = np.moveaxis(across[count:] @ owner, -1, 1).reshape(kinds * flights, -1)
     across = np.concatenate([across[:count].sum(axis=-1), of_flights])
     bend = slopes.information + 1e-9 * np.eye(len(slopes.slope))
+    strengths, slope = predictor.strengths, slopes.slope
+    held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
     return _Equations(
-        np.concatenate([own, slopes.slope]), np.block([[among, across], [across.T, bend]])
+        np.concatenate([own, slope]),
+        np.block([[among, across], [across.T, bend]]),
+        np.concatenate([free, ~held]),
     )
 
 
 def _lower(
+    equations: _Equations,
     predictor: Predictor,
     objective: Objective,
     point: Point,
     criterion: Criterion,
-    free: Mask,
 ) -> tuple[Predictor, Point] | None:
     """Return what predicts at the end of a step, and where that is; None if nothing is gained."""
-    kinds, flights = np.shape(point.offsets)
-    count, parameters, strengths = len(objective.space), len(free), predictor.strengths
-    by_kind = free[count:].reshape(kinds, flights).any(axis=1)
-    moved = [*np.flatnonzero(free[:count]), *(count + np.flatnonzero(by_kind))]
-    gradient, hessian = _equations(predictor, objective, point, criterion, moved)
-    slope = gradient[parameters:]
-    held = (strengths <= LEAST) & (slope > 0.0) | (strengths >= MOST) & (slope < 0.0)
-    free = np.concatenate([free, ~held])
+    space, strengths = objective.space, predictor.strengths
     here = _loss(predictor, objective, point, criterion)
     for damping in DAMPED:
-        damped = hessian + damping * np.diag(np.diag(hessian))
-        change = _step(objective.space, point, gradient, damped, free)
-        if -0.5 * (gradient @ change) < ENOUGH:
+        change = equations.step(space, point, damping)
+        if change is None:
             return None
-        by_strengths = np.clip(change[parameters:], -FURTHEST, FURTHEST)
-        to = _moved(objective.space, point, change[:parameters])
+        by_strengths = np.clip(change[-len(strengths) :], -FURTHEST, FURTHEST)
+        to = _moved(space, point, change[: -len(strengths)])
         tried = replace(predictor, strengths=within(strengths + by_strengths)).at(objective, to)
         if _loss(tried, objective, to, criterion) < here:
             return tried, to
     return None
-
-
-def _step(space: Space, point: Point, gradient: Array, hessian: Array, free: Mask) -> Array:
-    """Return the Gauss-Newton step in which what would leave its bounds stays where it is."""
-    free = free.copy()
-    while True:
-        moves = np.flatnonzero(free)
-        change = np.zeros(len(gradient))
-        change[moves] = -scaled_solve(hessian[np.ix_(moves, moves)], gradient[moves])
-        share = _share_after(space, point, change)
-        leaves = np.flatnonzero(free[: len(space)] & ((share <= 0.0) | (share >= 1.0)))
-        if not len(leaves):
-            return change
-        free[leaves] = False
 
 
 def _share_after(space: Space, point: Point, change: Array) -> Array:

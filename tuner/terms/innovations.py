@@ -71,7 +71,7 @@ class Innovations:
     @staticmethod
     def of(selected: Selected, fitted: Fitted, predictor: Predictor) -> Innovations:
         """Return what the innovations of a predictor say at a fit, gains as they are."""
-        names = [name for group in _outside(selected).values() for name in group]
+        names = [name for group in outside(selected).values() for name in group]
         _, wide = with_free(selected.job, fitted, names)
         beside = replace(predictor, schedule=wide.objective.schedule)
         information = beside.information(wide.objective, wide.point, fitted.criterion)
@@ -85,10 +85,10 @@ class Innovations:
 
         Of what set-points hide, by least squares.
         """
-        outside = _outside(self.selected)
+        left_out = outside(self.selected)
         groups = [
             (columns, presence_of(names))
-            for names in outside.values()
+            for names in left_out.values()
             if len(columns := self._columns(names))
         ]
         if not groups:
@@ -196,7 +196,7 @@ class Innovations:
         return np.flatnonzero(np.isin(self.space.names, list(names)) & seen)
 
 
-def _outside(selected: Selected) -> Groups:
+def outside(selected: Selected) -> Groups:
     """Return what was tried and left out. A steady wind is a disturbance like others."""
     around = set(conditions())
     return {names[0]: names for names in selected.left_out if not around & set(names)}

@@ -24,8 +24,8 @@ from tuner.search.optimiser import Free
 from tuner.search.polish import polished
 from tuner.search.problem import Job
 from tuner.search.progress import Progress
-from tuner.terms.candidates import is_stand_in
-from tuner.terms.innovations import Innovations
+from tuner.terms.candidates import is_stand_in, names_in
+from tuner.terms.innovations import Innovations, outside
 from tuner.terms.search_with_terms import candidates_of
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
@@ -91,7 +91,8 @@ def with_disturbances(
     if fitted.residuals_at_noise_level or not fitted.polished or not follows:
         return None
     full = full_problem_of(fitted.objective, fitted.point)  # as it is examined: compiled once
-    predictor = Predictor.of(full.objective, full.point, job.fitted)
+    terms = names_in(outside(selected))
+    predictor = Predictor.of(full.objective, full.point, job.fitted, terms)
     if predictor is None:
         return None
     if predictor.memory > full.objective.memory // 2:
@@ -109,6 +110,7 @@ def with_disturbances(
         if chosen is not None:
             on_message(_said(seen.selected, chosen))
             selected, there = chosen, chosen.fitted
+        predictor = predictor.without_gains  # their memory is for the next ones
         there, predictor = _descended(selected, there, predictor)
         seen = Innovations.of(selected, there, predictor)
     if not predictor.keeps_track:

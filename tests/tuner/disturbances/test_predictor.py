@@ -167,9 +167,9 @@ def test_a_strength_is_taken_for_what_moves_innovations(fitted) -> None:
     slopes, criterion = predictor.slopes(problem, point), making.fitted_of(problem, point).criterion
     information = predictor.information(problem, point, criterion, by_strengths=slopes.moved)
     across = np.array([information.changes[name].sum(axis=0) for name in NAMED])
-    hessian = _equations(predictor, problem, point, unscaled(criterion), range(len(FREE))).hessian[
-        -len(NAMED) :, : len(FREE)
-    ]
+    free = np.concatenate([np.ones(len(FREE), bool), OFFSETS.ravel()])
+    equations = _equations(predictor, problem, point, unscaled(criterion), free)
+    hessian = equations.hessian[-len(NAMED) :, : len(FREE)]
     expected = hessian / problem.space.slope(np.asarray(point.coefficients))
     np.testing.assert_allclose(across, expected, atol=1e-6 * np.abs(expected).max())
 
@@ -330,10 +330,11 @@ def test_finer_steps_of_physics_change_innovations_as_a_filter_of_such_steps_has
     own = Predictor.of(finer, point, gusty(problem, 1)[1])
     assert own is not None
     own = replace(own, strengths=predictor.strengths, noise=predictor.noise).at(finer, point)
-    stepped = predictor._stepped(finer, point)
-    here, there = (np.asarray(of.found.gains.gain) for of in (stepped, own))
+    stepped = predictor._stepped(finer)
+    here, there = (np.asarray(of.found.gains.gain) for of in (predictor, own))
+    commands = here[..., -COUNT - 8 : -COUNT].reshape(*here.shape[:-1], 2, 4).repeat(2, axis=-2)
     expected = there[..., -COUNT - 12 : -COUNT]
-    on_their_way = here[..., -COUNT - 16 : -COUNT - 4] - expected
+    on_their_way = commands.reshape(*here.shape[:-1], 16)[..., :12] - expected
     assert np.std(on_their_way) < 0.01 * np.std(expected)
     coarse = predictor.jacobian(late, point, []).residuals
     found, expected = (of.jacobian(finer, point, []).residuals for of in (stepped, own))
@@ -373,7 +374,7 @@ def test_a_push_that_is_known_moves_innovations_in_proportion(fitted) -> None:
             rate=float(problem.schedule.log_rate),
         )
         other = replace(problem, segments=replace(problem.segments, disturbance=known))
-        residuals = predictor._stepped(other, point).jacobian(other, point, []).residuals
+        residuals = predictor._stepped(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = predictor.jacobian(problem, point, []).residuals
@@ -393,7 +394,7 @@ def test_samples_that_are_stamped_otherwise_move_their_own_innovations_in_propor
         speeds = measured["rotor_speed"]
         measured["rotor_speed"] = eqx.tree_at(lambda m: m.time, speeds, speeds.time + seconds)
         other = replace(problem, segments=replace(problem.segments, measured=measured))
-        residuals = predictor._stepped(other, point).jacobian(other, point, []).residuals
+        residuals = predictor._stepped(other).jacobian(other, point, []).residuals
         return {name: np.asarray(rows) for name, rows in residuals.items()}
 
     here = {n: np.asarray(r) for n, r in predictor.jacobian(problem, point, []).residuals.items()}

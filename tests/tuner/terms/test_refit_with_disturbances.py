@@ -108,6 +108,7 @@ def test_terms_are_chosen_before_the_descent_and_after_it(monkeypatch, called_fo
     """What is missing would be taken for disturbances by a descent to its end."""
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, keeps_track=False)
+    predictor.without_gains = predictor
     monkeypatch.setattr(disturbances, "full_problem_of", lambda *_: full)
     monkeypatch.setattr(disturbances.Predictor, "of", lambda *_: predictor)
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
@@ -142,6 +143,7 @@ def test_a_fit_in_which_something_stood_in_is_compared_without_it(monkeypatch, g
     """What stood in for other terms made another model of it: it cannot contradict this one."""
     full = SimpleNamespace(objective=SimpleNamespace(memory=2), point=NOBODY)
     predictor = SimpleNamespace(memory=0, keeps_track=True, strengths=USUAL)
+    predictor.without_gains = predictor
     settings = SimpleNamespace(job=JobFile(disturbances="follow"))
     job = cast(Job, SimpleNamespace(settings=settings, fitted=(), space=("inertia_xx",)))
     row = SimpleNamespace(group=group, kept=True)
