@@ -37,8 +37,7 @@ from tuner.ground.rig_data import (
     read_columns,
     steady_flight,
 )
-from tuner.ground.rpm_curve import rpm_curve
-from tuner.ground.stands import thrust_stand, torque_stand
+from tuner.ground.stands import rpm_curve, thrust_stand, torque_stand
 from tuner.ground.step_response import step_response
 from tuner.vehicle import VehicleFile
 

@@ -14,9 +14,8 @@ from tuner.config import Options, Settings, settle
 from tuner.core.phrases import listed
 from tuner.recordings.cache import cached, digest, load, store
 from tuner.recordings.inspection import Inspection
-from tuner.recordings.px4 import Advice, advice_of, settings_in_words
 from tuner.recordings.topics import read_sidecar
-from tuner.recordings.ulog import parameters_of
+from tuner.recordings.ulog import Advice, advice_of, parameters_of, settings_in_words
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,20 @@
 """The formats of recordings: a reader each, which knows its files by how they begin.
 
-A format needs two things: a reader here, and a topic map whose ``format`` names it.
+A format needs two things: a reader here, and a topic map whose ``format`` names it. The first lines
+of a text table tell how it is laid out: encoding, separator, comments, columns and their units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import csv
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
-from tuner.recordings.layout import is_table
 from tuner.recordings.recording import Recording
 
 NO_TEXTS = (".bag", ".db3", ".mcap", ".ulg")
@@ -151,3 +153,163 @@ def open_recording(path: Path, messages: tuple[Path, ...] = ()) -> Recording:
     if path.suffix.lower() in NO_TEXTS and is_table(start):
         what = f"is a text, and no {path.suffix}"
     raise RecordingError(path, what, f"known formats are {known}")
+
+
+#: A longer line, in bytes, is no row of a table.
+LONGEST_LINE = 1 << 20
+MOST_LINES = 1000
+#: Marks at the beginning of a text, and the encodings that they stand for.
+MARKS = {
+    b"\xef\xbb\xbf": "utf-8-sig",
+    b"\xff\xfe": "utf-16",
+    b"\xfe\xff": "utf-16",
+}
+COMMENTS = ("#", "%", "//")
+#: Bytes and lines within which a table's rows have begun.
+HEAD = 4 * LONGEST_LINE
+_NUMBER = re.compile(r"^[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?$|^[+-]?(nan|inf(inity)?)$", re.I)
+_UNIT = re.compile(r"^[\[(]?[a-zA-Zµ°%0-9/^*.·\-²³ ]{0,12}[\])]?$")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the first lines of a text table give away.
+
+    Attributes
+    ----------
+    encoding
+        A codec's name.
+    separator
+        Between two cells.
+    decimal_comma
+        Whether numbers are written as ``1,5``.
+    columns
+        Their names, as they stand there without surrounding blanks; each once.
+    units
+        Column -> unit, of a row of units under the names.
+    lines_before
+        How many lines come before the first row of numbers.
+    """
+
+    encoding: str
+    separator: str
+    decimal_comma: bool
+    columns: tuple[str, ...]
+    units: Mapping[str, str]
+    lines_before: int
+
+
+def encoding_of(start: bytes) -> str:
+    """Return the codec of a text by how it begins: latin-1, which reads all, without a mark."""
+    return next((codec for mark, codec in MARKS.items() if start.startswith(mark)), "latin-1")
+
+
+def text_of(start: bytes) -> str:
+    """Return the text that a file begins with."""
+    encoding = encoding_of(start)
+    return start.decode("utf-8" if encoding == "latin-1" else encoding, errors="replace")
+
+
+def is_table(start: bytes) -> bool:
+    """Return whether a file begins as a text with cells in its first line that is no comment."""
+    wide = encoding_of(start).startswith("utf-16")
+    text = text_of(start)
+    if not all(ord(letter) >= 32 or letter in "\r\n\t" for letter in text):
+        return False
+    if not wide and not all(byte >= 32 or byte in b"\r\n\t" for byte in start):
+        return False
+    lines = text.splitlines()[:MOST_LINES]
+    first = next((i for i, line in enumerate(lines) if not _is_comment(line)), 0)
+    line = lines[first] if lines else ""
+    behind = lines[first + 1] if first + 1 < len(lines) else line
+    separator = _separator(line)
+    return separator != " " or (len(_cells(line, " ")) > 3 and _is_row(behind, " "))
+
+
+def layout_of(path: Path) -> Layout:
+    """Return how a text table is laid out.
+
+    Raises
+    ------
+    RecordingError
+        It has no line of column names.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(HEAD)
+    encoding = encoding_of(head)
+    lines = text_of(head).splitlines()[:MOST_LINES]
+    place = next((i for i, line in enumerate(lines) if not _is_comment(line)), len(lines) - 1)
+    separator = _separator(lines[place] if lines else "")
+    names = place
+    if names and _is_row(lines[place], separator) and _is_header(lines[place - 1], separator):
+        names -= 1  # the names stand in the last comment
+        place -= 1
+    elif lines and _is_row(lines[place], separator):
+        raise RecordingError(
+            path,
+            "has no line of column names: it begins with numbers",
+            "write the names of its columns into the first line",
+        )
+    columns = _cells(lines[names].lstrip("#/ ") if lines else "", separator)
+    place = names + 1
+    units: dict[str, str] = {}
+    if place + 1 < len(lines) and _is_units(lines[place], separator, len(columns)):
+        units = dict(zip(columns, _cells(lines[place], separator), strict=False))
+        place += 1
+    first = lines[place] if place < len(lines) else ""
+    width = len(_cells(first, separator))
+    if width == len(columns) - 1 and not columns[-1]:
+        columns = columns[:-1]
+    columns += [""] * (width == len(columns) + 1)  # every row ends with a separator
+    rows = [row for row in lines[place : place + 20] if row]
+    comma = separator != "," and any(re.search(r"\d,\d", row) for row in rows)
+    return Layout(encoding, separator, comma, _each_once(columns), units, place)
+
+
+def _is_comment(line: str) -> bool:
+    text = line.strip().lstrip("\ufeff")
+    return not text or (text.startswith(COMMENTS) and not text.startswith("%time"))
+
+
+def _separator(line: str) -> str:
+    """Return what parts the cells of a line."""
+    best = max(",;\t", key=line.count)
+    return best if best in line else " "
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    text = line.strip("\r\n").lstrip("\ufeff")
+    if separator == " ":
+        return text.split()
+    return [cell.strip().strip('"') for cell in next(csv.reader([text], delimiter=separator), [])]
+
+
+def _is_row(line: str, separator: str) -> bool:
+    """Return whether a line holds numbers and no names."""
+    cells = [cell for cell in _cells(line, separator) if cell]
+    numbers = sum(bool(_NUMBER.match(cell)) for cell in cells)
+    return numbers > len(cells) / 2
+
+
+def _is_header(line: str, separator: str) -> bool:
+    cells = _cells(line.lstrip("#%/ "), separator)
+    return len(cells) > 1 and not any(_NUMBER.match(cell) for cell in cells)
+
+
+def _is_units(line: str, separator: str, count: int) -> bool:
+    """Return whether a line under the names holds units."""
+    cells = _cells(line, separator)
+    if not count - 1 <= len(cells) <= count or any(_NUMBER.match(cell) for cell in cells):
+        return False
+    return any(cells) and all(_UNIT.match(cell) for cell in cells)
+
+
+def _each_once(columns: Sequence[str]) -> tuple[str, ...]:
+    """Return names that differ: the empty ones by their place, repeated ones with a number."""
+    seen: dict[str, int] = {}
+    names = []
+    for place, column in enumerate(columns):
+        name = column or f"column {place + 1}"
+        seen[name] = seen.get(name, 0) + 1
+        names.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
+    return tuple(names)

@@ -19,7 +19,6 @@ import yaml
 from tuner.core.disk import readable
 from tuner.core.errors import RecordingError
 from tuner.recordings.clocks import clock_of, pose_offset
-from tuner.recordings.columns import recognised
 from tuner.recordings.content import (
     Content,
     ReadOptions,
@@ -45,7 +44,7 @@ from tuner.recordings.loader import keep_flights
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Samples, Topic
-from tuner.recordings.sources import choose_map, locate
+from tuner.recordings.sources import choose_map, locate, recognised
 from tuner.recordings.topics import Sidecar, Source, TopicMap, shipped_maps
 from tuner.vehicle import COEFFICIENTS
 

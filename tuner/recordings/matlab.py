@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow
 
 from tuner.core.errors import RecordingError
-from tuner.recordings.columns import guess
 from tuner.recordings.flight import Array
 from tuner.recordings.notes import Note
 from tuner.recordings.recording import (
@@ -30,6 +29,7 @@ from tuner.recordings.recording import (
     TabularRecording,
     reason_of,
 )
+from tuner.recordings.sources import guess
 from tuner.recordings.table import NEVER, read_times
 
 MAGIC, MAGIC_7_3 = b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"

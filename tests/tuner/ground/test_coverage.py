@@ -11,8 +11,7 @@ from tuner.ground.bifilar import bifilar
 from tuner.ground.hovers import hover_weights, yaw_spin
 from tuner.ground.measurement import scaled_of
 from tuner.ground.propeller import propeller
-from tuner.ground.rpm_curve import rpm_curve
-from tuner.ground.stands import thrust_stand, torque_stand
+from tuner.ground.stands import rpm_curve, thrust_stand, torque_stand
 from tuner.ground.step_response import step_response
 
 TRUTH = rigs.TRUTH

@@ -25,8 +25,7 @@ from tuner.core.errors import InputError, RecordingError
 from tuner.recordings import inspect_recordings, load_flight
 from tuner.recordings.notes import Cause, NoteCode
 from tuner.recordings.ros.container import DamagedError, read_wanted, unpack, zstd
-from tuner.recordings.ros.messages import Definitions
-from tuner.recordings.ros.wire import UnknownFieldError, plan
+from tuner.recordings.ros.messages import Definitions, UnknownFieldError, plan
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from tuner.findings.findings import Code, one_line
 from tuner.job.recording_verdict import Verdict, in_words, verdict_of
 from tuner.recordings import Flight, inspect_recordings, load_flight
 from tuner.recordings.notes import NoteCode
-from tuner.recordings.px4 import advice_of, settings_in_words
+from tuner.recordings.ulog import advice_of, settings_in_words
 from tuner.search.job_flights import as_logged, read_usable
 from tuner.vehicle import ControllerFile
 from tuner.vehicle.motor_orders import motor_order_of

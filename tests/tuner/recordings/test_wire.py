@@ -13,8 +13,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tuner.recordings.ros.container import joined
-from tuner.recordings.ros.messages import Definitions
-from tuner.recordings.ros.wire import decode, plan
+from tuner.recordings.ros.messages import Definitions, decode, plan
 
 TEXT = """
 uint8 first

@@ -32,7 +32,7 @@ from tuner.recordings.ros.container import (
     Entries,
     unsigned,
 )
-from tuner.recordings.ros.wire import Block, Bytes, Index
+from tuner.recordings.ros.messages import Block, Bytes, Index
 
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 

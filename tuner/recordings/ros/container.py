@@ -16,7 +16,7 @@ import numpy as np
 from rosbags.interfaces import MessageDefinition
 
 from tuner.recordings.notes import Cause, Damage
-from tuner.recordings.ros.wire import Block, Bytes, Index
+from tuner.recordings.ros.messages import Block, Bytes, Index
 
 #: The largest chunk that is unpacked: cameras and lidars stay far below it.
 LARGEST_CHUNK = 128 << 20

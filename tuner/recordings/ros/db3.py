@@ -23,7 +23,7 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 from tuner.core.errors import RecordingError
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.ros.container import LARGEST_CHUNK, Connection, Container, joined
-from tuner.recordings.ros.wire import Block
+from tuner.recordings.ros.messages import Block
 
 #: Messages that are decoded together, and their bytes.
 AT_ONCE = 16384

@@ -31,7 +31,7 @@ from tuner.recordings.ros.container import (
     read_pieces,
     unsigned,
 )
-from tuner.recordings.ros.wire import Block, Bytes, Index
+from tuner.recordings.ros.messages import Block, Bytes, Index
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, CHUNK_INDEX, STATISTICS, DATA_END = (

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tuner.core.disk import file_name
 from tuner.core.errors import ConfigError, RecordingError
 from tuner.core.yaml_document import read_yaml
-from tuner.recordings import px4
+from tuner.recordings import ulog
 from tuner.recordings.notes import Cause, Damage
 from tuner.recordings.recording import (
     Clock,
@@ -42,8 +42,16 @@ from tuner.recordings.ros.container import (
 )
 from tuner.recordings.ros.db3 import Db3
 from tuner.recordings.ros.mcap import Mcap
-from tuner.recordings.ros.messages import USUAL, Definitions
-from tuner.recordings.ros.wire import Block, UnknownFieldError, Walk, decode, missing_fields, plan
+from tuner.recordings.ros.messages import (
+    USUAL,
+    Block,
+    Definitions,
+    UnknownFieldError,
+    Walk,
+    decode,
+    missing_fields,
+    plan,
+)
 
 #: Files compressed as a whole are unpacked beside the others up to this size.
 LARGEST_UNPACKED = 32 << 30
@@ -195,7 +203,7 @@ class RosRecording(Recording):
         kind = self._kind(topic)
         if kind.startswith("px4_msgs/"):
             in_log = re.sub(r"(?<!^)(?=[A-Z])", "_", kind.rpartition("/")[2]).lower()
-            return px4.USUAL.get(in_log, {}).get(signal)
+            return ulog.USUAL.get(in_log, {}).get(signal)
         return USUAL.get(kind, {}).get(signal)
 
     def fields(self, topic: str) -> list[str]:
