@@ -125,7 +125,7 @@ def upload(folder: Path) -> tuple[float, float, int]:
         for _ in range(UPLOAD // MIB):
             writer.write(camera, when, bytes(MIB))
     code = (
-        "import sys\nfrom pathlib import Path\nfrom tuner.service.server import serve\n"
+        "import sys\nfrom pathlib import Path\nfrom tuner.service.app import serve\n"
         "from tuner.service.settings import *\n"
         "serve(ServiceSettings(Path(sys.argv[1]), limits=Limits(free_bytes=0)), "
         "host='127.0.0.1', port=0, say=lambda t: print(t, flush=True))"

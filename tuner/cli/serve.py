@@ -87,8 +87,8 @@ def _serve(
         Let a job take so many GiB of memory.
     """
     with _extra():
-        from tuner.service.server import LOOPBACK, is_loopback
-        from tuner.service.server import serve as run
+        from tuner.service.app import LOOPBACK, is_loopback
+        from tuner.service.app import serve as run
     from tuner.service.settings import GIB, Limits, ServiceSettings, default_data
 
     if not 0 <= port < 2**16:

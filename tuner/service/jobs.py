@@ -13,6 +13,7 @@ from sqlalchemy import func, select, update
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session, selectinload, undefer
 
+from tuner.core.errors import InputError
 from tuner.service.database import Database
 from tuner.service.errors import NotKnownError, NotNowError, TooManyError, unknown_job
 from tuner.service.names import recording_name
@@ -115,19 +116,9 @@ def _recordings(session: Session, digests: Sequence[str], limits: Limits) -> lis
     chosen = dict.fromkeys(digests)
     for digest in chosen:
         if digest not in rows:
-            raise UnknownRecordingError(digest)
+            what = f"{digest[:12]}… was not uploaded here"
+            raise InputError("recordings", what, "upload the recording first")
     return [rows[digest] for digest in chosen]
-
-
-class UnknownRecordingError(NotKnownError):
-    """A job names a recording that was not uploaded."""
-
-    STATUS = 422
-
-    def __init__(self, digest: str) -> None:
-        super().__init__(
-            "recordings", f"{digest[:12]}… was not uploaded here", "upload the recording first"
-        )
 
 
 def _earlier_vehicle(session: Session, request: JobRequest) -> dict[str, Mapping[str, Any]]:

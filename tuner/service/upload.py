@@ -94,7 +94,9 @@ class _Receiver:
             return
         self.size += end - start
         if self.size > self._most:
-            raise too_large(self._most)
+            what = f"is larger than the {size_in_words(self._most)} that this server takes"
+            remedy = "split it, or leave out topics such as images"
+            raise TooLargeError("the recording", what, remedy)
         self.buffer += data[start:end]
 
     def _on_part_end(self) -> None:
@@ -115,12 +117,6 @@ class _Receiver:
         if self._file is not None:
             with full_disk():
                 self._file.close()
-
-
-def too_large(most: int) -> TooLargeError:
-    """Return the refusal of a file that is too large."""
-    what = f"is larger than the {size_in_words(most)} that this server takes"
-    return TooLargeError("the recording", what, "split it, or leave out topics such as images")
 
 
 async def receive(

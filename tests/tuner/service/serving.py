@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from tuner.service import attempt, recordings
-from tuner.service.server import serve
+from tuner.service.app import serve
 from tuner.service.settings import Limits, ServiceSettings
 
 ROOT = Path(__file__).parents[3]

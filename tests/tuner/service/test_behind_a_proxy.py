@@ -9,9 +9,9 @@ import pytest
 from tests.tuner.service.conftest import listening
 from tests.tuner.service.proxy import proxied
 from tuner.cli import main
-from tuner.service import server, tokens
+from tuner.service import app, tokens
+from tuner.service.app import LOOPBACK
 from tuner.service.safety import COOKIE
-from tuner.service.server import LOOPBACK
 from tuner.service.service import Service
 
 PUBLIC = "tune.lab.example"
@@ -128,7 +128,7 @@ def test_a_host_that_is_none_is_refused(settings, host):
 
 def test_the_command_says_who_is_let_in(monkeypatch, tmp_path, capsys):
     asked = []
-    monkeypatch.setattr(server, "serve", lambda settings, **_: asked.append(settings))
+    monkeypatch.setattr(app, "serve", lambda settings, **_: asked.append(settings))
     at = ["serve", "--data", str(tmp_path)]
     assert main(at) == 0
     assert main([*at, "--tokens", "always", "--allow-host", "Tune.lab.example"]) == 0

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from tests.tuner.service.conftest import LIMITS, ended, listening, submit, upload
 from tuner.core.errors import InputError
 from tuner.service import tokens
+from tuner.service.app import is_loopback, serve
 from tuner.service.names import recording_name
 from tuner.service.safety import COOKIE, RateLimit
-from tuner.service.server import is_loopback, serve
 from tuner.service.service import Service
 from tuner.service.web import pages
 
