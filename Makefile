@@ -6,6 +6,8 @@ FITS := $(VENV)/.fits
 READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
 
+export OPENBLAS_NUM_THREADS ?= 1
+
 .PHONY: demo test test-all test-fast lint docs bench clean
 
 $(FITS): pyproject.toml
