@@ -30,6 +30,9 @@ FACTOR = 5.0
 STILL = 1e-9
 """Change of a coordinate, and of the loss, below which nothing moves any more; relative to one, and
 to the coordinate or the loss where that is larger."""
+CHEAP = 8
+"""Coefficients for each free number of a start from which a flight without derivatives costs so
+much less than one with them that a point is judged by it first."""
 RIDGE = 1e-13
 """Added to the Hessian's diagonal, relative to its largest element: a singular one has a factor."""
 
@@ -122,17 +125,27 @@ def advance(objective: Objective, before: Step, criterion: Criterion, free: Arra
     free
         (K + offsets·N,) one for what may move, zero for what stays; changes only at `begin`.
     """
-    sums = before.ahead
-    if sums is None:
-        sums = sums_at(objective, before.tried, criterion)
     moves = np.flatnonzero(free)
     flight, starts = np.asarray(objective.segments.flight), range(len(before.loss))
-    tried = [
-        normal_equations(
-            objective.space, flight, _of(before.tried, start), criterion, _of(sums, start)
-        )
-        for start in starts
-    ]
+
+    def quadratics(sums: SegmentSums) -> list[NormalEquations]:
+        return [
+            normal_equations(
+                objective.space, flight, _of(before.tried, start), criterion, _of(sums, start)
+            )
+            for start in starts
+        ]
+
+    sums, tried = before.ahead, None
+    unknown = 0 if criterion.states is None else len(criterion.states)
+    if before.quadratics and CHEAP * unknown <= len(objective.space):
+        plain = sums_at(objective, before.tried, criterion, derivatives=False)
+        found = quadratics(plain)
+        if not any(_tried(before, start, found[start].loss, moves)[0] for start in starts):
+            sums, tried = plain, found
+    if sums is None:
+        sums = sums_at(objective, before.tried, criterion)
+    tried = tried or quadratics(sums)
     steps = [_stepped(before, start, tried[start], moves) for start in starts]
     accepted = np.array([step.accepted for step in steps])
     best = before.best
@@ -173,10 +186,8 @@ def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.
     if before.quadratics:
         last = before.quadratics[start]
         change = (_packed(tried) - _packed(point))[moves]
-        predicted = last.gradient[moves] @ change
-        predicted += 0.5 * change @ last.hessian[np.ix_(moves, moves)] @ change
         rise = here.loss - last.loss
-        accepted = bool(rise <= ACCEPTED * predicted)
+        accepted, predicted = _tried(before, start, here.loss, moves)
         if not accepted:
             damping *= FACTOR
         elif predicted < 0.0 and rise < WELL_PREDICTED * predicted:
@@ -197,6 +208,15 @@ def _stepped(before: Step, start: int, here: NormalEquations, moves: NDArray[np.
         _unpacked(following, base),
         float(gain) / max(here.loss, 1e-300),
     )
+
+
+def _tried(before: Step, start: int, loss: float, moves: NDArray[np.intp]) -> tuple[bool, float]:
+    """Return whether a start's point is accepted with a loss, and the rise that was predicted."""
+    last = before.quadratics[start]
+    change = (_packed(_of(before.tried, start)) - _packed(_of(before.point, start)))[moves]
+    predicted = last.gradient[moves] @ change
+    predicted += 0.5 * change @ last.hessian[np.ix_(moves, moves)] @ change
+    return bool(loss - last.loss <= ACCEPTED * predicted), float(predicted)
 
 
 def _solved(hessian: Array, gradient: Array, damping: float) -> Array:

@@ -25,22 +25,43 @@ def valley(vector):
 
 @pytest.fixture
 def advanced(monkeypatch):
-    """Steps in the valley, of several starts."""
-    monkeypatch.setattr(levenberg_marquardt, "sums_at", lambda _, points, __: points)
+    """Steps in the valley, of several starts; ``differentiated`` has the points that were."""
+    differentiated = []
+
+    def flown(_, points, __, *, derivatives=True):
+        if derivatives:
+            differentiated.append(points)
+        return points
+
+    monkeypatch.setattr(levenberg_marquardt, "sums_at", flown)
     monkeypatch.setattr(
         levenberg_marquardt,
         "normal_equations",
         lambda _, __, tried, ___, ____: valley(tried.coefficients),
     )
-    objective = SimpleNamespace(space=None, segments=SimpleNamespace(flight=np.zeros(1, int)))
+    objective = SimpleNamespace(space=range(2), segments=SimpleNamespace(flight=np.zeros(1, int)))
 
-    def steps(points, count, free=(1.0, 1.0), damping=None):
+    def steps(points, count, free=(1.0, 1.0), damping=None, unknown=0):
+        criterion = SimpleNamespace(states=np.zeros((unknown, 1)) if unknown else None)
         found = [begin(Point(np.asarray(points), np.zeros((len(points), 0, 1))), damping)]
         for _ in range(count):
-            found.append(advance(objective, found[-1], None, np.array(free)))
+            found.append(advance(objective, found[-1], criterion, np.array(free)))
         return found
 
+    steps.differentiated = differentiated
     return steps
+
+
+def test_a_point_that_is_rejected_is_not_differentiated_where_flights_cost_less(advanced):
+    found = {}
+    for unknown in (0, 1):
+        del advanced.differentiated[:]
+        found[unknown] = advanced([START], 12, damping=np.array([1e-9]), unknown=unknown)
+        accepted = sum(bool(step.accepted[0]) for step in found[unknown][1:])
+        assert accepted < 12
+        assert len(advanced.differentiated) == (12 if unknown else accepted)
+    for first, second in zip(found[0], found[1], strict=True):
+        np.testing.assert_array_equal(first.tried.coefficients, second.tried.coefficients)
 
 
 def test_every_start_reaches_the_minimum_and_stands_still(advanced):
