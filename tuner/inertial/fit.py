@@ -1,47 +1,87 @@
-"""The lags of the motors and the gains from squared rotor speed to motion, by least squares.
+"""The lags of the motors and the gains from rotor speeds to motion, by prediction error.
 
-In the band of `tuner.inertial.signals`, with Ω the rotor speeds that follow the commands::
+With Ω the rotor speeds that follow the commands, f the specific force and h the height of the
+rotors over the centre of mass::
 
-    dω/dt = gain · Σ lever·Ω² + damping · ω + coupling · (ω × ω) + constant       about x, y, z
-    f_z   = gain · ΣΩ² + decline · t·ΣΩ² + constant                              along z
+    dω/dt = gain · (f_z · Σ lever·Ω² / ΣΩ² + h · (-f_y, f_x)) + damping · ω + coupling · (ω × ω)
+            + drag · (f_y, f_x) + offset · (f_z - g) + constant                    about x and y
+    dω/dt = gain · Σ lever·Ω² + reaction · dΣ±Ω/dt + spread · (x̄ · f_y - ȳ · f_x)
+            + damping · ω + coupling · (ω × ω) + constant                          about z
+    f_z   = gain · ΣΩ² + decline · t·ΣΩ² + constant                               along z
 
-about x and y with the moment of drag, which the accelerometer shows, less its mean over the flight,
-and which acts at the height of the rotors, so that the constant is the steady moment of rotors that
-differ and of a mass that is not in the middle; about z with the reaction of rotors that speed up.
-Commands are known exactly, so that noise biases no gain. The gains are linear: for given lags their
-best values are a solve, and the search moves three numbers (variable projection, Golub and Pereyra
-1973). After Eschmann, Albani and Loianno, "Data-Driven System Identification of Quadrotors Subject
-to Motor Delays", 2024, who take the lag for symmetric.
+What air does to a vehicle that flies fast shows in the accelerometer. Whatever is left of the
+rotors' thrust is in f_z, slowly: about x and y the rotors share that, whatever battery and inflow
+are. What drags at the rotors is in f_x and f_y, at their height; what else goes with the airspeed
+(flapping, a body that drags elsewhere) is a part of those, as large as its prior lets it be. About
+z the rotors' drags have arms as their speeds spread them (x̄, ȳ: the rotors' mean place).
+
+What is left is not white, and the loop's rotors answer it. So errors are predicted from those
+before them, and what is new in each is weighed (prediction errors with an autoregressive noise
+model; Ljung, System Identification, 13.4). The gains are linear: for given lags their best values
+are a solve, and the search moves three numbers (variable projection, Golub and Pereyra 1973).
+After Eschmann, Albani and Loianno, "Data-Driven System Identification of Quadrotors Subject to
+Motor Delays", 2024, who take the lag for symmetric.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import optimize
+from scipy import linalg, optimize, signal
 
+from sim_jax.constants import GRAVITY
 from sim_jax.vehicle import Motor
 from tuner.core.numerics import Inverse
-from tuner.inertial.signals import Lags, Stretch, blocks_of, derivative, rotor_speeds, smoothed
+from tuner.inertial.signals import Lags, Stretch, blocks_of, low_passed, rotor_speeds, smoothed
+from tuner.objective.explained import levers
 from tuner.recordings.flight import Array
+from tuner.vehicle import ControllerFile, VehicleFile, values_of
+from tuner.vehicle.model import model_of
 
 OUTPUTS = ("roll", "pitch", "yaw", "thrust")
 """What is explained: three angular accelerations in rad/s², the specific force along z in m/s²."""
 STEADY = ("steady_roll", "steady_pitch", "steady_yaw")
 """The constants of the first three, in rad/s²."""
-CONSTANT = 3
-"""The column of a constant among the regressors of an angular acceleration."""
-TAUS = (0.01, 0.02, 0.04, 0.07, 0.12)
-LATENCIES = (0.0, 0.01, 0.02)
-"""s from which the search sets out; the likeliest of their pairs."""
+CONSTANT, RATE, DRAG = 0, 1, 3
+"""The columns of a constant, of the rate, and about x and y of the drag, among those that no lag
+moves."""
+LASTING = 0.1
+"""rad/s² by which what is steady in one flight is another in the next."""
+AIRSPEED = 25.0
+"""m/s along its axis at which a rotor has lost its thrust, or earlier."""
+MEMORY = 0.15
+"""s of errors from which the next one is predicted."""
+GYRO, ACCELEROMETER = 1e-4, 0.02
+"""rad/s and m/s² of white noise that any sensor has: a simulated log may hold none."""
+BIAS = 0.1
+"""m/s², standard deviation of the accelerometer's error along z."""
+SHARED = 3.0
+"""Hz, up to which the accelerometer tells what is left of the rotors' thrust."""
+DRAGGED = 8.0
+"""Hz, up to which it tells what drags."""
+HEIGHT = 0.3
+"""Standard deviation, in arms, of the height at which what goes with the airspeed acts."""
+TOLD = 0.02
+"""Share to which it tells a moment of drag."""
+LATEST = 0.02
+"""s by which a phase may be off that is all wrong: a rotor's lag."""
+OFFSET = 0.03
+"""Standard deviation, in arms, of the centre of mass across the rotors' axes."""
+START_TAUS = (0.5, 1.0, 2.0, 4.0)
+"""Time constants, over the vehicle file's, from which the search sets out."""
+START_LATENCIES = (0.002, 0.012)
+"""s, likewise; the likeliest of their pairs."""
+PRIOR = np.array([0.7, 0.7, 0.01])
+"""Standard deviations of the lags' coordinates about the vehicle file's."""
 BOUNDS = ((np.log(0.002), np.log(0.5)), (np.log(0.002), np.log(0.5)), (0.0, 0.06))
-RESOLVED = 1e-4
-"""rad/s² and m/s² that no gyro or accelerometer resolves: a simulated log may hold no noise, and
-turn about no axis that it is not sent about."""
-NUDGE = (1e-3, 1e-3, 1e-5)
+SIMPLEX = np.diag([0.2, 0.2, 0.003])
+"""First steps of the search."""
+NUDGE = (1e-2, 1e-2, 2e-4)
 """Steps of the lags' coordinates for derivatives."""
+ROUNDS, ARRIVED = 5, np.array([0.02, 0.02, 5e-4])
+"""Of weighing and searching, at most; steps of the lags' coordinates below which it has arrived."""
 
 
 @dataclass(frozen=True)
@@ -53,18 +93,19 @@ class Response:
     lags
         Of the motors.
     gains
-        Output -> the response to squared rotor speed: of torque's lever in m, or of thrust.
+        Output -> the response: mass over inertia in 1/m², of torque's lever in m, or of thrust to
+        squared rotor speed.
     steady
         Of `STEADY` -> rad/s².
     names
         Of the numbers in ``covariance``: ``up``, ``down`` (logarithms), ``late`` (s), `OUTPUTS`
         (the gains), `STEADY`.
     covariance
-        (10, 10) of those, of blocks rather than samples: residuals are alike from one to the next.
+        (10, 10) of those.
     explained
-        Output -> share of its variance that is explained.
+        Output -> share of its variance that is explained, in the band of `smoothed`.
     curves
-        Output -> measured and modelled (n,), for a picture.
+        Output -> measured and modelled (n,) there, for a picture.
     time
         (n,) s of those.
     """
@@ -79,161 +120,443 @@ class Response:
     time: Array
 
 
+TINY = 1e-30
+"""Size of a column that is none."""
+NAMES = ("up", "down", "late", *OUTPUTS, *STEADY)
+Tables = dict[str, list[Array]]
+"""Output -> a table of each stretch."""
+
+
 @dataclass(frozen=True)
 class _Problem:
-    """What is explained, and by what."""
+    """What is explained, and by what.
+
+    Attributes
+    ----------
+    stretches, vehicle, motor
+        What flew, as far as it is known.
+    measured
+        Output -> (n,) of each stretch.
+    still
+        Output -> (n, k) of each stretch, what explains it at any lags; the constant first.
+    shared
+        (n, 3) m/s² of each stretch's all steps: f_x and f_y up to `DRAGGED`, f_z up to `SHARED`.
+    """
 
     stretches: tuple[Stretch, ...]
+    vehicle: VehicleFile
     motor: Motor
-    levers: Array
-    measured: Mapping[str, Array]
+    measured: Tables
+    still: Tables
+    shared: tuple[Array, ...]
+
+    @property
+    def step(self) -> float:
+        return self.stretches[0].step
+
+    @property
+    def begin(self) -> Array:
+        """The lags' coordinates (3,) in the vehicle file."""
+        value = values_of(self.vehicle)
+        late = value.get("actuator_latency") or 0.0
+        return Lags(value["time_constant_up"], value["time_constant_down"], late).coordinates
 
 
-def fit_response(stretches: tuple[Stretch, ...], motor: Motor, levers: Array) -> Response:
+@dataclass(frozen=True)
+class _Weighing:
+    """How errors of one output are weighed.
+
+    Attributes
+    ----------
+    kernel
+        Leaves of errors what those before do not predict, in their standard deviations.
+    prior
+        (k,) information about what no lag moves.
+    basis, target
+        Orthonormal columns (n + k, k) of that, filtered, and what it leaves of the measured.
+    """
+
+    kernel: Array
+    prior: Array
+    basis: Array
+    target: Array
+
+    @staticmethod
+    def of(
+        kernel: Array, prior: Array, still: Sequence[Array], measured: Sequence[Array]
+    ) -> _Weighing:
+        table = np.vstack([_filtered(still, kernel), np.diag(np.sqrt(prior))])
+        size = np.sqrt((table * table).sum(axis=0)) + TINY
+        basis = np.linalg.qr(table / size)[0]
+        target = np.concatenate([_filtered(measured, kernel), np.zeros(len(prior))])
+        return _Weighing(kernel, prior, basis, target - basis @ (basis.T @ target))
+
+    def left(self, moving: Sequence[Array]) -> Array:
+        """Return what columns that lags move leave of the measured (n + k,)."""
+        table = _filtered(moving, self.kernel)
+        table = np.vstack([table, np.zeros((len(self.prior), table.shape[1]))])
+        table = table - self.basis @ (self.basis.T @ table)
+        size = np.sqrt((table * table).sum(axis=0)) + TINY
+        table /= size
+        square = table.T @ table + 1e-12 * np.eye(len(size))
+        return np.asarray(self.target - table @ np.linalg.solve(square, table.T @ self.target))
+
+
+def fit_response(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
     """Fit the lags and the gains of one flight.
+
+    Its errors are also those of which the same at half the rate knows nothing: what noise that the
+    loop did not see, or air, does to a gain is not the same at other frequencies.
 
     Parameters
     ----------
     stretches
         Of the flight, at least one.
-    motor
-        The curve from command to rotor speed.
-    levers
-        (4, 3) m, moments of one newton of thrust at each rotor.
+    vehicle
+        Of a known mass, geometry, and curve from command to rotor speed.
     """
-    targets: dict[str, list[Array]] = {name: [] for name in OUTPUTS}
+    found = _fitted(stretches, vehicle)
+    other = _fitted(tuple(stretch.coarser for stretch in stretches), vehicle)
+    apart = _numbers(found) - _numbers(other)
+    return replace(found, covariance=found.covariance + np.diag(apart**2))
+
+
+def _numbers(response: Response) -> Array:
+    return np.array(
+        [*response.lags.coordinates, *response.gains.values(), *response.steady.values()]
+    )
+
+
+def _fitted(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> Response:
+    problem = _problem_of(stretches, vehicle)
+    weighings = {name: _first(problem, name) for name in OUTPUTS}
+    place = problem.begin
+    for _ in range(ROUNDS):
+        weighings = _weighed(problem, place, weighings)
+    for number in range(ROUNDS):
+        before, place = place, _searched(problem, place, weighings, first=number == 0)
+        for _ in range(2):
+            weighings = _weighed(problem, place, weighings)
+        if np.all(np.abs(place - before) < ARRIVED):
+            break
+    return _response(problem, place, weighings)
+
+
+def _problem_of(stretches: tuple[Stretch, ...], vehicle: VehicleFile) -> _Problem:
+    measured: Tables = {name: [] for name in OUTPUTS}
+    still: Tables = {name: [] for name in OUTPUTS}
+    shared = []
     for stretch in stretches:
-        turning = derivative(stretch.body_rate, stretch.step)[stretch.inside]
+        inside, step = stretch.inside[:-1], stretch.step
+        rate = stretch.body_rate[:-1]
+        force = 0.5 * (stretch.force[1:] + stretch.force[:-1])
+        turning = (np.diff(stretch.body_rate, axis=0) / step)[inside]
+        across = low_passed(force[:, :2], step, DRAGGED)
+        shared.append(np.column_stack([across, low_passed(force[:, 2:], step, SHARED)]))
+        one = np.ones(int(inside.sum()))
         for axis, name in enumerate(OUTPUTS[:3]):
-            targets[name].append(turning[:, axis])
-        targets["thrust"].append(smoothed(stretch.force, stretch.step)[stretch.inside, 2])
-    measured = {name: np.concatenate(parts) for name, parts in targets.items()}
-    problem = _Problem(stretches, motor, levers, measured)
+            coupling = rate[:, (axis + 1) % 3] * rate[:, (axis + 2) % 3]
+            columns = [one, rate[inside, axis], coupling[inside]]
+            if axis < 2:
+                columns += [across[inside, 1 - axis], shared[-1][inside, 2] - GRAVITY]
+            measured[name].append(turning[:, axis])
+            still[name].append(np.column_stack(columns))
+        measured["thrust"].append(force[inside, 2])
+        still["thrust"].append(one[:, None])
+    motor = model_of(vehicle, ControllerFile()).vehicle.motor
+    return _Problem(stretches, vehicle, motor, measured, still, tuple(shared))
 
-    def misfit(coordinates: Array) -> float:
-        solved = _solved(problem, Lags.at(coordinates))
-        squares = [float(np.mean(left * left)) for _, _, left in solved.values()]
-        return float(np.log(np.add(squares, RESOLVED**2)).sum())
 
-    starts = [Lags(tau, tau, late).coordinates for tau in TAUS for late in LATENCIES]
-    best = min(starts, key=misfit)
+def _moving(problem: _Problem, place: Array) -> Tables:
+    """Return for each output the columns that lags move, the gain's first."""
+    vehicle, step = problem.vehicle, problem.step
+    arms, places = levers(vehicle), _places(vehicle)
+    height = places[:, 2].mean()
+    tables: Tables = {name: [] for name in OUTPUTS}
+    for stretch, shared in zip(problem.stretches, problem.shared, strict=True):
+        speed, inside = rotor_speeds(stretch, problem.motor, Lags.at(place)), stretch.inside[:-1]
+        square = 0.5 * (speed[1:] ** 2 + speed[:-1] ** 2)
+        lift, torque = square.sum(axis=1), square @ arms
+        each = shared[:, 2] / low_passed(lift[:, None], step, SHARED)[:, 0]
+        mean = (speed[1:] + speed[:-1]) @ places / (speed[1:] + speed[:-1]).sum(axis=1)[:, None]
+        spread = mean[:, 0] * shared[:, 1] - mean[:, 1] * shared[:, 0]
+        reaction = np.diff(speed @ np.sign(arms[:, 2])) / step
+        since = stretch.time[:-1] - stretch.time.mean()
+        tables["roll"].append((each * torque[:, 0] - height * shared[:, 1])[inside, None])
+        tables["pitch"].append((each * torque[:, 1] + height * shared[:, 0])[inside, None])
+        tables["yaw"].append(np.column_stack([torque[:, 2], reaction, spread])[inside])
+        tables["thrust"].append(np.column_stack([lift, since * lift])[inside])
+    return tables
+
+
+def _places(vehicle: VehicleFile) -> Array:
+    """Return (4, 3) m of the rotors from the centre of mass."""
+    value, places = values_of(vehicle), np.array([rotor.position for rotor in vehicle.rotors])
+    return np.asarray(places - [value.get(f"center_of_mass_{axis}") or 0.0 for axis in "xyz"])
+
+
+def _first(problem: _Problem, name: str) -> _Weighing:
+    """Return plain least squares."""
+    still, measured = problem.still[name], problem.measured[name]
+    return _Weighing.of(np.ones(1), _prior(problem, name, None), still, measured)
+
+
+def _prior(problem: _Problem, name: str, gain: float | None) -> Array:
+    """Return the information (k,) about what no lag moves; ``gain`` of what flew, once known."""
+    prior = np.zeros(problem.still[name][0].shape[1])
+    value = values_of(problem.vehicle)
+    if name == "thrust":
+        prior[CONSTANT] = BIAS**-2
+    elif name != "yaw":
+        axis = OUTPUTS.index(name)
+        if gain is None or gain <= 0.0:
+            gain = value["mass"] / value[("inertia_xx", "inertia_yy")[axis]]
+        arm = np.abs(levers(problem.vehicle)[:, axis]).max()
+        prior[-2:] = (HEIGHT * arm * gain) ** -2, (OFFSET * arm * gain) ** -2
+    return prior
+
+
+def _filtered(tables: Sequence[Array], kernel: Array) -> Array:
+    """Return the rows (n, k) of all stretches, filtered; the first that a filter spans are lost."""
+    shape = (-1, *(1,) * (tables[0].ndim - 1))
+    parts = [
+        signal.oaconvolve(table, kernel.reshape(shape), "valid", axes=0)
+        for table in tables
+        if len(table) >= len(kernel)
+    ]
+    return np.concatenate(parts)
+
+
+def _solved(weighing: _Weighing, table: Array, measured: Array) -> Array:
+    """Return the best coefficients (k,) of a filtered table (n, k), moved columns first."""
+    moved = table.shape[1] - len(weighing.prior)
+    prior = np.concatenate([np.zeros(moved), weighing.prior])
+    size = np.sqrt((table * table).sum(axis=0) + prior) + TINY
+    scaled = table / size
+    square = scaled.T @ scaled + np.diag(prior / size**2 + 1e-12)
+    return np.asarray(np.linalg.solve(square, scaled.T @ measured) / size)
+
+
+def _columns(problem: _Problem, name: str, moving: Tables) -> list[Array]:
+    pairs = zip(moving[name], problem.still[name], strict=True)
+    return [np.hstack(pair) for pair in pairs]
+
+
+def _weighed(
+    problem: _Problem, place: Array, weighings: Mapping[str, _Weighing]
+) -> dict[str, _Weighing]:
+    """Return the weighings that errors at a place call for."""
+    moving, order = _moving(problem, place), max(1, round(MEMORY / problem.step))
+    renewed = {}
+    for name in OUTPUTS:
+        old, columns, measured = (
+            weighings[name],
+            _columns(problem, name, moving),
+            problem.measured[name],
+        )
+        found = _solved(old, _filtered(columns, old.kernel), _filtered(measured, old.kernel))
+        alike = np.zeros(order + 1)
+        for table, values in zip(columns, measured, strict=True):
+            errors = values - table @ found
+            errors = errors - errors.mean()
+            both = signal.correlate(errors, errors, "full", method="fft")
+            alike += both[len(errors) - 1 :][: order + 1]
+        alike /= sum(map(len, measured))
+        if name == "thrust":
+            alike[0] += ACCELEROMETER**2
+        else:
+            alike[:2] += np.array([2.0, -1.0]) * (GYRO / problem.step) ** 2
+        ahead = linalg.solve_toeplitz(alike[:-1], alike[1:])
+        new = np.sqrt(max(alike[0] - ahead @ alike[1:], 1e-300))
+        kernel = np.concatenate([[1.0], -ahead]) / new
+        prior = _prior(problem, name, float(found[0]))
+        renewed[name] = _Weighing.of(kernel, prior, problem.still[name], measured)
+    return renewed
+
+
+def _searched(
+    problem: _Problem, place: Array, weighings: Mapping[str, _Weighing], *, first: bool
+) -> Array:
+    """Return the likeliest lags' coordinates (3,)."""
+    begin = problem.begin
+
+    def misfit(at: Array) -> float:
+        moving, total = _moving(problem, at), float(np.sum(((at - begin) / PRIOR) ** 2))
+        for name in OUTPUTS:
+            left = weighings[name].left(moving[name])
+            total += len(left) * float(np.log(np.mean(left * left) + TINY))
+        return total
+
+    if first:
+        others = [
+            np.array([*(begin[:2] + np.log(factor)), late])
+            for factor in START_TAUS
+            for late in START_LATENCIES
+        ]
+        place = min([place, *others], key=misfit)
     end = optimize.minimize(
         misfit,
-        best,
+        place,
         method="Nelder-Mead",
         bounds=BOUNDS,
-        options={"xatol": 1e-3, "fatol": 1e-4, "maxfev": 150},
+        options={
+            "initial_simplex": np.vstack([place, place + SIMPLEX]),
+            "xatol": 3e-3,
+            "fatol": 0.1,
+            "maxfev": 80,
+        },
     )
-    lags = Lags.at(end.x)
-    solved = _solved(problem, lags)
+    return np.asarray(end.x)
+
+
+def _response(problem: _Problem, place: Array, weighings: Mapping[str, _Weighing]) -> Response:
+    """Return what is found at a place, and how surely."""
+    moving = _moving(problem, place)
+    slopes = _slopes(problem, place)
+    found, tables, errors, curves = {}, {}, {}, {}
+    for name in OUTPUTS:
+        weighing, columns = weighings[name], _columns(problem, name, moving)
+        measured = problem.measured[name]
+        table = _filtered(columns, weighing.kernel)
+        found[name] = _solved(weighing, table, _filtered(measured, weighing.kernel))
+        errors[name] = _filtered(measured, weighing.kernel) - table @ found[name]
+        count = moving[name][0].shape[1]
+        by_lags = [
+            _filtered([part @ found[name][:count] for part in slope[name]], weighing.kernel)
+            for slope in slopes
+        ]
+        tables[name] = np.column_stack([*by_lags, table])
+        modelled = [table @ found[name] for table in columns]
+        curves[name] = _curves(measured, modelled, problem.step)
+    firsts, covariance = _covariance(problem, weighings, tables, errors)
+    covariance += _of_air(problem, moving, found)
     return Response(
-        lags=lags,
-        gains={name: float(solution[0]) for name, (_, solution, _) in solved.items()},
+        lags=Lags.at(place),
+        gains={name: float(solution[0]) for name, solution in found.items()},
         steady={
-            name: float(solved[output][1][CONSTANT])
+            name: float(found[output][firsts[output] + CONSTANT])
             for name, output in zip(STEADY, OUTPUTS, strict=False)
         },
-        names=("up", "down", "late", *OUTPUTS, *STEADY),
-        covariance=_covariance(problem, lags, solved),
+        names=NAMES,
+        covariance=covariance,
         explained={
-            name: float(
-                (np.var(measured[name]) - np.var(left)) / (np.var(measured[name]) + RESOLVED**2)
-            )
-            for name, (_, _, left) in solved.items()
+            name: float((np.var(seen) - np.var(seen - made)) / (np.var(seen) + BIAS**2))
+            for name, (seen, made) in curves.items()
         },
-        curves={
-            name: (measured[name], measured[name] - left) for name, (_, _, left) in solved.items()
-        },
-        time=np.concatenate([stretch.time[stretch.inside] for stretch in stretches]),
+        curves=curves,
+        time=np.concatenate([s.time[:-1][s.inside[:-1]] for s in problem.stretches]),
     )
 
 
-Solved = dict[str, tuple[Array, Array, Array]]
-"""Output -> regressors (n, p), solution (p,), residuals (n,)."""
+def _slopes(problem: _Problem, place: Array) -> list[Tables]:
+    """Return the derivatives of the moving columns by each of the lags' coordinates."""
+    slopes = []
+    for number, nudge in enumerate(NUDGE):
+        ends = []
+        for sign in (1.0, -1.0):
+            at = place.copy()
+            at[number] = np.clip(at[number] + sign * nudge, *BOUNDS[number])
+            ends.append((at[number], _moving(problem, at)))
+        (above, high), (below, low) = ends
+        slopes.append(
+            {
+                name: [
+                    (a - b) / (above - below) for a, b in zip(high[name], low[name], strict=True)
+                ]
+                for name in OUTPUTS
+            }
+        )
+    return slopes
 
 
-def _solved(problem: _Problem, lags: Lags) -> Solved:
-    """Return each output's best explanation for given lags."""
-    parts = [
-        _regressors(stretch, problem.motor, problem.levers, lags) for stretch in problem.stretches
-    ]
-    solved: Solved = {}
-    for name in OUTPUTS:
-        table = np.concatenate([part[name] for part in parts])
-        size = np.sqrt((table * table).mean(axis=0)) + 1e-300
-        solution = np.linalg.lstsq(table / size, problem.measured[name], rcond=None)[0] / size
-        solved[name] = table, solution, problem.measured[name] - table @ solution
-    return solved
+def _curves(
+    measured: Sequence[Array], modelled: Sequence[Array], step: float
+) -> tuple[Array, Array]:
+    seen, made = (
+        np.concatenate([smoothed(part[:, None], step)[:, 0] for part in parts])
+        for parts in (measured, modelled)
+    )
+    return seen, made
 
 
-def _regressors(stretch: Stretch, motor: Motor, levers: Array, lags: Lags) -> dict[str, Array]:
-    """Return for each output the columns that explain it, the gain's first."""
-    speed = rotor_speeds(stretch, motor, lags)
-    inside, step = stretch.inside, stretch.step
-    torque = smoothed(speed**2 @ levers, step)[inside]
-    rates = stretch.body_rate
-    damping = smoothed(rates, step)[inside]
-    coupling = smoothed(
-        np.column_stack([rates[:, b] * rates[:, c] for b, c in ((1, 2), (0, 2), (0, 1))]), step
-    )[inside]
-    one = np.ones(int(inside.sum()))
-    columns = {
-        name: np.column_stack([torque[:, axis], damping[:, axis], coupling[:, axis], one])
-        for axis, name in enumerate(OUTPUTS[:3])
-    }
-    across = smoothed(stretch.force[:, :2], step)[inside]
-    across = across - across.mean(axis=0)
-    columns["roll"] = np.column_stack([columns["roll"], across[:, 1]])
-    columns["pitch"] = np.column_stack([columns["pitch"], across[:, 0]])
-    spins = np.sign(levers[:, 2])
-    reaction = derivative(speed @ spins[:, None], step)[inside]
-    columns["yaw"] = np.column_stack([columns["yaw"], reaction])
-    lift = smoothed((speed**2).sum(axis=1, keepdims=True), step)[inside]
-    since = (stretch.time - stretch.time.mean())[inside, None]
-    columns["thrust"] = np.column_stack([lift, since * lift, one])
-    return columns
+def _covariance(
+    problem: _Problem,
+    weighings: Mapping[str, _Weighing],
+    tables: Mapping[str, Array],
+    errors: Mapping[str, Array],
+) -> tuple[dict[str, int], Array]:
+    """Return where each output's constant stands, and the covariance of the numbers (10, 10).
 
-
-def _covariance(problem: _Problem, lags: Lags, solved: Solved) -> Array:
-    """Return the covariance of lags and gains from how blocks of residuals scatter (sandwich)."""
-    here = lags.coordinates
-    shifted: list[Solved] = []
-    for place, nudge in enumerate(NUDGE):
-        moved = here.copy()
-        moved[place] += nudge
-        shifted.append(_solved(problem, Lags.at(moved)))
-    sizes = [solved[name][0].shape[1] for name in OUTPUTS]
-    total, first = 3 + sum(sizes), 3
-    blocks = blocks_of(problem.stretches)
-    count = int(blocks.max()) + 1
-    bread, meat = np.zeros((total, total)), np.zeros((count, total))
-    firsts = []
-    for name, size in zip(OUTPUTS, sizes, strict=True):
-        table, solution, left = solved[name]
-        scale = float(np.hypot(np.std(left), RESOLVED))
-        slopes = [
-            (moved[name][0] - table) @ solution / nudge
-            for moved, nudge in zip(shifted, NUDGE, strict=True)
-        ]
-        columns = np.zeros((len(left), total))
-        columns[:, :3] = np.column_stack(slopes)
-        columns[:, first : first + size] = table
-        columns /= scale
-        bread += columns.T @ columns
-        np.add.at(meat, blocks, columns * (left / scale)[:, None])
-        firsts.append(first)
-        first += size
-    constants = [first + CONSTANT for first in firsts[: len(STEADY)]]
-    return _sandwich(bread, meat, [0, 1, 2, *firsts, *constants])
-
-
-def _sandwich(bread: Array, meat: Array, wanted: list[int]) -> Array:
-    """Return the wanted part of G⁻¹ Σ sᵀs G⁻¹, with few blocks made up for.
-
-    What no sample tells of has a variance beyond any other.
+    Of what is new in errors, or of how blocks of them scatter (sandwich): the larger of both.
     """
+    order = len(weighings["roll"].kernel) - 1
+    blocks = blocks_of(problem.stretches, order)
+    total = 3 + sum(tables[name].shape[1] - 3 for name in OUTPUTS)
+    bread, scores = np.zeros((total, total)), np.zeros((int(blocks.max()) + 1, total))
+    bread[:3, :3] = np.diag(PRIOR**-2)
+    first, gains, constants, firsts = 3, [], [], {}
+    for name in OUTPUTS:
+        table = tables[name]
+        moved = table.shape[1] - 3 - len(weighings[name].prior)
+        places = np.r_[0:3, first : first + table.shape[1] - 3]
+        bread[np.ix_(places, places)] += table.T @ table
+        still = places[3 + moved :]
+        bread[still, still] += weighings[name].prior
+        np.add.at(scores, (blocks[:, None], places[None]), table * errors[name][:, None])
+        firsts[name] = moved
+        gains.append(first)
+        constants.append(first + moved + CONSTANT)
+        first += table.shape[1] - 3
     nothing = np.zeros_like(bread)
     inverse = Inverse.of(bread, nothing)
-    count, size = meat.shape
-    scattered = inverse.sandwiched(meat.T @ meat, nothing) * (count / max(1, count - size))
-    return np.asarray((scattered + inverse.open)[np.ix_(wanted, wanted)])
+    count, most = len(scores), max(table.shape[1] for table in tables.values())
+    scattered = inverse.sandwiched(scores.T @ scores, nothing) * (count / max(1, count - most))
+    white = inverse.sandwiched(bread, nothing)
+    wider = np.sqrt(np.maximum(1.0, np.diag(white) / np.maximum(np.diag(scattered), 1e-300)))
+    covariance = scattered * np.outer(wider, wider) + inverse.open
+    wanted = [0, 1, 2, *gains, *constants[:3]]
+    return firsts, np.asarray(covariance[np.ix_(wanted, wanted)])
+
+
+def _of_air(problem: _Problem, moving: Tables, found: Mapping[str, Array]) -> Array:
+    """Return the covariance (10, 10) of what the accelerometer does not tell of air.
+
+    What air takes of the thrust is not known in the mean: as much, say, as it changes along the
+    flight, or as the constant is that it leaves of the specific force. Whether it takes it of a
+    rotor's speed or of its square, and the accelerometer's own error along z, make up as much of
+    roll's and pitch's gain. The moment of drag is told to a share (`TOLD`), which is more of the
+    turning the gentler that is. What the axial airspeed takes of rotors that rise or sink as the
+    vehicle turns damps that, or drives it where the air comes from below: half of that is unknown.
+    A phase that is off by as much is another lag.
+    """
+    gain, decline = found["thrust"][:2]
+    left = []
+    for stretch, shared, table in zip(
+        problem.stretches, problem.shared, moving["thrust"], strict=True
+    ):
+        lift = low_passed(table, problem.step, SHARED) @ [gain, decline]
+        left.append(shared[stretch.inside[:-1], 2] / lift)
+    taken = float(np.concatenate(left).std())
+    fastest = min(problem.vehicle.aerodynamics.max_relative_airspeed, AIRSPEED)
+    shares = []
+    for name in OUTPUTS[:2]:
+        turned = np.concatenate(
+            [smoothed(m[:, None], problem.step) for m in problem.measured[name]]
+        )
+        force = np.concatenate([still[:, DRAG] for still in problem.still[name]])
+        arm = abs(float(_places(problem.vehicle)[:, 2].mean())) * abs(found[name][0])
+        told = TOLD * arm * force.std()
+        turning = turned.std() + GYRO
+        rate = np.concatenate([still[:, RATE] for still in problem.still[name]]).std()
+        squares = np.mean(levers(problem.vehicle)[:, OUTPUTS.index(name)] ** 2)
+        damped = 0.5 * abs(found[name][0]) * GRAVITY * squares / fastest * rate
+        told = np.hypot(told, damped) / turning
+        shares.append(float(np.sqrt(taken**2 + (BIAS / GRAVITY) ** 2 + told**2)))
+    both = float(np.mean(shares))
+    deviations = np.zeros(len(NAMES))
+    deviations[:3] = both, both, both * LATEST
+    deviations[3:5] = np.abs([found[name][0] for name in OUTPUTS[:2]]) * shares
+    offset = found["thrust"][moving["thrust"][0].shape[1] + CONSTANT] / GRAVITY
+    deviations[-len(STEADY) :] = LASTING
+    deviations[NAMES.index("thrust")] = gain * np.hypot(taken, offset)
+    return np.diag(deviations**2)

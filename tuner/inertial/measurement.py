@@ -21,18 +21,16 @@ from tuner.findings.findings import remedy, sentence
 from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
-from tuner.objective.explained import levers
 from tuner.objective.motor_order import order_findings
 from tuner.recordings.inertial import InertialFlight
-from tuner.vehicle import ControllerFile, VehicleFile
-from tuner.vehicle.model import model_of
+from tuner.vehicle import VehicleFile
 
 NUMBERS = (
     ("time_constant_up",),
     ("time_constant_down",),
     ("actuator_latency",),
-    ("motor_constant", "inertia_xx"),
-    ("motor_constant", "inertia_yy"),
+    ("inertia_xx",),
+    ("inertia_yy",),
     ("motor_constant", "moment_constant", "inertia_zz"),
     ("motor_constant",),
     ("torque_trim_x",),
@@ -66,9 +64,7 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     longest = max(flight.flying, key=lambda span: span[1] - span[0])
     for finding in order_findings(flight.name, flight.series, vehicle, longest):
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
-    arms = levers(vehicle)
-    motor = model_of(vehicle, ControllerFile()).vehicle.motor
-    response = fit_response(stretches, motor, arms)
+    response = fit_response(stretches, vehicle)
     used = _used(response)
     if not set(used) & set(OUTPUTS):
         raise RecordingError(
@@ -107,14 +103,17 @@ def _measurement(
         "up": math.log(lags.up),
         "down": math.log(lags.down),
         "late": lags.late,
-        "roll": math.log(max(gains["roll"], 1e-300)),
-        "pitch": math.log(max(gains["pitch"], 1e-300)),
+        "roll": math.log(max(gains["roll"] / vehicle.mass, 1e-300)),
+        "pitch": math.log(max(gains["pitch"] / vehicle.mass, 1e-300)),
         "yaw": math.log(max(gains["yaw"] * vehicle.aerodynamics.moment_constant, 1e-300)),
         "thrust": math.log(max(gains["thrust"] * vehicle.mass, 1e-300)),
     }
     thrust = gains["thrust"] * vehicle.mass if "thrust" in used else None
     constant = vehicle.aerodynamics.motor_constant if thrust is None else thrust
-    inertia = {name: constant / gains[output] for name, output in TURNED.items() if name in used}
+    over = {"roll": vehicle.mass, "pitch": vehicle.mass, "yaw": constant}
+    inertia = {
+        name: over[output] / gains[output] for name, output in TURNED.items() if name in used
+    }
     values |= {name: response.steady[name] * moment for name, moment in inertia.items()}
     places = [response.names.index(number) for number in used]
     # gains enter by their logarithms, constants as moments

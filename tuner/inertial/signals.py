@@ -24,7 +24,7 @@ from tuner.recordings.flight import Array, Series
 CUTOFF = 30.0
 """Hz of the low-pass that measured and modelled signals pass alike: above it are propellers' and
 frames' vibrations, below it what motors of tens of ms can follow."""
-FASTEST = 1000.0
+FASTEST = 500.0
 """Hz of the common clock, at most."""
 TRIMMED = 0.5
 """s at both ends of a stretch that are left out: take-off, landing and the filters' ends."""
@@ -64,6 +64,14 @@ class Stretch:
         ends = self.time[0] + TRIMMED, self.time[-1] - TRIMMED
         return np.asarray((self.time > ends[0]) & (self.time < ends[1]), dtype=np.bool_)
 
+    @property
+    def coarser(self) -> Stretch:
+        """The same at half the rate."""
+        even = len(self.time) // 2 * 2
+        command = self.command[:even].reshape(-1, 2, self.command.shape[1]).mean(axis=1)
+        every = slice(0, even, 2)
+        return Stretch(self.time[every], self.body_rate[every], self.force[every], command)
+
 
 def stretches_of(
     series: Mapping[str, Series], flying: tuple[tuple[float, float], ...]
@@ -82,20 +90,22 @@ def stretches_of(
 
 def smoothed(values: Array, step: float) -> Array:
     """Return (n, k) values without what is above the band, not delayed."""
-    sections = signal.butter(2, CUTOFF, fs=1.0 / step, output="sos")
+    return low_passed(values, step, CUTOFF)
+
+
+def low_passed(values: Array, step: float, cutoff: float) -> Array:
+    """Return (n, k) values without what is above a frequency in Hz, not delayed."""
+    sections = signal.butter(2, cutoff, fs=1.0 / step, output="sos")
     return np.asarray(signal.sosfiltfilt(sections, values, axis=0))
 
 
-def derivative(values: Array, step: float) -> Array:
-    """Return the derivative in time of (n, k) values in the band."""
-    return np.asarray(np.gradient(smoothed(values, step), step, axis=0))
-
-
-def blocks_of(stretches: tuple[Stretch, ...]) -> NDArray[np.int64]:
-    """Return for every compared sample of all stretches the number of its block."""
+def blocks_of(stretches: tuple[Stretch, ...], order: int) -> NDArray[np.int64]:
+    """Return the number of its block for every compared step, but the first few of a stretch."""
     numbers, first = [], 0
     for stretch in stretches:
-        inside = stretch.time[stretch.inside]
+        inside = stretch.time[:-1][stretch.inside[:-1]][order:]
+        if not len(inside):
+            continue
         block = first + ((inside - inside[0]) / BLOCK).astype(np.int64)
         numbers.append(block)
         first = int(block[-1]) + 1
@@ -138,11 +148,16 @@ class Lags:
 
 
 def rotor_speeds(stretch: Stretch, motor: Motor, lags: Lags) -> Array:
-    """Return (n, 4) rad/s, settled at the first command."""
-    late = [
-        np.interp(stretch.time - lags.late, stretch.time, column) for column in stretch.command.T
-    ]
-    return np.asarray(_followed(np.column_stack(late), motor, lags.up, lags.down, stretch.step))
+    """Return (n, 4) rad/s at the samples' times, settled at the first command.
+
+    A command holds until the next: over each step its mean is followed.
+    """
+    command, late = stretch.command, stretch.time - lags.late
+    held = np.vstack([np.zeros(command.shape[1]), np.cumsum(command[:-1], axis=0)]) * stretch.step
+    total = np.column_stack([np.interp(late, stretch.time, column) for column in held.T])
+    total += np.minimum(late - stretch.time[0], 0.0)[:, None] * command[0]
+    mean = np.diff(total, axis=0) / stretch.step
+    return np.asarray(_followed(mean, motor, lags.up, lags.down, stretch.step))
 
 
 @jax.jit
@@ -160,4 +175,4 @@ def _followed(command: Array, motor: Motor, up: float, down: float, step: float)
         return after, after
 
     speeds: jax.Array = jax.lax.scan(advance, asked[0], asked)[1]
-    return speeds
+    return jnp.concatenate([asked[:1], speeds])

@@ -10,7 +10,7 @@ from tests.tuner.recordings.micro_sd import log_of
 from tuner.config import Options, TrajectorySettings, settle
 from tuner.core.errors import InputError, RecordingError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.simulate import simulate
+from tuner.evaluate.simulate import fly, simulate
 from tuner.findings.findings import Code, one_line
 from tuner.ground.bench_json import Combination
 from tuner.inertial.prediction import rate_errors
@@ -114,6 +114,23 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
     assert codes == {Code.SCALES_WITH_MASS, Code.NO_TACHOMETER, Code.YAW_OPEN}
     again = values_of(read_vehicle(fitted.folder / BEST_FIT_FILE))
     assert again["inertia_xx"] == result["inertia_xx"].best
+
+
+@pytest.mark.parametrize("name", ["circle", "lemniscate"])
+def test_air_that_drags_at_the_rotors_is_not_taken_for_inertia(name, tmp_path):
+    """At 4 m/s the moment of the shipped rotor drag is three times that of the turning, or more."""
+    vehicle = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
+    (flown,) = fly(vehicle, ControllerFile(), {"name": name}, speed=4.0, duration=30.0, rate=400.0)
+    settings = settings_for(log_file(flown, tmp_path / "log00", noise=0.0), vehicle)
+    fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
+    truth = values_of(vehicle)
+    for coefficient in SHOWN:
+        found = fitted.result.coefficients[coefficient]
+        assert found.std_error is not None
+        assert abs(found.best - truth[coefficient]) < 3.0 * found.std_error, coefficient
+    for coefficient in ("inertia_xx", "inertia_yy", "motor_constant"):
+        found = fitted.result.coefficients[coefficient]
+        assert found.best == pytest.approx(truth[coefficient], rel=0.1), coefficient
 
 
 def test_a_vehicle_file_of_another_size_gives_a_rigid_body(simulation, flown, tmp_path):
