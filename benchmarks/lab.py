@@ -104,9 +104,10 @@ class Kept(BaseModel):
 def measure() -> Section:
     """Fly, fit and compare every seed."""
     file = None if KEPT is None else Path(KEPT)
-    trials = {} if file is None else kept(file, CHOICE)
-    for seed in trials:
-        print(_line(seed, trials[seed]), flush=True)
+    had = {} if file is None else kept(file, CHOICE)
+    trials = {seed: had[seed] for seed in SEEDS if seed in had}
+    for seed, trial in trials.items():
+        print(_line(seed, trial), flush=True)
     rest = [seed for seed in SEEDS if seed not in trials]
     with engine_for(WORKERS) as engine:
         for seed, trial in zip(rest, engine.stream(_task, rest), strict=True):
