@@ -46,6 +46,8 @@ from tuner.vehicle.model import Model
 MATTERS = 0.5
 """Standard errors without it, from which the move of a coefficient is said."""
 _CHANNELS = ("position", "attitude", "rotor_speed", "body_rate", "command")
+LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
+"""What a rate controller hears and says, as recorded."""
 LATE = 1e-3
 """s of rotor speeds' lateness that is worth a word."""
 SMALLEST = 0.03
@@ -235,25 +237,24 @@ def _heard(
     recorded, simulated = [], []
     for number, flight in enumerate(flights):
         series = flight.series
-        known = {"command", "body_rate", "rate_setpoint"} <= set(series)
+        known = set(LOOP_SIGNALS) <= set(series)
         if not known or np.isfinite(flown.crash_time[number]):
             continue
         clock = np.arange(flown.channels["command"].shape[1]) / rate
         time = series["command"].time
         time = time[(time >= 0.0) & (time <= clock[-1])]
         if len(time) < FEWEST or not all(
-            np.isfinite(series[name].values).all()
-            for name in ("command", "body_rate", "rate_setpoint")
+            np.isfinite(series[name].values).all() for name in LOOP_SIGNALS
         ):
             continue
         even = np.linspace(time[0], time[-1], len(time))
-        recorded.append(
-            _signals([series[n] for n in ("rate_setpoint", "body_rate", "command")], mixer, even)
-        )
-        made = [
-            Series(clock, flown.channels[name][number])
-            for name in (SETPOINTS, "body_rate", "command")
-        ]
+        recorded.append(_signals([series[name] for name in LOOP_SIGNALS], mixer, even))
+        made = []
+        for name, channel in zip(LOOP_SIGNALS, (SETPOINTS, "body_rate", "command"), strict=True):
+            stamps = series[name].time  # what is lost between a recording's samples is lost here
+            stamps = stamps[(stamps >= 0.0) & (stamps <= clock[-1])]
+            there = Series(clock, flown.channels[channel][number])
+            made.append(Series(stamps, _at(there, stamps)))
         simulated.append(_signals(made, mixer, even))
     return answers(recorded, simulated) if recorded else ()
 

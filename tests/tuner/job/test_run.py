@@ -113,6 +113,15 @@ def test_the_terminal_says_in_thirty_lines_that_it_can_be_used(finished, capsys)
 
 
 @pytest.mark.slow
+def test_nothing_is_said_to_lack_where_the_model_is_the_one_that_flew(finished):
+    """Though set-points, gyro and commands are recorded at other rates than simulated ones."""
+    result = finished[1]
+    lacking = ("law_lacking", "controller_answers", "rotor_speeds_late", "rotor_changed")
+    assert not [finding for finding in result.findings if finding.code in lacking]
+    fitted = [row for row in result.coefficients.values() if row.fitted]
+    assert not [row for row in fitted if row.std_error_parts.lack]
+
+
 def test_no_term_is_added_to_flights_that_lack_none(finished):
     table = finished[1].selection
     assert len(table) > 5
