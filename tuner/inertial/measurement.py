@@ -42,8 +42,10 @@ TURNED = dict(zip(STEADY, OUTPUTS, strict=False))
 """The angular acceleration that each constant is of."""
 ENOUGH = 0.1
 """Share of an output's variance below which nothing is taken from it."""
-DIM = 0.5
-"""Relative standard error from which a gain says nothing."""
+DIM = 0.25
+"""Relative standard error from which a gain says nothing: what it is of stays as it was."""
+SURE = 0.1
+"""That below which a gain of the wrong sign is the vehicle file's fault, and no chance."""
 TITLES = {
     "roll": "angular acceleration about x, rad/s²",
     "pitch": "angular acceleration about y, rad/s²",
@@ -65,6 +67,13 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
     for finding in order_findings(flight.name, flight.series, vehicle, longest):
         raise RecordingError(flight.path, clause(sentence(finding)), clause(remedy(finding)))
     response = fit_response(stretches, vehicle)
+    wrong = [name for name in _shown(response, SURE) if response.gains[name] <= 0.0]
+    if wrong:
+        raise RecordingError(
+            flight.path,
+            f"its commands turn the vehicle against the vehicle file in {', '.join(wrong)}",
+            "check the motor order in the topic map, and the rotors' spins in the vehicle file",
+        )
     used = _used(response)
     if not set(used) & set(OUTPUTS):
         raise RecordingError(
@@ -72,25 +81,24 @@ def measure_inertial(flight: InertialFlight, vehicle: VehicleFile) -> Measuremen
             "holds no pose, and nothing turns it or changes its thrust",
             "record a flight that moves",
         )
-    wrong = [name for name in used if name in OUTPUTS and response.gains[name] <= 0.0]
-    if wrong:
-        raise RecordingError(
-            flight.path,
-            f"its commands turn the vehicle against the vehicle file in {', '.join(wrong)}",
-            "check the motor order in the topic map, and the rotors' spins in the vehicle file",
-        )
     return _measurement(flight.name, response, used, vehicle)
+
+
+def _shown(response: Response, dim: float) -> list[str]:
+    """Return the outputs whose gains have relative standard errors below some."""
+    error = dict(zip(response.names, np.sqrt(np.diag(response.covariance)), strict=True))
+    return [
+        name
+        for name in OUTPUTS
+        if response.explained[name] > ENOUGH and error[name] < dim * abs(response.gains[name])
+    ]
 
 
 def _used(response: Response) -> tuple[str, ...]:
     """Return the names of the numbers that the flight shows at all."""
     error = dict(zip(response.names, np.sqrt(np.diag(response.covariance)), strict=True))
-    shown = {
-        name
-        for name in OUTPUTS
-        if response.explained[name] > ENOUGH and error[name] < DIM * abs(response.gains[name])
-    }
-    lags = {name for name in ("up", "down") if error[name] < DIM} | {"late"}
+    shown = {name for name in _shown(response, DIM) if response.gains[name] > 0.0}
+    lags = {name for name in ("up", "down") if error[name] < 2.0 * DIM} | {"late"}
     steady = {name for name, output in TURNED.items() if output in shown}
     return tuple(name for name in response.names if name in shown | lags | steady)
 
