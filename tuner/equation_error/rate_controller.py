@@ -33,7 +33,7 @@ AT_LEAST = 0.05
 AXES = ("roll", "pitch", "yaw")
 PARTS = ("P", "I", "late")
 SMALLEST = {"P": 0.02, "I": 0.1, "late": 5e-4}
-"""Change of a gain as a share of it, and s, below which nothing is said."""
+"""Change of a gain as a share of it, and s, below which nothing is found."""
 APART = 1e-6
 """Inverse condition from which columns are told apart."""
 

@@ -37,6 +37,7 @@ from tuner.objective.criterion import units_of
 from tuner.objective.flight import MOTION, SETPOINTS, TURNED, environment_of
 from tuner.objective.flown import Flown, fly
 from tuner.objective.normal import Objective
+from tuner.objective.recorded_inputs import zero_order_hold
 from tuner.objective.segments import OFFSETS
 from tuner.recordings.flight import Array, Flight, Series
 from tuner.search.fitted import Fitted
@@ -48,6 +49,9 @@ MATTERS = 0.5
 _CHANNELS = ("position", "attitude", "rotor_speed", "body_rate", "command")
 LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
 """What a rate controller hears and says, as recorded."""
+WITHIN_PERIOD = 1.5e-3
+"""s of a rate controller's lateness below which nothing is said: stamps tell in which period of the
+loop a sample was taken, and not when in it; half of one at 400 Hz is 1.25 ms."""
 LATE = 1e-3
 """s of rotor speeds' lateness that is worth a word."""
 SMALLEST = 0.03
@@ -190,7 +194,8 @@ def lack_found(lack: Lack | None, uncertainty: Uncertainty) -> tuple[Finding, ..
         for law in lack.laws
         if moved and abs(law.share) > SMALLEST
     ]
-    parts = {part: [one for one in lack.answers if one.part == part] for part in PARTS}
+    heard = [one for one in lack.answers if one.part != "late" or abs(one.value) > WITHIN_PERIOD]
+    parts = {part: [one for one in heard if one.part == part] for part in PARTS}
     controller = [
         Finding(
             Code.CONTROLLER_ANSWERS,
@@ -254,7 +259,9 @@ def _heard(
             stamps = series[name].time  # what is lost between a recording's samples is lost here
             stamps = stamps[(stamps >= 0.0) & (stamps <= clock[-1])]
             there = Series(clock, flown.channels[channel][number])
-            made.append(Series(stamps, _at(there, stamps)))
+            # what a loop computes holds until it runs again; a body turns on
+            read = _at if name == "body_rate" else zero_order_hold
+            made.append(Series(stamps, read(there, stamps)))
         simulated.append(_signals(made, mixer, even))
     return answers(recorded, simulated) if recorded else ()
 
