@@ -82,7 +82,7 @@ def test_what_a_term_that_was_missed_would_change_widens_the_intervals_that_hold
     result, _ = selected(DRAG, seed=3)
     row = next(row for row in result.rows if row.group == "fuselage_drag")
     assert not row.kept
-    assert set(result.in_doubt) == set(BASE_IN_ORDER)
+    assert set(BASE_IN_ORDER) <= set(result.in_doubt)
     examination = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt)
     truth = result.job.space.numbers(result.job.space.initial)
     for name in BASE_IN_ORDER:
