@@ -20,16 +20,14 @@ from sim_jax.inlet import ReferenceInlet, Stages, Step
 from sim_jax.numeric import Scalar
 from sim_jax.plant import Plant
 from sim_jax.state import State
-from sim_jax.trees import replaced
 from sim_jax.vehicle import PerRotor
 from tuner.vehicle import ControllerFile
 
 Numbers = NDArray[np.float64]
 
-KNOWN = ("thrust_exponent", "rate_gain", "autopilot_tilt", "gyro_scale")
+KNOWN = ("thrust_exponent", "rate_gain", "autopilot_tilt", "gyro_scale", "motor_lag")
 """Groups of terms."""
 UNKNOWN = (
-    "second_lag",
     "rotor_damage",
     "filtered_speeds",
     "translational_lift",
@@ -52,10 +50,9 @@ class Effect:
     values
         Coefficients of the registry.
     size
-        Of what is in no row: s of a second lag of the motors; share of its thrust that a rotor
-        loses; s of the filter through which rotor speeds went before they were logged; gain of
-        thrust per squared air velocity across the rotors, s²/m²; factor on the controller file's
-        I, or on its gyro's cutoff.
+        Of what is in no row: share of its thrust that a rotor loses; s of the filter through which
+        rotor speeds went before they were logged; gain of thrust per squared air velocity across
+        the rotors, s²/m²; factor on the controller file's I, or on its gyro's cutoff.
     rotor, flight, begin
         Which rotor loses thrust, in which flight, from which s on.
     """
@@ -87,9 +84,9 @@ def effect_of(seed: int, *, seconds: float, flights: int) -> Effect:
         },
         "autopilot_tilt": {f"autopilot_tilt_{axis}": signed(0.006, 0.025) for axis in "xy"},
         "gyro_scale": {f"gyro_scale_{axis}": float(np.exp(signed(5e-3, 0.02))) for axis in "xyz"},
+        "motor_lag": {"time_constant_second": random.uniform(0.003, 0.008)},
     }
     sizes = {
-        "second_lag": random.uniform(0.003, 0.008),
         "rotor_damage": random.uniform(0.03, 0.07),
         "filtered_speeds": random.uniform(0.005, 0.02),
         "translational_lift": random.uniform(0.002, 0.006),
@@ -124,10 +121,8 @@ def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
 
 
 class Beyond(ReferenceInlet):
-    """The loop with motors and rotors that no coefficient describes; what is None is not there."""
+    """The loop with rotors that no coefficient describes; what is None is not there."""
 
-    second_lag: Scalar | None = None
-    """s of a lag of first order before the motors' own."""
     loss: Array | None = None
     """(rotors, flights) of thrust and torque, from ``begin`` on."""
     begin: Scalar | None = None
@@ -139,9 +134,6 @@ class Beyond(ReferenceInlet):
         self, stages: Stages, state: State, step: Step
     ) -> tuple[PerRotor, PerRotor]:
         assert isinstance(stages, Plant)
-        if self.second_lag is not None:
-            history = _lagged(state.reference_history, step, stages.schedule.step / self.second_lag)
-            state = replaced(state, reference_history=history)
         speeds, acting = stages.motors(state, step)
         if self.lift is not None:
             through = state.motion.attitude.to_body(state.motion.velocity)
@@ -153,24 +145,10 @@ class Beyond(ReferenceInlet):
         return speeds, acting
 
 
-def _lagged(history: Array | None, step: Step, steps: Scalar) -> Array:
-    """Return a delay line of held references as a lag of so many steps' inverse leaves them."""
-    assert history is not None
-    length = len(history)
-    ages = jnp.arange(length)
-    order = jnp.mod(step - ages, length)
-    apart = ages[None, :] - ages[:, None]
-    weight = jnp.where(apart >= 0, jnp.exp(-jnp.abs(apart) * steps), 0.0)
-    weight = weight / weight.sum(axis=1, keepdims=True)
-    return history.at[order].set(jnp.tensordot(weight, history[order], axes=1))
-
-
 def inlet_with(effect: Effect, inlet: ReferenceInlet) -> ReferenceInlet:
     """Return the loop's inlet with what no coefficient describes."""
     parts = (inlet.points, inlet.spins, inlet.yaw_rate, inlet.level_held)
     size = jnp.asarray(effect.size)
-    if effect.name == "second_lag":
-        return Beyond(*parts, second_lag=size)
     if effect.name == "translational_lift":
         return Beyond(*parts, lift=size)
     if effect.name == "rotor_damage":

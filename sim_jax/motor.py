@@ -1,12 +1,18 @@
-"""Command to rotor speed: RPM curve, speed limit, first-order lag up and down (Eq. 4.2, 5.3)."""
+"""Command to rotor speed: RPM curve, speed limit, first-order lag up and down (Eq. 4.2, 5.3).
+
+A second lag may stand before the rotor's own: of the motor's current, or of a smoothed command.
+"""
 
 from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from sim_jax.numeric import Scalar
+from sim_jax.numeric import Flag, Scalar
 from sim_jax.vehicle import Motor
+
+INSTANT = 1e-9
+"""s of a second lag up to which it is over at once."""
 
 
 class LagSlope(eqx.Module):
@@ -24,6 +30,47 @@ class LagSlope(eqx.Module):
         return jnp.maximum(1.0 + self.slope * (speed / self.hover_speed - 1.0), 0.1)
 
 
+class SecondLag(eqx.Module):
+    """A lag of first order before the rotor's own, over the same step: both exact in series.
+
+    The rotor speed's gap g and the lagged reference's gap e to a reference that holds follow
+    e' = -e/τ₂ and τ·g' = e - g. Below zero τ₂ is a lead: the law goes on smoothly through zero,
+    where it does nothing.
+    """
+
+    time_constant: Scalar
+    """τ₂, s."""
+    step: Scalar | float
+    """s."""
+
+    def decays(self) -> tuple[Scalar, Scalar]:
+        """Return which share of e a step leaves, and its mean over the step."""
+        acts, steps = self._steps()
+        left = jnp.where(acts, jnp.exp(-steps), 0.0)
+        return left, jnp.where(acts, _mean_decay(steps), 0.0)
+
+    def carried(self, time_constant: Scalar, decay: Scalar, mean: Scalar) -> tuple[Scalar, Scalar]:
+        """Return which share of e is in g after a step, and its mean over the step.
+
+        Parameters
+        ----------
+        time_constant, decay, mean
+            τ in s, the share of g that a step leaves, and its mean over the step.
+        """
+        acts, steps = self._steps()
+        own = self.step / time_constant
+        slower = jnp.where(steps < own, jnp.exp(-steps), decay)
+        both = slower * _mean_decay(jnp.abs(steps - own))
+        after, during = own * both, _mean_decay(steps) - both
+        lead = self.time_constant / (time_constant - jnp.minimum(self.time_constant, 0.0))
+        return jnp.where(acts, after, lead * decay), jnp.where(acts, during, lead * mean)
+
+    def _steps(self) -> tuple[Flag, Scalar]:
+        """Return whether it lags, and the step over τ₂ where it does."""
+        acts = self.time_constant > INSTANT
+        return acts, self.step / jnp.where(acts, self.time_constant, 1.0)
+
+
 class Lag(eqx.Module):
     """The exact first-order filter over one physics step, prepared once a rollout."""
 
@@ -34,9 +81,17 @@ class Lag(eqx.Module):
     steps: tuple[Scalar, ...] = ()
     """The step over both time constants; for a slope alone."""
     slope: LagSlope | None = None
+    second: SecondLag | None = None
+    constants: tuple[Scalar, ...] = ()
+    """Both time constants, s; for a second lag alone."""
 
     @staticmethod
-    def over(motor: Motor, step: Scalar | float, slope: LagSlope | None = None) -> Lag:
+    def over(
+        motor: Motor,
+        step: Scalar | float,
+        slope: LagSlope | None = None,
+        second: Scalar | None = None,
+    ) -> Lag:
         """Prepare the filter α = exp(-step/τ), and the mean of the decay over the step.
 
         Parameters
@@ -47,6 +102,8 @@ class Lag(eqx.Module):
             Physics step in s, or a part of it, which may be zero.
         slope
             Where the time constants change with the speed.
+        second
+            s, of a second lag before the rotor's own.
         """
         up, down = step / motor.time_constant_up, step / motor.time_constant_down
         return Lag(
@@ -56,19 +113,47 @@ class Lag(eqx.Module):
             mean_down=_mean_decay(down),
             steps=() if slope is None else (up, down),
             slope=slope,
+            second=None if second is None else SecondLag(second, step),
+            constants=() if second is None else (motor.time_constant_up, motor.time_constant_down),
         )
 
-    def advance(self, speed: Scalar, reference: Scalar) -> tuple[Scalar, Scalar]:
-        """Return the rotor speed after the step and its mean over the step, in rad/s."""
-        rising = reference > speed
+    def advance(
+        self, speed: Scalar, reference: Scalar, lagged: Scalar | None = None
+    ) -> tuple[Scalar, Scalar]:
+        """Return the rotor speed after the step and its mean over the step, in rad/s.
+
+        ``lagged``: the reference speed before the step as the second lag leaves it.
+        """
+        if self.second is None or lagged is None:
+            decay, mean = self._decays(speed, reference > speed)
+            gap = speed - reference
+            return reference + decay * gap, reference + mean * gap
+        behind = lagged - reference
+        rising = reference + self.second.decays()[1] * behind > speed
+        decay, mean = self._decays(speed, rising)
+        up, down = self.constants
+        constant = jnp.where(rising, up, down)
+        if self.slope is not None:
+            constant = constant * self.slope.stretch(speed)
+        after, during = self.second.carried(constant, decay, mean)
         gap = speed - reference
+        return reference + decay * gap + after * behind, reference + mean * gap + during * behind
+
+    def lag_reference(self, lagged: Scalar, reference: Scalar) -> Scalar:
+        """Return the reference speed after the step as the second lag leaves it, in rad/s."""
+        assert self.second is not None
+        return reference + self.second.decays()[0] * (lagged - reference)
+
+    def _decays(self, speed: Scalar, rising: Flag) -> tuple[Scalar, Scalar]:
+        """Return which share of a gap the step leaves, and its mean over the step."""
         if self.slope is not None:
             up, down = self.steps
             steps = jnp.where(rising, up, down) / self.slope.stretch(speed)
-            return reference + jnp.exp(-steps) * gap, reference + _mean_decay(steps) * gap
-        after = reference + jnp.where(rising, self.decay_up, self.decay_down) * gap
-        mean = reference + jnp.where(rising, self.mean_up, self.mean_down) * gap
-        return after, mean
+            return jnp.exp(-steps), _mean_decay(steps)
+        return (
+            jnp.where(rising, self.decay_up, self.decay_down),
+            jnp.where(rising, self.mean_up, self.mean_down),
+        )
 
 
 class SwitchedLag(eqx.Module):
@@ -81,25 +166,36 @@ class SwitchedLag(eqx.Module):
 
     @staticmethod
     def over(
-        motor: Motor, step: float, share: Scalar, slope: LagSlope | None = None
+        motor: Motor,
+        step: float,
+        share: Scalar,
+        slope: LagSlope | None = None,
+        second: Scalar | None = None,
     ) -> SwitchedLag:
         """Prepare both parts of a step of ``step`` s."""
         return SwitchedLag(
-            Lag.over(motor, step * share, slope),
-            Lag.over(motor, step * (1.0 - share), slope),
+            Lag.over(motor, step * share, slope, second),
+            Lag.over(motor, step * (1.0 - share), slope, second),
             share,
         )
 
-    def advance(self, speed: Scalar, before: Scalar, after: Scalar) -> tuple[Scalar, Scalar]:
+    def advance(
+        self, speed: Scalar, before: Scalar, after: Scalar, lagged: Scalar | None = None
+    ) -> tuple[Scalar, Scalar]:
         """Return the rotor speed after the step and its mean, in rad/s.
 
         ``before`` and ``after`` are the reference speeds of the two parts. Taking their mean for
         the whole step instead would smooth what the motor does, and a fit would make up for that
         with time constants a percent too short.
         """
-        middle, first = self.early.advance(speed, before)
-        end, second = self.late.advance(middle, after)
+        middle, first = self.early.advance(speed, before, lagged)
+        then = None if lagged is None else self.early.lag_reference(lagged, before)
+        end, second = self.late.advance(middle, after, then)
         return end, self.share * first + (1.0 - self.share) * second
+
+    def lag_reference(self, lagged: Scalar, before: Scalar, after: Scalar) -> Scalar:
+        """Return the reference speed after the step as the second lag leaves it, in rad/s."""
+        return self.late.lag_reference(self.early.lag_reference(lagged, before), after)
 
 
 def _mean_decay(steps: Scalar) -> Scalar:

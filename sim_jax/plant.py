@@ -168,25 +168,22 @@ class Plant(eqx.Module):
 
     def motors(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor, PerRotor]:
         """Return the rotor speeds after a step and those that act during it, in rad/s."""
-        if isinstance(self.lag, SwitchedLag) and state.reference_history is not None:
-            age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
-            before, after = switched(state.reference_history, step, age)
-            before, after = self._on_battery(before, step), self._on_battery(after, step)
-            moves = [
-                self.lag.advance(speed, old, new)
-                for speed, old, new in zip(state.rotor_speed, before, after, strict=True)
-            ]
-        else:
-            assert isinstance(self.lag, Lag)
-            moves = [
-                self.lag.advance(speed, reference)
-                for speed, reference in zip(
-                    state.rotor_speed, self._on_battery(state.reference_speed, step), strict=True
-                )
-            ]
+        asked = [self._on_battery(references, step) for references in self._asked(state, step)]
+        if state.lagged_speed is not None:
+            asked.append(self._on_battery(state.lagged_speed, step))
+        moves = [
+            self.lag.advance(*speeds) for speeds in zip(state.rotor_speed, *asked, strict=True)
+        ]
         speeds = tuple(end for end, _ in moves)
         mean = tuple(mean for _, mean in moves)
         return speeds, mean if self.schedule.integrator == "midpoint" else state.rotor_speed
+
+    def _asked(self, state: State, step: Int[Array, ""]) -> tuple[PerRotor | Array, ...]:
+        """Return the reference speeds of a step in rad/s: of both its parts where it has two."""
+        if state.reference_history is None:
+            return (state.reference_speed,)
+        age = self.vehicle.setup.actuator_latency * self.schedule.physics_rate
+        return switched(state.reference_history, step, age)
 
     def _on_battery(self, references: T, step: Int[Array, ""]) -> T:
         """Return reference speeds, rad/s, as the battery's voltage lets the motors reach them."""
@@ -228,6 +225,10 @@ class Plant(eqx.Module):
             history = push(state.reference_history, jnp.stack(state.reference_speed), step)
             state = replaced(state, reference_history=history)
         state = self.physics(state, step)
+        if state.lagged_speed is not None:
+            held = zip(state.lagged_speed, *self._asked(state, step), strict=True)
+            lagged = tuple(self.lag.lag_reference(*speeds) for speeds in held)
+            state = replaced(state, lagged_speed=lagged)
         if state.estimate_history is not None:
             seen = estimated(self.vehicle, self.controller, state.motion)
             history = push(state.estimate_history, packed(seen), step + 1)
@@ -280,8 +281,8 @@ class Plant(eqx.Module):
 
 def _flight(state: State) -> dict[str, PyTree[Array]]:
     """Return what stays as it is once a vehicle has crashed."""
-    names = ("motion", "rotor_speed", "integral", "gyro", "command", "reference_speed")
-    return {name: getattr(state, name) for name in names}
+    motors = ("rotor_speed", "command", "reference_speed", "lagged_speed")
+    return {name: getattr(state, name) for name in ("motion", "integral", "gyro", *motors)}
 
 
 def _frd(flu: Vec3) -> Vec3:

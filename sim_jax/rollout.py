@@ -26,6 +26,9 @@ from sim_jax.state import Start, State, first_state, hover_speed
 from sim_jax.trees import forgetful
 from sim_jax.vehicle import Vehicle
 
+SECOND_LAG = "time_constant_second"
+"""The effect of a second lag."""
+
 
 class Rollout(eqx.Module):
     """A simulated flight."""
@@ -41,11 +44,12 @@ class Rollout(eqx.Module):
 
 
 def _lag(vehicle: Vehicle, schedule: Schedule) -> Lag | SwitchedLag:
+    slope, second = _lag_slope(vehicle), vehicle.effects.get(SECOND_LAG)
     if schedule.longest_actuator_latency == 0:
-        return Lag.over(vehicle.motor, schedule.step, _lag_slope(vehicle))
+        return Lag.over(vehicle.motor, schedule.step, slope, second)
     age = vehicle.setup.actuator_latency * schedule.physics_rate
     part = age - jnp.floor(age)
-    return SwitchedLag.over(vehicle.motor, schedule.step, part, _lag_slope(vehicle))
+    return SwitchedLag.over(vehicle.motor, schedule.step, part, slope, second)
 
 
 def _lag_slope(vehicle: Vehicle) -> LagSlope | None:
@@ -121,6 +125,7 @@ def begun(
         shape,
         seen=estimated(vehicle, controller, start.motion),
         read=rate if senses is None else senses.reading(rate),
+        lags_twice=SECOND_LAG in vehicle.effects,
     )
 
 

@@ -50,6 +50,8 @@ class State(eqx.Module):
     command: PerRotor
     reference_speed: PerRotor
     """rad/s, what the command asks of the motors."""
+    lagged_speed: PerRotor | None
+    """rad/s, that as a second lag of the motors leaves it; None without one."""
     estimate_history: Float[Array, "past_estimates 10 *batch"] | None
     reference_history: Float[Array, "past_references rotors *batch"] | None
     crash_time: Scalar
@@ -84,11 +86,12 @@ def first_state(
     *,
     seen: Motion,
     read: Vec3,
+    lags_twice: bool = False,
 ) -> State:
     """Return the state at time 0, every leaf in the full shape of the batch.
 
     ``seen``: the start's motion as position and attitude control see it; ``read``: its body rate as
-    the gyro reads it, rad/s.
+    the gyro reads it, rad/s; ``lags_twice``: whether the motors have a second lag.
     """
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start, seen, read = jax.tree.map(
@@ -117,6 +120,7 @@ def first_state(
         gyro=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape).astype(dtype), memory),
         command=start.command,
         reference_speed=references,
+        lagged_speed=references if lags_twice else None,
         estimate_history=estimate_history,
         reference_history=reference_history,
         crash_time=jnp.full(shape, jnp.inf, dtype),

@@ -6,21 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from sim_jax.environment import Environment
-from sim_jax.motor import Lag, LagSlope
+from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.rigid_body import Motion, angular_acceleration
+from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import hover_speed
 from sim_jax.terms.air import Air
 from sim_jax.terms.rotor import lifting
 from sim_jax.terms.total import total_wrench, wrench_of_each_term
-from tests.sim_jax.support import quaternion, vec, vehicle
+from tests.sim_jax.support import controller, moving_start, quaternion, vec, vehicle, wobble
 from tuner.vehicle import REGISTRY
 
 CRAFT = vehicle()
 EFFECTS = [row for row in REGISTRY.values() if row.is_effect and row.scope == "vehicle"]
-IN_WRENCH = [row for row in EFFECTS if row.name not in ("battery_exponent", "time_constant_slope")]
+IN_MOTORS = ("battery_exponent", "time_constant_slope", "time_constant_second")
+IN_WRENCH = [row for row in EFFECTS if row.name not in IN_MOTORS]
 SPEEDS = tuple(jnp.asarray(speed) for speed in (590.0, 610.0, 600.0, 630.0))
 ACCELERATIONS = tuple(jnp.asarray(change) for change in (40.0, -20.0, 10.0, 90.0))
 MOVING = Motion(
@@ -181,3 +184,57 @@ def test_terms_add_up_with_gains():
     whole = total_wrench(craft, MOVING, SPEEDS, air).moment.stacked()
     each = wrench_of_each_term(craft, MOVING, SPEEDS, air).values()
     np.testing.assert_allclose(sum(one.moment.stacked() for one in each), whole, rtol=1e-12)
+
+
+SECOND = 0.006
+ON_ITS_WAY = (jnp.asarray(610.0), jnp.asarray(620.0), jnp.asarray(590.0), jnp.asarray(585.0))
+"""Speed, reference before and after a command arrives, reference as lagged, rad/s."""
+
+
+def after_two_lags(second, *, craft=CRAFT, share=0.4):
+    """Return the rotor speed after a step of 2.5 ms, its mean, and the lagged reference."""
+    lag = SwitchedLag.over(craft.motor, 0.0025, jnp.asarray(share), None, jnp.asarray(second))
+    speed, before, after, lagged = ON_ITS_WAY
+    return jnp.stack(
+        [*lag.advance(speed, before, after, lagged), lag.lag_reference(lagged, before, after)]
+    )
+
+
+@pytest.mark.parametrize("second", [1e-4, SECOND, float(CRAFT.motor.time_constant_down), 0.05])
+def test_two_lags_in_series_are_those_of_the_differential_equations(second):
+    constant, (speed, before, after, lagged) = float(CRAFT.motor.time_constant_down), ON_ITS_WAY
+    alike = replace(CRAFT, motor=replace(CRAFT.motor, time_constant_up=jnp.asarray(constant)))
+
+    def slopes(_, state, reference):
+        turning, behind, _ = state
+        return [(behind - turning) / constant, (reference - behind) / second, turning]
+
+    state = [float(speed), float(lagged), 0.0]
+    for reference, length in ((float(before), 0.001), (float(after), 0.0015)):
+        state = solve_ivp(
+            slopes, (0.0, length), state, args=(reference,), rtol=1e-10, atol=1e-10, method="LSODA"
+        ).y[:, -1]
+    expected = [state[0], state[2] / 0.0025, state[1]]
+    np.testing.assert_allclose(after_two_lags(second, craft=alike), expected, rtol=1e-8)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+@pytest.mark.parametrize("second", [-0.002, 0.0, 5e-4, SECOND, 0.025])
+def test_a_second_lags_derivatives_agree_with_differences_also_where_it_vanishes(second, share):
+    slope = jax.jacfwd(lambda value: after_two_lags(value, share=share))(jnp.asarray(second))
+    width = 1e-7 if second else -1e-7  # below zero it leads
+    there, here = (after_two_lags(second + way * width, share=share) for way in (1, 0))
+    np.testing.assert_allclose(slope, (there - here) / width, rtol=2e-3, atol=1e-3)
+
+
+def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_it():
+    def flown(**effects):
+        craft = with_effects(**effects)
+        schedule = Schedule(log_rate=100, longest_actuator_latency=0.01)
+        start = moving_start(craft)
+        log = rollout(craft, controller(), schedule, wobble(craft, 30), start, samples=30).log
+        return np.asarray(jnp.stack(log.rotor_speed))
+
+    base = flown()
+    np.testing.assert_array_equal(flown(time_constant_second=0.0), base)
+    assert np.abs(flown(time_constant_second=SECOND) - base).max() > 1.0

@@ -147,7 +147,7 @@ class Observer(eqx.Module):
         """Return a state moved by a change of its n numbers; its attitude stays a rotation."""
         leaves, structure = jax.tree.flatten(_parts(state))
         moved = [leaf + row for leaf, row in zip(leaves, change[: len(leaves)], strict=True)]
-        motion, rotor_speed, integral, gyro = jax.tree.unflatten(structure, moved)
+        motion, rotor_speed, integral, gyro, lagged = jax.tree.unflatten(structure, moved)
         motion = Motion(
             motion.position, motion.velocity, motion.attitude.normalized(), motion.body_rate
         )
@@ -164,6 +164,7 @@ class Observer(eqx.Module):
             rotor_speed=rotor_speed,
             integral=integral,
             gyro=gyro,
+            lagged_speed=lagged,
             reference_history=line,
         )
 
@@ -245,9 +246,12 @@ class Observer(eqx.Module):
         return rows
 
 
-def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory]:
-    """Return what is corrected of a state: 32 numbers with both gyro filters."""
-    return state.motion, state.rotor_speed, state.integral, state.gyro
+def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory, Any]:
+    """Return what is corrected of a state: 32 numbers with both gyro filters.
+
+    And four with a second lag of the motors.
+    """
+    return state.motion, state.rotor_speed, state.integral, state.gyro, state.lagged_speed
 
 
 def commands_in_flight(state: State, count: int) -> int:
@@ -261,7 +265,7 @@ def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
     def filled(tree: Any, sd: float) -> Any:
         return jax.tree.map(lambda _: sd, tree)
 
-    motion, rotor_speed, integral, gyro = _parts(state)
+    motion, rotor_speed, integral, gyro, lagged = _parts(state)
     errors = (
         Motion(
             filled(motion.position, 1e-3),
@@ -277,5 +281,6 @@ def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
             filled(gyro.rate, 0.03),
             filled(gyro.acceleration, 0.3),
         ),
+        filled(lagged, 3.0),
     )
     return np.asarray([*jax.tree.leaves(errors), *[3.0] * (in_flight * len(rotor_speed))])

@@ -29,7 +29,7 @@ from tuner.disturbances.recorded import (
 )
 from tuner.disturbances.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
-from tuner.objective.information import FisherInformation, information_from_jacobian
+from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
 from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.objective.tunable import tunable_of
@@ -46,8 +46,9 @@ LEARNT_FROM = 18.0
 """s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
 SEGMENTS = 8
 """That are filtered side by side while strengths are differentiated by."""
-NUMBERS = 57
-"""Of a state and its disturbances that samples correct, with four commands on their way."""
+NUMBERS = 61
+"""Of a state and its disturbances that samples correct, with four commands on their way and those
+that a second lag holds."""
 NOISIER = 1.05
 """Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
 
@@ -288,7 +289,12 @@ class Predictor:
         moved = np.flatnonzero(~hidden(objective.space.names))
         offsets = np.arange(len(point.offsets)) + len(objective.space)
         own = Point(point.coefficients, self.feed.offsets)
-        jacobian = self.jacobian(objective, own, [*moved, *offsets])
+        jacobian = with_secants(
+            self.jacobian(objective, own, [*moved, *offsets]),
+            objective.space,
+            own,
+            lambda there: dict[str, Any](self.jacobian(objective, there, []).residuals),
+        )
         changed = {
             name: dict[str, Any](self._stepped(other).jacobian(other, own, []).residuals)
             for name, other in otherwise.items()

@@ -291,6 +291,15 @@ def _thrust_exponent(numbers: Numbers) -> str:
     )
 
 
+def _motor_lag(numbers: Numbers) -> str:
+    value, error = numbers["time_constant_second"], numbers["time_constant_second_error"]
+    before = "a second lag" if value > 0.0 else "a lead"
+    return (
+        f"Rotors follow as if {before} of {1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms stood "
+        "before their own."
+    )
+
+
 def _rate_gain(numbers: Numbers) -> str:
     axes = {"rate_gain_roll_pitch": "roll and pitch react", "rate_gain_yaw": "yaw reacts"}
     parts = [
@@ -328,6 +337,10 @@ _SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
     "thrust_exponent": (
         _thrust_exponent,
         "A simulator without such a term has the right thrust at the hover alone.",
+    ),
+    "motor_lag": (
+        _motor_lag,
+        "Look at what smooths commands: speed controllers, IMU_GYRO_CUTOFF, a bridge.",
     ),
     "rate_gain": (
         _rate_gain,

@@ -7,20 +7,23 @@ concerns the coefficients alone and can be added up over any part of the data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tuner.core.numerics import huber_weights
 from tuner.objective.criterion import OFFSET_SD, Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
+from tuner.vehicle import COEFFICIENTS
 
 Array = NDArray[np.float64]
 
+NEAR = 1e-3
+"""Steps from its neutral value within which a coefficient is at it."""
 BLOCK = 2.0
 """Time beyond which residuals are taken to be independent, s."""
 
@@ -169,6 +172,54 @@ class FisherInformation:
 def _summed(parts: Sequence[Array | None]) -> Array | None:
     known = [part for part in parts if part is not None]
     return np.asarray(np.sum(known, axis=0)) if len(known) == len(parts) else None
+
+
+def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> list[float]:
+    """Return a search vector with new coefficients where a search of them begins.
+
+    A second lag takes its time from the actuator's latency.
+    """
+    values = space.numbers(np.asarray(vector))
+    moved = {name: at for name in names if (at := COEFFICIENTS[name].begin) is not None}
+    if not moved:
+        return np.asarray(vector).tolist()
+    if "time_constant_second" in moved and "actuator_latency" in values:
+        left = values["actuator_latency"] - moved["time_constant_second"]
+        moved["actuator_latency"] = max(left, 0.25 * values["actuator_latency"])
+    there = space.vector_of({**values, **moved})
+    start = np.asarray(vector)
+    return [there[i] if name in moved else start[i] for i, name in enumerate(space.names)]
+
+
+def with_secants(
+    jacobian: Jacobian,
+    space: Space,
+    point: Point,
+    residuals: Callable[[Point], Mapping[str, Array]],
+) -> Jacobian:
+    """Return a Jacobian whose columns of some coefficients at neutral values are secants.
+
+    Of those that there do, to first order, what another does: their rows say where they begin.
+    """
+    values = space.numbers(np.asarray(point.coefficients))
+    for index, name in enumerate(space.names):
+        row = COEFFICIENTS.get(name)
+        if row is None or row.begin is None or row.neutral is None:
+            continue
+        if abs(values[name] - row.neutral) > NEAR * row.step:
+            continue
+        there = np.asarray(begun(space, point.coefficients, (name,)))
+        change = there - np.asarray(point.coefficients)
+        width, change[index] = change[index], 0.0
+        beside = np.flatnonzero(change)
+        columns = dict(jacobian.columns)
+        for channel, moved in residuals(Point(there, point.offsets)).items():
+            column = np.array(columns[channel])
+            others = np.tensordot(change[beside], column[beside], axes=1)
+            column[index] = (moved - jacobian.residuals[channel] - others) / width
+            columns[channel] = column
+        jacobian = replace(jacobian, columns=columns)
+    return jacobian
 
 
 def information_at(

@@ -47,6 +47,7 @@ OF_MOTORS = (
     "time_constant_up",
     "time_constant_down",
     "time_constant_slope",
+    "time_constant_second",
     "battery_exponent",
 )
 """Coefficients between a motor command and a rotor's speed."""

@@ -18,7 +18,12 @@ from numpy.typing import NDArray
 from tuner.core.numerics import scaled_solve
 from tuner.objective.criterion import Criterion, Jacobian, Point, units_of
 from tuner.objective.flight_batches import portion, portions
-from tuner.objective.information import BLOCK, FisherInformation, information_from_jacobian
+from tuner.objective.information import (
+    BLOCK,
+    FisherInformation,
+    information_from_jacobian,
+    with_secants,
+)
 from tuner.objective.normal import Objective
 from tuner.objective.space import Space
 from tuner.uncertainty.overdispersion import Stretches
@@ -178,6 +183,8 @@ def linear_at(
 ) -> Linear:
     """Return the linear approximation of a fit, from one Jacobian by all of its parameters.
 
+    Of what at its neutral value does what another does, secants stand for derivatives.
+
     Flights whose Jacobian would not fit half of the objective's memory take turns: its columns are
     put in another order, which copies them.
 
@@ -193,7 +200,12 @@ def linear_at(
     parts, loss = [], 0.0
     for flights in portions(replace(objective, memory=objective.memory // 2), point, criterion):
         batch = portion(objective, point, criterion, flights)
-        jacobian = batch[0].jacobian(*batch[1:])
+        jacobian = with_secants(
+            batch[0].jacobian(*batch[1:]),
+            batch[0].space,
+            batch[1],
+            lambda moved, batch=batch: batch[0].residuals(moved, batch[2]),
+        )
         fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
         parts.append(
             information_from_jacobian(

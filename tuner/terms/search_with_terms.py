@@ -24,6 +24,7 @@ from tuner.search.problem import Job
 from tuner.terms.candidates import candidate_groups, groups_around, groups_named, start_of
 from tuner.terms.selection import Selection
 from tuner.terms.selection_state import Selected
+from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.selection_table import Groups
 
 MARKERS = ("marker_offset", "marker_tilt")
@@ -57,6 +58,7 @@ def with_first_terms(job: Job) -> Job:
     if "battery_exponent" in names:
         require_voltage(job.fitted)
     begin = dict(zip(("marker_tilt_x", "marker_tilt_y"), tilt.mean(axis=0), strict=True))
+    begin |= {name: row.begin for name in names if (row := COEFFICIENTS[name]).begin is not None}
     values = {name: float(begin.get(name, value)) for name, value in start_of(names).items()}
     space = extended(job.space, names, settings, values)
     windows = None if job.windows is None else replace(job.windows, space=space)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tuner.core.phrases import listed
 from tuner.objective.criterion import Point, units_of
+from tuner.objective.information import begun
 from tuner.objective.normal import Objective, with_conditions
 from tuner.search.estimation import OnProgress, free_offsets
 from tuner.search.findings import findings_at
@@ -222,6 +223,8 @@ class Selection:
         start, names = np.array(point.coefficients), objective.space.names
         vector = [state.vector.get(name, start[i]) for i, name in enumerate(names)]
         new = [group for group in groups if group not in state.added]
+        new_ones = [name for group in new for name in groups[group] if name in wanted]
+        vector = begun(objective.space, vector, new_ones)
         from_here = replace(
             state.fitted,
             objective=objective,
@@ -240,6 +243,7 @@ class Selection:
 
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
+            start = np.asarray(begun(objective.space, start, wanted))
             fitted = searched_again(
                 self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
             )

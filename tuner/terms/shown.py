@@ -7,7 +7,7 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.vehicle import COEFFICIENTS, term_groups
 
-SHOWN = ("thrust_exponent", "rate_gain", "autopilot_tilt", "gyro_scale")
+SHOWN = ("thrust_exponent", "motor_lag", "rate_gain", "autopilot_tilt", "gyro_scale")
 """Groups of terms of which is said what they mean."""
 
 

@@ -326,6 +326,7 @@ def _driven(
     if not commands:
         return {}
     late = float(model.vehicle.setup.actuator_latency)
+    late += float(model.vehicle.effects.get("time_constant_second", 0.0))  # to first order
     values = np.concatenate([series.values for series in commands.values()])
     steps = [np.diff(series.time, prepend=series.time[0]) for series in commands.values()]
     found = _motor_answers(model.vehicle.motor, values, np.concatenate(steps)[:, None])

@@ -99,6 +99,9 @@ class Coefficient:
         Of an effect: whether it describes as a whole what other terms do one by one.
     expected
         Of an effect: whether every vehicle has it, if often in a size that flights do not tell.
+    begin
+        Where a search begins that adds it: for one that at its neutral value does what another
+        does. From there to the neutral value reaches the secant by which it is judged.
     reads
         Of an effect: the recorded signal that its law reads beside the simulated state, if any.
     exported_as
@@ -133,6 +136,7 @@ class Coefficient:
     group: str = ""
     stands_in: bool = False
     expected: bool = False
+    begin: float | None = None
     reads: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None

@@ -31,6 +31,7 @@ def _effect(
     informed_by: str | None = None,
     stands_in: bool = False,
     expected: bool = False,
+    begin: float | None = None,
     reads: str = "",
     neutral: float = 0.0,
 ) -> Coefficient:
@@ -58,6 +59,7 @@ def _effect(
         group=group,
         stands_in=stands_in,
         expected=expected,
+        begin=begin,
         reads=reads,
         exported_as=held,
         informed_by=informed_by,
@@ -238,6 +240,17 @@ EFFECT_ROWS = (
         limit=3.0,
         prior_sd=0.5,
         step=0.2,
+    ),
+    _effect(
+        "time_constant_second",
+        "s",
+        "second lag of the motors, between a command's speed and the rotor's own lag",
+        "motor current, and speed controllers that smooth their command",
+        group="motor_lag",
+        limit=0.03,
+        prior_sd=0.003,
+        step=0.002,
+        begin=0.004,  # at zero it is an actuator latency
     ),
     _effect(
         "flapping_moment_coefficient",

@@ -28,9 +28,15 @@ TICK = jnp.asarray(25)  # beyond the delay line's ten places
 
 @pytest.fixture(scope="module")
 def begin():
-    """An observer of a vehicle whose commands take 1.4 steps, and its state."""
+    return begun_with()
+
+
+def begun_with(**effects):
+    """Return an observer of a vehicle whose commands take 1.4 steps, and its state."""
     craft = eqx.tree_at(
-        lambda v: v.setup.actuator_latency, vehicle(), jnp.asarray(1.4 * SCHEDULE.step)
+        lambda v: (v.setup.actuator_latency, v.effects),
+        vehicle(),
+        (jnp.asarray(1.4 * SCHEDULE.step), {n: jnp.asarray(value) for n, value in effects.items()}),
     )
     start = jax.tree.map(lambda leaf: jnp.asarray(leaf, float)[None], moving_start(craft))
     plant, state = begun(craft, controller(), SCHEDULE, wobble(craft, 200), start)
@@ -38,8 +44,9 @@ def begin():
 
 
 @pytest.mark.parametrize("in_flight", [0, 2])
-def test_numbers_move_by_what_they_are_corrected_by(begin, in_flight):
-    observer, state = begin
+@pytest.mark.parametrize("effects", [{}, {"time_constant_second": 0.006}], ids=["one", "two"])
+def test_numbers_move_by_what_they_are_corrected_by(effects, in_flight):
+    observer, state = begun_with(**effects)
     before = observer.numbers(state, TICK, in_flight)
     assert commands_in_flight(state, len(before)) == in_flight
     assert len(first_errors(state, in_flight)) == len(before)

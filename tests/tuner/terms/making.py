@@ -53,15 +53,17 @@ def unfitted_with(
     around: Mapping[str, Sequence[float]] | None = None,
     effects: Mapping[str, float] | None = None,
     setpoints: bool = False,
+    base: tuple[str, ...] = BASE,
 ) -> tuple[Job, Fitted]:
     """Return a job whose flights were flown with some drag of the body, and its start as a fit.
 
     Its recordings show a hover that is tilted, in rad about x and y; ``around`` is what surrounded
-    each of them, and ``effects`` what flew instead of the drag. With ``setpoints`` those of rate
-    and thrust are fed in, as control without these effects asks for them.
+    each of them, and ``effects`` what flew instead of the drag; ``base`` is free from the
+    beginning. With ``setpoints`` those of rate and thrust are fed in, as control without these
+    effects asks for them.
     """
     there = {"fuselage_drag": drag} if effects is None else dict(effects)
-    truth = problem((*BASE, *there))
+    truth = problem((*base, *there))
     if setpoints:
         truth = fed_with_setpoints(truth)
     vector = truth.space.vector_of(
@@ -74,7 +76,7 @@ def unfitted_with(
     offsets = jnp.asarray(np.vstack([np.zeros((len(truth.of_flight), len(FLIGHTS))), *rows]))
     flown = with_data(flown, Point(point.coefficients, offsets), noise=np.random.default_rng(seed))
     truth = replace(truth, segments=flown.segments)
-    file = JobFile(free=BASE)
+    file = JobFile(free=base)
     space = space_of(vehicle_file(), controller_file(), file)
     objective = replace(truth, space=space)
     recordings = tuple(

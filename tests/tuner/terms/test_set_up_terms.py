@@ -1,9 +1,9 @@
-"""Terms of autopilot and thrust law: found where they flew, with intervals that hold, else not."""
+"""Terms of the set-up and the motors: found where they flew, with intervals that hold, else not."""
 
 import pytest
 
 from tests.tuner.terms.making import BASE, job_with
-from tests.tuner.uncertainty.making import FLIGHTS
+from tests.tuner.uncertainty.making import FLIGHTS, problem
 from tuner.terms import search_with_terms
 from tuner.terms.search_with_terms import with_terms_selected
 from tuner.uncertainty.examination import examine
@@ -24,9 +24,9 @@ GROUPS = {
 }  # fmt: skip
 
 
-def selected(monkeypatch, **given):
+def selected(monkeypatch, groups=GROUPS, **given):
     """Return the selection among these terms alone, which makes it cheap."""
-    monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: GROUPS)
+    monkeypatch.setattr(search_with_terms, "candidate_groups", lambda *_: groups)
     monkeypatch.setattr(search_with_terms, "groups_around", lambda *_, **__: {})
     fit = job_with(0.0, seed=0, **given)
     return with_terms_selected(*fit, lambda *_: None, lambda _: None)
@@ -39,7 +39,7 @@ def test_they_are_found_where_they_flew_and_their_intervals_hold_the_truth(monke
     result = selected(monkeypatch, effects=TRUTH, setpoints=setpoints)
     assert {row.group for row in result.rows if row.kept} == set(GROUPS)
     known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
-    base = result.job.space.values(result.job.space.initial)
+    base = result.job.space.numbers(result.job.space.initial)
     for name in (*BASE, *TRUTH):
         low, high = known[name].ci95
         assert low < TRUTH.get(name, float(base[name])) < high, name
@@ -52,3 +52,18 @@ def test_none_is_found_where_none_flew(monkeypatch, setpoints):
     result = selected(monkeypatch, effects={}, setpoints=setpoints)
     assert len(result.rows) == len(GROUPS)
     assert not any(row.kept for row in result.rows)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("second", [0.0, 0.012])
+def test_a_second_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, second):
+    base = ("time_constant_up", "time_constant_down", "actuator_latency", "inertia_xx")
+    group = {"motor_lag": ("time_constant_second",)}
+    effects = {"time_constant_second": second} if second else {}
+    result = selected(monkeypatch, group, effects=effects, base=base)
+    assert [row.kept for row in result.rows] == [second > 0.0]
+    known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
+    space = problem(base).space
+    for name, true in (space.numbers(space.initial) | effects).items():
+        low, high = known[name].ci95
+        assert low < true < high, name
