@@ -174,7 +174,7 @@ def _summed(parts: Sequence[Array | None]) -> Array | None:
     return np.asarray(np.sum(known, axis=0)) if len(known) == len(parts) else None
 
 
-def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> list[float]:
+def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
     """Return a search vector with new coefficients where a search of them begins.
 
     A second lag takes its time from the actuator's latency.
@@ -182,13 +182,13 @@ def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> list[float
     values = space.numbers(np.asarray(vector))
     moved = {name: at for name in names if (at := COEFFICIENTS[name].begin) is not None}
     if not moved:
-        return np.asarray(vector).tolist()
+        return np.asarray(vector)
     if "time_constant_second" in moved and "actuator_latency" in values:
         left = values["actuator_latency"] - moved["time_constant_second"]
         moved["actuator_latency"] = max(left, 0.25 * values["actuator_latency"])
     there = space.vector_of({**values, **moved})
     start = np.asarray(vector)
-    return [there[i] if name in moved else start[i] for i, name in enumerate(space.names)]
+    return np.where([name in moved for name in space.names], there, start)
 
 
 def with_secants(
@@ -208,7 +208,7 @@ def with_secants(
             continue
         if abs(values[name] - row.neutral) > NEAR * row.step:
             continue
-        there = np.asarray(begun(space, point.coefficients, (name,)))
+        there = begun(space, point.coefficients, (name,))
         change = there - np.asarray(point.coefficients)
         width, change[index] = change[index], 0.0
         beside = np.flatnonzero(change)

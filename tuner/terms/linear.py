@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -204,7 +205,7 @@ def linear_at(
             batch[0].jacobian(*batch[1:]),
             batch[0].space,
             batch[1],
-            lambda moved, batch=batch: batch[0].residuals(moved, batch[2]),
+            partial(batch[0].residuals, criterion=batch[2]),
         )
         fitted = offsets_fitted[: len(offsets_fitted) - len(around), flights]
         parts.append(

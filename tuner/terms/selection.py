@@ -224,11 +224,13 @@ class Selection:
         vector = [state.vector.get(name, start[i]) for i, name in enumerate(names)]
         new = [group for group in groups if group not in state.added]
         new_ones = [name for group in new for name in groups[group] if name in wanted]
-        vector = begun(objective.space, vector, new_ones)
         from_here = replace(
             state.fitted,
             objective=objective,
-            point=Point(np.asarray(vector), offsets_of(state.fitted, objective, gone=idle)),
+            point=Point(
+                begun(objective.space, vector, new_ones),
+                offsets_of(state.fitted, objective, gone=idle),
+            ),
         )
         offsets = free_offsets(self.job)
         moves = np.array([name not in idle for name in objective.of_flight[len(offsets) :]], bool)
@@ -243,7 +245,7 @@ class Selection:
 
         if anew:
             start[: len(self.job.space)] = self.job.space.initial
-            start = np.asarray(begun(objective.space, start, wanted))
+            start = begun(objective.space, start, wanted)
             fitted = searched_again(
                 self.job, from_here, start, free=free_ones, title=title, on_progress=on_progress
             )
