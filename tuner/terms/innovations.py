@@ -32,7 +32,7 @@ from tuner.terms.held_out_score import vector_after
 from tuner.terms.linear import Columns, Linear, linear_of
 from tuner.terms.score import EARNING, surviving
 from tuner.terms.selection_state import Selected
-from tuner.vehicle import conditions
+from tuner.vehicle import COEFFICIENTS, conditions
 from tuner.vehicle.selection_table import Groups, SelectionCode, SelectionRow
 
 Array = NDArray[np.float64]
@@ -158,13 +158,18 @@ class Innovations:
         return replace(self.selected, job=job, fitted=fitted, rows=tuple(rows))
 
     def _tried(self) -> dict[str, tuple[str, ...]]:
-        """Return the groups that innovations can judge: all of whose columns they see."""
+        """Return the groups that innovations can judge: all of whose columns they see.
+
+        Not one that at its neutral value does what another coefficient does: their derivatives
+        there do not tell it.
+        """
         return {
             row.group: row.names
             for row in self.selected.rows
             if row.reason in (EARNING if row.kept else REFUSED)
             and not hidden(row.names).any()
             and not set(row.names) & set(conditions())
+            and all(COEFFICIENTS[name].begin is None for name in row.names)
         }
 
     def _is_in(self, group: str) -> bool:
