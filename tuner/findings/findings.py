@@ -388,8 +388,8 @@ class Code(Worded):
     FINER_THAN_STEPS = (
         "finer_than_steps",  # seconds
         (
-            "Simulators' steps shift them {milliseconds:g} ms: that lies between simulators of "
-            "other steps, and the 95 % intervals leave it out."
+            "Simulators' steps shift them {milliseconds:g} ms: two of other steps differ by that, "
+            "and the 95 % intervals leave it out."
         ),
         "Take them as known to ±{twice:g} ms: twice as much, in any simulator.",
     )

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 
 NEAR = 1e-3
 """Steps from its neutral value within which a coefficient is at it."""
+LEFT = 0.25
+"""Share that is left at least of what a new coefficient acts as, where a search of it begins."""
 BLOCK = 2.0
 """Time beyond which residuals are taken to be independent, s."""
 
@@ -177,15 +179,16 @@ def _summed(parts: Sequence[Array | None]) -> Array | None:
 def begun(space: Space, vector: ArrayLike, names: Collection[str]) -> Array:
     """Return a search vector with new coefficients where a search of them begins.
 
-    A second lag takes its time from the actuator's latency.
+    What they act as at their neutral values begins lower by as much, at least at a quarter.
     """
     values = space.numbers(np.asarray(vector))
     moved = {name: at for name in names if (at := COEFFICIENTS[name].begin) is not None}
     if not moved:
         return np.asarray(vector)
-    if "time_constant_second" in moved and "actuator_latency" in values:
-        left = values["actuator_latency"] - moved["time_constant_second"]
-        moved["actuator_latency"] = max(left, 0.25 * values["actuator_latency"])
+    for name, at in tuple(moved.items()):
+        other = COEFFICIENTS[name].acts_as
+        if other in values:
+            moved[other] = max(values[other] - at, LEFT * values[other])
     there = space.vector_of({**values, **moved})
     start = np.asarray(vector)
     return np.where([name in moved for name in space.names], there, start)

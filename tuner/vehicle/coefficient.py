@@ -102,6 +102,8 @@ class Coefficient:
     begin
         Where a search begins that adds it: for one that at its neutral value does what another
         does. From there to the neutral value reaches the secant by which it is judged.
+    acts_as
+        That other, which begins lower by as much.
     reads
         Of an effect: the recorded signal that its law reads beside the simulated state, if any.
     exported_as
@@ -137,6 +139,7 @@ class Coefficient:
     stands_in: bool = False
     expected: bool = False
     begin: float | None = None
+    acts_as: str = ""
     reads: str = ""
     exported_as: Mapping[str, Written | NotCarried] = field(default_factory=dict)
     informed_by: str | None = None

@@ -32,6 +32,7 @@ def _effect(
     stands_in: bool = False,
     expected: bool = False,
     begin: float | None = None,
+    acts_as: str = "",
     reads: str = "",
     neutral: float = 0.0,
 ) -> Coefficient:
@@ -60,6 +61,7 @@ def _effect(
         stands_in=stands_in,
         expected=expected,
         begin=begin,
+        acts_as=acts_as,
         reads=reads,
         exported_as=held,
         informed_by=informed_by,
@@ -250,7 +252,8 @@ EFFECT_ROWS = (
         limit=0.03,
         prior_sd=0.003,
         step=0.002,
-        begin=0.004,  # at zero it is an actuator latency
+        begin=0.004,
+        acts_as="actuator_latency",
     ),
     _effect(
         "flapping_moment_coefficient",

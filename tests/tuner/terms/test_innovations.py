@@ -206,8 +206,15 @@ def test_others_are_judged_as_if_what_stood_in_were_not_there(chosen) -> None:
         [row("marker_offset", SelectionCode.NOT_SIGNIFICANT)],
         [row("fuselage_drag", SelectionCode.NO_INFORMATION)],
         [row("fuselage_drag", SelectionCode.ASKED_FOR, kept=True)],
+        [row("motor_lag", SelectionCode.IMMATERIAL)],
     ],
-    ids=["stands in for others", "is hidden by set-points", "nothing tells it", "asked for"],
+    ids=[
+        "stands in for others",
+        "is hidden by set-points",
+        "nothing tells it",
+        "asked for",
+        "acts as another where it is neutral",
+    ],
 )
 def test_of_some_terms_innovations_do_not_judge(chosen, rows) -> None:
     assert chosen(seen(rows, {name: 0.5 for name in rows[0].names[:1] if not rows[0].kept})) is None

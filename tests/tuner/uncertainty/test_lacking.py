@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -231,6 +232,23 @@ def test_gains_that_were_found_fly_the_other_model():
     assert float(rate.i.z) == pytest.approx(0.7 * float(before.i.z))
     assert float(rate.d.y) == pytest.approx(float(before.d.y) - 2e-3 * float(before.p.y))
     assert (rate.p.y, rate.p.z, rate.i.x) == (before.p.y, before.p.z, before.i.x)
+
+
+@pytest.mark.parametrize(("late", "said"), [(1e-3, False), (-2e-3, True)])
+def test_lateness_within_a_period_of_the_loop_is_not_said(late, said):
+    """Stamps do not tell when in a period a sample was taken."""
+    lack = Lack((), None, (Answer("roll", "late", late, 1e-4),))
+    assert bool(lack_found(lack, SimpleNamespace(estimates={}))) is said
+
+
+def test_commands_that_were_recorded_between_two_ticks_are_those_that_hold():
+    measured, flights = flown(problem({}), 0, loop=True)
+    for series in (flight.series for flight in flights):
+        command = series["command"]
+        series["command"] = Series(command.time + 0.5 / RATE, command.values)
+    objective = problem({})
+    objective = replace(objective, segments=replace(objective.segments, measured=measured))
+    assert lack_of(making.fitted_of(objective, making.truth(objective)), flights) is None
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.06])
