@@ -16,7 +16,9 @@ RATES = {"default.ulg": (50.0, 1), "sysid.ulg": (400.0, 25)}
 def write_logs(folder: Path) -> None:
     """Write the logs of one flight into a folder: no pose, no rotor speeds."""
     folder.mkdir(parents=True, exist_ok=True)
-    (flown,) = tuner.simulate("lemniscate", radius=1.0, omega=1.0, speed_scale=4.0, duration=14.0)
+    (flown,) = tuner.simulate(
+        "lemniscate", radius=1.0, omega=1.0, speed_scale=4.0, duration=14.0, rate=400.0
+    )
     generator = np.random.default_rng(3)
     for name, (rate, profile) in RATES.items():
         time = np.arange(0.0, flown.time[-1], 1.0 / rate)
