@@ -23,7 +23,7 @@ from tuner.vehicle import ControllerFile, VehicleFile
 if TYPE_CHECKING:
     from sim_jax.precision import Precision
     from tuner.client.client import Client
-    from tuner.evaluate.comparison_table import Table
+    from tuner.evaluate.records import Table
     from tuner.evaluate.simulate import Simulation
     from tuner.exporters.export import Exported
     from tuner.job.sensitivity import SensitivityResult
@@ -118,7 +118,7 @@ def compare(
         The input cannot be used.
     """
     configure()
-    from tuner.evaluate.compare import compare as compare_vehicles  # noqa: PLC0415 (jax)
+    from tuner.evaluate.comparison import compare as compare_vehicles  # noqa: PLC0415 (jax)
 
     given = RecordingOptions.of(flights, **options)
     labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
@@ -174,7 +174,7 @@ def sensitivity(
         The input cannot be used; one line says what to do.
     """
     configure()
-    from tuner.job.folder import folder_for  # noqa: PLC0415
+    from tuner.core.disk import folder_for  # noqa: PLC0415
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
 
     given = ExaminationOptions.of(flights, **options)

@@ -105,7 +105,7 @@ def compare(
     from tuner.core.runtime import configure
 
     configure()
-    from tuner.evaluate.compare import compare as compare_vehicles
+    from tuner.evaluate.comparison import compare as compare_vehicles
     from tuner.report.paper import check_figure, comparison_figure, write_figure
 
     written = list(out or ())
@@ -253,8 +253,8 @@ def sensitivity(
     from tuner.core.runtime import configure
 
     configure()
+    from tuner.core.disk import folder_for
     from tuner.engine import engine_for
-    from tuner.job.folder import folder_for
     from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
 
     request = SensitivityRequest(

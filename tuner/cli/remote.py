@@ -102,7 +102,7 @@ def submit(
     from tuner.cli.progress import listening
     from tuner.cli.results import print_run
     from tuner.client.client import ended_well
-    from tuner.job.folder import folder_for
+    from tuner.core.disk import folder_for
 
     with client_of(server, token) as client:
         folder = folder_for(out) if wait else None

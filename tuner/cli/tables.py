@@ -15,8 +15,8 @@ from tuner.report.section import Cell, Table
 
 if TYPE_CHECKING:
     from tuner.config import Settings
-    from tuner.evaluate.comparison_table import Row
-    from tuner.evaluate.comparison_table import Table as Comparison
+    from tuner.evaluate.records import Row
+    from tuner.evaluate.records import Table as Comparison
     from tuner.evaluate.write import Summary
     from tuner.exporters.export import Exported
     from tuner.vehicle.scaling_laws import Estimate

@@ -13,12 +13,11 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from tuner.config import Settings, settle
-from tuner.core.disk import inside, make_folder, whole_file
+from tuner.core.disk import folder_for, inside, make_folder, whole_file
 from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
 from tuner.core.yaml_section import Section
-from tuner.job.folder import folder_for
 from tuner.options import FILES, FitOptions, Options, taking
 from tuner.recordings.cache import digest
 from tuner.recordings.topics import load_topic_map

@@ -5,6 +5,7 @@ Standard library only, so that a recording seen before is answered before anythi
 
 from __future__ import annotations
 
+import datetime
 import errno
 import glob
 import hashlib
@@ -260,3 +261,28 @@ def find_flights(patterns: Iterable[str]) -> tuple[Path, ...]:
     if not recordings:
         raise InputError("--flights", "names no recording", "give the recordings to use")
     return tuple(recordings.values())
+
+
+def folder_for(out: Path | None, *, resume: bool = False) -> Path:
+    """Return the folder to write into: the one named, or a new one under ``runs/``.
+
+    Parameters
+    ----------
+    out
+        What the user named.
+    resume
+        Whether a search that was interrupted there is gone on with.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be made or written to, or there is none to go on in.
+    """
+    if resume and out is None:
+        raise InputError("--resume", "needs the folder to go on in", "name it with --out")
+    if out is None:
+        out = Path("runs") / datetime.datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    check_folder(out)
+    if resume and not exists(out):
+        raise InputError(out, "does not exist, so there is nothing to resume", "leave --resume out")
+    return out

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sim_jax.inlet import ReferenceInlet
 from sim_jax.schedule import Schedule
 from tuner.core.numerics import robust_sd
-from tuner.disturbances.disturbances import COMMAND_NOISE, STRENGTHS, USUAL
+from tuner.disturbances.disturbances import COMMAND_NOISE, MOST, STRENGTHS, USUAL
 from tuner.disturbances.extended_kalman_filter import GATE, Filtered, filtered, innovations
 from tuner.disturbances.information import hidden
 from tuner.disturbances.observer import CHANNELS, Expected, Feed
@@ -27,7 +27,6 @@ from tuner.disturbances.recorded import (
     sampled,
     setpoints_on_ticks,
 )
-from tuner.disturbances.strengths import Likelihood, Slopes, slopes_of, steps_from
 from tuner.objective.criterion import OFFSET_UNIT, Criterion, Jacobian, Point
 from tuner.objective.information import FisherInformation, information_from_jacobian, with_secants
 from tuner.objective.normal import Objective
@@ -373,3 +372,71 @@ def unscaled(criterion: Criterion) -> Criterion:
     """Return a criterion for residuals that are whitened already, a filter knowing the start."""
     ones = {name: jnp.ones_like(scale) for name, scale in criterion.scale.items()}
     return replace(criterion, scale=ones, states=None)
+
+
+STEP = 0.02
+"""Of a logarithm, over which is differentiated."""
+
+
+class Likelihood(NamedTuple):
+    """What a filter makes of recordings with some strengths.
+
+    Attributes
+    ----------
+    loss
+        Negative log-likelihood.
+    white, root
+        (T, m, F) innovations, each given those before it in its tick, over their standard
+        deviations, and those.
+    """
+
+    loss: float
+    white: Array
+    root: Array
+
+
+class Slopes(NamedTuple):
+    """How the negative log-likelihood changes with the strengths, logarithms.
+
+    Attributes
+    ----------
+    slope
+        (7,) its derivatives.
+    information
+        (7, 7) Fisher's.
+    moved
+        (7, T, m, F) derivatives of the innovations over the standard deviations that they had.
+    """
+
+    slope: Array
+    information: Array
+    moved: Array
+
+
+def steps_from(strengths: Array) -> Array:
+    """Return the steps (7,) over which is differentiated by each of the strengths, logarithms."""
+    return np.where(strengths + STEP <= MOST, STEP, -STEP)
+
+
+def slopes_of(here: Likelihood, beside: Iterable[Likelihood], steps: Array) -> Slopes:
+    """Return how the likelihood changes with the strengths, by differences.
+
+    Parameters
+    ----------
+    here
+        At the strengths.
+    beside
+        Where one of them is a step away, each in turn.
+    steps
+        (7,) see `steps_from`.
+    """
+    moves, spreads = np.zeros((2, len(steps), *here.white.shape))
+    slope = np.zeros(len(steps))
+    for number, (there, step) in enumerate(zip(beside, steps.tolist(), strict=True)):
+        turn = there.root / here.root
+        moves[number] = (turn * there.white - here.white) / step
+        spreads[number] = np.sqrt(0.5) * (turn**2 - 1.0) / step
+        bend = np.sum(moves[number] ** 2) + np.sum(spreads[number] ** 2)
+        slope[number] = (there.loss - here.loss) / step - 0.5 * step * bend  # where it begins
+    flat = (part.reshape(len(steps), -1) for part in (moves, spreads))
+    return Slopes(slope, sum(part @ part.T for part in flat), moves)

@@ -1,10 +1,17 @@
-"""Errors of flights as ``result.json`` holds them."""
+"""Errors of flights as ``result.json`` holds them, and their table as CSV, JSON or HTML.
+
+Pages and terminals read both without the simulator.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from pathlib import Path
 
-from tuner.core.files import FiniteOrNone, Part
+from tuner.core.disk import check_file, write_text
+from tuner.core.errors import InputError
+from tuner.core.files import FiniteOrNone, Part, ResultFile, csv_text
 
 RMSE_UNITS = {"x": "m", "y": "m", "z": "m", "roll": "deg", "pitch": "deg", "yaw": "deg"}
 """Axis -> unit of its RMSE."""
@@ -45,3 +52,129 @@ class PredictedErrors(Part):
     velocity: FiniteOrNone
     attitude: FiniteOrNone
     body_rate: FiniteOrNone
+
+
+TEMPLATE = Path(__file__).parent / "comparison.html.jinja"
+
+
+class Row(Part):
+    """The RMSE of one vehicle over one stretch.
+
+    Attributes
+    ----------
+    flight
+        Its name, or ``all``.
+    lap
+        From 1; None for the whole flight. The last may be incomplete.
+    vehicle
+        As the user calls it.
+    rmse
+        m and degrees.
+    crash_time
+        s at which the simulated vehicle crashed; None if it flew.
+    """
+
+    flight: str
+    lap: int | None
+    vehicle: str
+    rmse: AxesRmse
+    crash_time: float | None
+
+
+class Table(ResultFile):
+    """The rows of all stretches and vehicles, and which vehicle is closest to the recordings.
+
+    ``best`` is None where each vehicle crashed on some flight. A run writes one of its initial and
+    best coefficients.
+    """
+
+    FILE = "laps.json"
+
+    units: dict[str, str] = RMSE_UNITS
+    vehicles: tuple[str, ...]
+    best: str | None
+    rows: tuple[Row, ...]
+
+    def of(self, vehicle: str, flight: str, lap: int | None = None) -> AxesRmse:
+        """Return the RMSE of a vehicle over a stretch."""
+        return next(
+            row.rmse
+            for row in self.rows
+            if (row.vehicle, row.flight, row.lap) == (vehicle, flight, lap)
+        )
+
+    def winners(self, flight: str, lap: int | None) -> dict[str, str]:
+        """Return axis to the vehicle with the lowest RMSE over a stretch."""
+        winners = {}
+        for axis in RMSE_UNITS:
+            known = [
+                (value, row.vehicle)
+                for row in self.rows
+                if (row.flight, row.lap) == (flight, lap)
+                and (value := getattr(row.rmse, axis)) is not None
+            ]
+            if known:
+                winners[axis] = min(known)[1]
+        return winners
+
+
+def write_table(table: Table, path: Path) -> None:
+    """Write a comparison in the format that the file's suffix names.
+
+    Raises
+    ------
+    InputError
+        The suffix is none of .csv, .json and .html, or the file cannot be written.
+    """
+    write_text(path, _writer(path)(table))
+
+
+def check_table_file(path: Path) -> None:
+    """Refuse a file that `write_table` could not write, before anything is computed."""
+    _writer(path)
+    check_file(path)
+
+
+def _writer(path: Path) -> Callable[[Table], str]:
+    writers = {
+        ".csv": _csv,
+        ".json": lambda table: table.model_dump_json(indent=2) + "\n",
+        ".html": _html,
+    }
+    if path.suffix not in writers:
+        raise InputError(
+            path, f"a table cannot be written as '{path.suffix}'", "name a .csv, .json or .html"
+        )
+    return writers[path.suffix]
+
+
+def _csv(table: Table) -> str:
+    header = ("flight", "lap", "vehicle", "axis", "unit", "rmse", "best", "crash_time")
+    rows = []
+    for row in table.rows:
+        winners = table.winners(row.flight, row.lap)
+        for axis, unit in RMSE_UNITS.items():
+            first, rmse = int(winners.get(axis) == row.vehicle), getattr(row.rmse, axis)
+            place = (row.flight, row.lap, row.vehicle, axis, unit)
+            rows.append((*place, rmse, first, row.crash_time))
+    return csv_text(header, rows)
+
+
+def _html(table: Table) -> str:
+    from jinja2 import Environment, StrictUndefined  # noqa: PLC0415 (for HTML alone)
+
+    environment = Environment(undefined=StrictUndefined, autoescape=True)
+    stretches = dict.fromkeys((row.flight, row.lap) for row in table.rows)
+    return environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+        table=table,
+        units=RMSE_UNITS,
+        stretches=[
+            {
+                "flight": flight,
+                "lap": lap,
+                "winners": table.winners(flight, lap),
+                "rows": [row for row in table.rows if (row.flight, row.lap) == (flight, lap)],
+            }
+            for flight, lap in stretches
+        ],
+    )

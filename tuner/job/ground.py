@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from tuner.core.disk import make_folder
+from tuner.core.disk import folder_for, make_folder
 from tuner.core.errors import ConfigError
 from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
@@ -20,7 +20,6 @@ from tuner.ground.bench_json import Combination, bench_record, combine
 from tuner.ground.experiments import measure, names_of
 from tuner.ground.measurement import Measurement, error_of, scaled_of, value_of
 from tuner.ground.plan import BenchFile, YawSpin, read_bench
-from tuner.job.folder import folder_for
 from tuner.report import render
 from tuner.result import (
     BEST_FIT_FILE,

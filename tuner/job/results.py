@@ -1,20 +1,22 @@
-"""The content of ``result.json`` and ``metrics.csv``, assembled from a finished search."""
+"""The files of a result folder, assembled from a finished search and its examination."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from pydantic import JsonValue
 
+from sim_jax.inlet import ReferenceInlet
 from tuner.core.disk import write_text
 from tuner.core.files import csv_text
 from tuner.core.numerics import Z95
 from tuner.core.runtime import PROGRAM, versions
 from tuner.core.yaml_document import commented, dump_yaml
-from tuner.design.proposals import LogProposal
+from tuner.design.proposals import LogProposal, Proposals
+from tuner.design.ranking import CLEARANCE, LEVEL, SMALLEST, Arena, rank_next_flights
 from tuner.evaluate.held_out import (
     Validation,
     best_values,
@@ -29,6 +31,7 @@ from tuner.objective.criterion import OFFSET_UNIT
 from tuner.objective.initial_conditions import ROWS
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.segments import OFFSETS
+from tuner.recordings.flight import Flight
 from tuner.result import (
     BEST_FIT_FILE,
     EFFECTIVE_FILE,
@@ -43,9 +46,11 @@ from tuner.result import (
 from tuner.search.fitted import Fitted
 from tuner.search.job_flights import Recording
 from tuner.search.normal_equations import normal_equations
-from tuner.search.problem import Job
+from tuner.search.problem import SPIN_CHANNELS, Job
 from tuner.uncertainty.estimates import Uncertainty
+from tuner.uncertainty.examination import Examination, knowledge_of
 from tuner.uncertainty.records import Sources
+from tuner.uncertainty.sensitivity_json import Knowledge, write_files
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,
@@ -344,4 +349,62 @@ def metrics(result: RunResult) -> str:
             for flight in result.flights
             for axis, unit in RMSE_UNITS.items()
         ),
+    )
+
+
+MARGIN = 1.0
+"""Length added to what the recorded flights took, to make an arena of it; m."""
+SHORTEST = 20.0
+"""Length of a proposed flight, or twice, four times as long, whichever is nearest to the recorded
+ones, for each length is compiled anew; s. The publisher takes ten to wind up."""
+
+
+def write_knowledge(folder: Path, job: Job, examination: Examination, fitted: Fitted) -> Knowledge:
+    """Write what is known of each coefficient into a result folder, and return it."""
+    knowledge = knowledge_of(examination, job.space, fitted.point)
+    write_files(knowledge, folder)
+    return knowledge
+
+
+def write_next_flight(
+    folder: Path, job: Job, examination: Examination, fitted: Fitted, arena: Arena | None = None
+) -> Proposals | None:
+    """Write what to fly next into a result folder, and return it.
+
+    Returns None, and writes nothing, where the controllers that flew are not simulated.
+
+    Parameters
+    ----------
+    folder
+        The result folder.
+    job, examination, fitted
+        The recorded flights, what they identify, and the fit.
+    arena
+        Where the next flight must fit; None takes what the recorded flights took, and some more.
+    """
+    if not isinstance(examination.full_problem.objective.segments.inlet, ReferenceInlet):
+        return None
+    seconds = float(np.median([flight.duration for flight in job.fitted]))
+    doublings = max(round(float(np.log2(seconds / SHORTEST))), 0)
+    proposals = rank_next_flights(
+        examination,
+        fitted.criterion,
+        arena=arena_of(job.flights) if arena is None else arena,
+        seconds=round(SHORTEST * 2**doublings),
+        spin_channels=SPIN_CHANNELS,
+    )
+    proposals.write(folder)
+    return proposals
+
+
+def arena_of(flights: Sequence[Flight]) -> Arena:
+    """Return the box about the origin that some flights took, and a little more."""
+    places = np.concatenate([flight.series["position"].values for flight in flights])
+    x, y = (2.0 * float(np.nanmax(np.abs(places[:, axis]))) for axis in (0, 1))
+    top = float(np.nanmax(places[:, 2]))
+    least = 2.0 * CLEARANCE + 2.0 * SMALLEST
+    return Arena(
+        x=round(max(x + MARGIN, least), 1),
+        y=round(max(y + MARGIN, least), 1),
+        z=round(max(top + MARGIN, LEVEL + CLEARANCE), 1),
     )

@@ -14,13 +14,13 @@ from math import nan
 from pathlib import Path
 
 from tuner.config import Options, Settings, settle
-from tuner.core.disk import make_folder
+from tuner.core.disk import folder_for, make_folder
 from tuner.core.errors import ConfigError, EngineError, InputError, OutputError
 from tuner.core.phrases import clause
 from tuner.core.spans import span
 from tuner.design.next_log import what_to_log
 from tuner.design.proposals import LogProposal
-from tuner.evaluate.compare import table_of
+from tuner.evaluate.comparison import table_of
 from tuner.evaluate.held_out import (
     Validation,
     flights_not_flown,
@@ -35,10 +35,14 @@ from tuner.exporters.export import exports_of_job
 from tuner.findings.findings import Finding, remedy, sentence
 from tuner.job.accelerations import with_accelerations
 from tuner.job.check import check_information, check_recordings
-from tuner.job.examination_files import write_knowledge, write_next_flight
-from tuner.job.folder import folder_for
 from tuner.job.listener import SILENT, Listener
-from tuner.job.results import result_of, with_errors_of_refits, write_folder
+from tuner.job.results import (
+    result_of,
+    with_errors_of_refits,
+    write_folder,
+    write_knowledge,
+    write_next_flight,
+)
 from tuner.report import render, write_search, write_traces
 from tuner.report.result_texts import export_sentence
 from tuner.result import BEST_FIT_FILE, RunResult

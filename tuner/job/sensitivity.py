@@ -17,12 +17,12 @@ from tuner.design.proposals import Proposals
 from tuner.design.ranking import Arena
 from tuner.evaluate.held_out import comparison_of
 from tuner.findings.findings import Code, Finding
-from tuner.job.examination_files import write_knowledge, write_next_flight
+from tuner.job.results import write_knowledge, write_next_flight
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
 from tuner.report import render
-from tuner.report.record import About, Recording, write_traces
+from tuner.report.contents import About, Recording, write_traces
 from tuner.search.findings import UNMATCHED, loop_findings
 from tuner.search.fitted import Fitted, by_flight
 from tuner.search.job_flights import as_logged, read_usable

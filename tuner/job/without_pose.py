@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tuner.config import Settings
+from tuner.core.disk import folder_for
 from tuner.core.errors import ConfigError, InputError, RecordingError
 from tuner.findings.findings import Code, Finding
 from tuner.ground.bench_json import Combination, combine
@@ -17,7 +18,6 @@ from tuner.ground.measurement import Measurement, value_of
 from tuner.inertial.measurement import agreeing, measure_inertial
 from tuner.inertial.prediction import AHEAD, rate_errors
 from tuner.inertial.signals import stretches_of
-from tuner.job.folder import folder_for
 from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
 from tuner.recordings.inertial import InertialFlight

@@ -32,7 +32,7 @@ from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
 from tuner.search.inlet_choice import FED_BY, choose_inlet
 from tuner.vehicle import check_mixer
-from tuner.vehicle.px4_parameters import PLACES, with_parameters
+from tuner.vehicle.controller import PLACES, with_parameters
 
 
 @dataclass(frozen=True)

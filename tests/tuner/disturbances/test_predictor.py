@@ -28,9 +28,15 @@ from tuner.disturbances.disturbances import STRENGTHS as NAMED
 from tuner.disturbances.extended_kalman_filter import GATE
 from tuner.disturbances.information import USUALLY, with_strengths
 from tuner.disturbances.observer import Observer
-from tuner.disturbances.predictor import Predictor, likelihood_of, unscaled
+from tuner.disturbances.predictor import (
+    Likelihood,
+    Predictor,
+    likelihood_of,
+    slopes_of,
+    steps_from,
+    unscaled,
+)
 from tuner.disturbances.refit import _equations, with_least_innovations
-from tuner.disturbances.strengths import Likelihood, slopes_of, steps_from
 from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
 from tuner.objective.flight import beginning_of, trace_of

@@ -20,7 +20,7 @@ from tuner.disturbances.disturbances import (
     processes_of,
     within,
 )
-from tuner.disturbances.strengths import STEP, Likelihood, Slopes, slopes_of, steps_from
+from tuner.disturbances.predictor import STEP, Likelihood, Slopes, slopes_of, steps_from
 
 ORDER = (*SLOW, *FAST)
 

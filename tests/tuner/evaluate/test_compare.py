@@ -11,8 +11,7 @@ from tuner.cli import main
 from tuner.config import Options
 from tuner.core.errors import ConfigError, InputError
 from tuner.core.shipped import configs_folder
-from tuner.evaluate.compare import compare, table_of, write_table
-from tuner.evaluate.comparison import Comparison
+from tuner.evaluate.comparison import Comparison, compare, table_of, write_table
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile
 

@@ -24,7 +24,7 @@ from tuner.job.run import run
 from tuner.recordings.loader import load_flight
 from tuner.recordings.notes import Cause
 from tuner.report import render
-from tuner.report.record import SearchRecord
+from tuner.report.contents import SearchRecord
 from tuner.result import read_run
 from tuner.search.iteration import PointEstimate
 from tuner.search.job_flights import Recording

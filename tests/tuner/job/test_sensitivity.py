@@ -8,7 +8,7 @@ import tuner
 from tuner.cli import main
 from tuner.core.errors import InputError
 from tuner.core.shipped import configs_folder
-from tuner.job.examination_files import arena_of
+from tuner.job.results import arena_of
 from tuner.vehicle import ControllerFile
 
 pytestmark = pytest.mark.slow

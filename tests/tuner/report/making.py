@@ -9,12 +9,12 @@ import numpy as np
 
 from tuner.core.shipped import find_config
 from tuner.design.proposals import LogProposal
-from tuner.evaluate.compare import table_of
+from tuner.evaluate.comparison import table_of
 from tuner.evaluate.forces import Forces
 from tuner.evaluate.records import PredictedErrors
 from tuner.evaluate.rmse import FlightErrors, SignalErrors
 from tuner.report import write_traces
-from tuner.report.record import SearchRecord, Start
+from tuner.report.contents import SearchRecord, Start
 from tuner.result import (
     CoefficientResult,
     EffectiveResult,

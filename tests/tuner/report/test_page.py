@@ -13,8 +13,7 @@ from tests.tuner.report.conftest import FREE, ROLLING
 from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding
 from tuner.report import render
-from tuner.report.contents import read_contents
-from tuner.report.record import SearchRecord
+from tuner.report.contents import SearchRecord, read_contents
 from tuner.report.sections import sections_of
 from tuner.result import ExportRecord, ExportRecords, Gate, read_run
 from tuner.uncertainty.directions import Direction

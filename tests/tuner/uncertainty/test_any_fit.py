@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from tuner.core.numerics import scaled_solve
 from tuner.objective.information import FisherInformation
 from tuner.uncertainty.covariance import covariance_of
-from tuner.uncertainty.estimates import _shares
-from tuner.uncertainty.parts import left_out, parts_of, quoted
+from tuner.uncertainty.estimates import _shares, left_out, parts_of, quoted
 
 
 @dataclass(frozen=True)

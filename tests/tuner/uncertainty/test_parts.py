@@ -10,8 +10,8 @@ from scipy import stats
 
 from tuner.objective.alternatives import DRAWS, READINGS
 from tuner.objective.information import FisherInformation
+from tuner.uncertainty.estimates import left_out, noise_alone, parts_of, quoted
 from tuner.uncertainty.overdispersion import allowed_for
-from tuner.uncertainty.parts import left_out, noise_alone, parts_of, quoted
 
 COUNT, FLIGHTS, LENGTH = 3, 4, 80
 ONE, ALIKE = np.ones((1, 1)), np.ones(1)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from tuner.core.phrases import listed
 from tuner.report.chart import FITTED, GREY, INITIAL, PALETTE, Bars, Chart, Line, Look, Panel
-from tuner.report.contents import Contents
-from tuner.report.record import SearchRecord
+from tuner.report.contents import Contents, SearchRecord
 from tuner.report.result_texts import (
     ending_sentence,
     gain_in_words,
