@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -14,14 +14,13 @@ from tuner.core.disk import exists
 from tuner.core.errors import ExportError
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
-from tuner.options import ExaminationOptions, Options, RecordingOptions, taking
+from tuner.options import ExaminationOptions, Options, RecordingOptions, SimulationOptions, taking
 from tuner.recordings.flight import Array
 from tuner.recordings.loader import load_flight
 from tuner.result import Run, read_run
-from tuner.vehicle import ControllerFile, VehicleFile
+from tuner.vehicle import VehicleFile
 
 if TYPE_CHECKING:
-    from sim_jax.precision import Precision
     from tuner.client.client import Client
     from tuner.evaluate.records import Table
     from tuner.evaluate.simulate import Simulation
@@ -123,7 +122,7 @@ def compare(
     given = RecordingOptions.of(flights, **options)
     labelled = vehicles if isinstance(vehicles, Mapping) else {str(name): name for name in vehicles}
     sets: dict[str, str | VehicleFile] = {k: text_of(v) for k, v in labelled.items()}
-    table, _ = compare_vehicles(Options(**vars(given)), sets, [Path(path) for path in out])
+    table, _ = compare_vehicles(given, sets, [Path(path) for path in out])
     return table
 
 
@@ -133,10 +132,6 @@ def sensitivity(
     flights: Sequence[Named],
     *,
     arena: Sequence[float] | None = None,
-    global_method: Literal["morris", "sobol"] | None = None,
-    samples: int | None = None,
-    span: float = 30.0,
-    profile: Sequence[str] | None = None,
     **options: Any,
 ) -> SensitivityResult:
     """Report what recordings say about each coefficient of a vehicle, as ``tune sensitivity`` does.
@@ -148,18 +143,10 @@ def sensitivity(
     arena
         m from wall to wall along x and y, about the origin, and up: what the next flight must fit
         into. None takes what the recorded flights took, and a little more.
-    global_method
-        Also computes the indices of Morris or Sobol over the range of the coefficients.
-    samples
-        Trajectories (Morris) or base points (Sobol) that they are computed from.
-    span
-        Percent by which coefficients are varied for them where the job file gives no bounds.
-    profile
-        Coefficients whose likelihood is profiled: the others are fitted again along a grid.
     options
-        ``vehicle``, ``controller``, ``mass``, ``config``, ``free``, ``fixed``, ``topics``,
-        ``namespace``, ``out``, ``workers`` and ``cluster`` as of `fit`. Nothing is fitted: the
-        coefficients that would be are judged, and held-out flights examined like the others.
+        Those of `tune sensitivity` by their names: all fields of `ExaminationOptions`, as of `fit`;
+        ``global_`` is called ``global_method``. Nothing is fitted: the coefficients that would be
+        are judged, and held-out flights examined like the others.
 
     Returns
     -------
@@ -174,23 +161,12 @@ def sensitivity(
         The input cannot be used; one line says what to do.
     """
     configure()
-    from tuner.core.disk import folder_for  # noqa: PLC0415
-    from tuner.job.sensitivity import SensitivityRequest, examine_vehicle  # noqa: PLC0415 (jax)
+    from tuner.job.sensitivity import examine_vehicle  # noqa: PLC0415 (jax)
 
-    given = ExaminationOptions.of(flights, **options)
-    with engine_for(given.workers, given.cluster):
-        return examine_vehicle(
-            Options(**vars(given)),
-            SensitivityRequest(
-                arena=arena,
-                global_method=global_method,
-                samples=samples,
-                span=span / 100.0,
-                profiles=tuple(profile or ()),
-            ),
-            out=folder_for(given.out),
-            command=f"tuner.sensitivity from Python: {given.flights}",
-        )
+    asked = ExaminationOptions.of(flights, **options)
+    with engine_for(asked.workers, asked.cluster):
+        command = f"tuner.sensitivity from Python: {asked.flights}"
+        return examine_vehicle(asked, arena, command=command)
 
 
 def connect(url: str | None = None, *, token: str | None = None) -> Client:
@@ -213,23 +189,13 @@ def connect(url: str | None = None, *, token: str | None = None) -> Client:
     return Client(url, token)
 
 
+@taking(SimulationOptions)
 def simulate(
     trajectory: TrajectoryName,
     *,
-    vehicle: Named | VehicleFile = "hovergames",
-    controller: Named | ControllerFile = "hovergames",
-    radius: float = 2.0,
-    omega: float = 0.7,
-    speed_scale: float = 2.1,
-    speed: float | None = None,
-    yaw_rate: float = 2.0,
-    duration: float = 40.0,
-    rate: float = 100.0,
     grid: Mapping[str, Array] | None = None,
-    precision: Precision = "float64",
     forces: bool = False,
-    workers: int | None = None,
-    cluster: str | None = None,
+    **options: Any,
 ) -> tuple[Simulation, ...]:
     """Simulate a trajectory, as ``tune simulate`` does.
 
@@ -237,29 +203,14 @@ def simulate(
     ----------
     trajectory
         Which shape, flown from rest.
-    vehicle, controller
-        What flies: the thing itself, its file, or the name of a shipped one.
-    radius, omega
-        m and rad/s.
-    speed_scale
-        The publisher's velocity scaler.
-    speed
-        m/s at which the reference peaks; instead of ``speed_scale``.
-    yaw_rate
-        rad/s, of the yaw spin.
-    duration
-        s.
-    rate
-        Hz of the result.
     grid
         Coefficient -> (B,) values: B vehicles fly side by side. `tuner.evaluate.simulate.grid_of`
         makes every combination of several ranges.
-    precision
-        What to compute in: ``float32`` is twice as fast for many vehicles, and 0.02 mm off.
     forces
         Whether each simulation has ``forces``: what acted along the flight, term by term.
-    workers, cluster
-        As of `tuner.fit`.
+    options
+        Those of `tune simulate` by their names: all other fields of `SimulationOptions`.
+        ``vehicle`` and ``controller`` may be such a thing itself.
 
     Returns
     -------
@@ -274,27 +225,10 @@ def simulate(
     configure()
     from tuner.evaluate.simulate import fly  # noqa: PLC0415 (jax)
 
-    shape = {
-        "name": trajectory,
-        "radius": radius,
-        "omega": omega,
-        "speed_scale": speed_scale,
-        "yaw_rate": yaw_rate,
-    }
-    with engine_for(workers, cluster):
-        return tuple(
-            fly(
-                text_of(vehicle),
-                text_of(controller),
-                shape,
-                speed=speed,
-                duration=duration,
-                rate=rate,
-                grid=grid,
-                precision=precision,
-                forces=forces,
-            )
-        )
+    given: dict[str, Any] = {name: text_of(value) for name, value in options.items()}
+    asked = SimulationOptions(trajectory=trajectory, **given)
+    with engine_for(asked.workers, asked.cluster):
+        return tuple(fly(asked, grid=grid, forces=forces))
 
 
 def export(

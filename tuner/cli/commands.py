@@ -7,18 +7,17 @@ import sys
 import webbrowser
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from tuner.cli.options import EACH, TYPED, Quiet, Verbose
 from tuner.core.errors import InputError
 from tuner.options import (
-    EngineOptions,
     ExaminationOptions,
-    Options,
     ReadingOptions,
     RecordingOptions,
+    SimulationOptions,
 )
 
 if TYPE_CHECKING:
@@ -117,10 +116,9 @@ def compare(
         if plot is not None:
             write_figure(comparison_figure(flown), plot)
 
-    options = Options(**vars(recordings))
     with listening(quiet=quiet, verbose=True) as listener:
         table, settings = compare_vehicles(
-            options, vehicle, out or (), on_flown=draw, on_message=listener.on_message
+            recordings, vehicle, out or (), on_flown=draw, on_message=listener.on_message
         )
     if not quiet:
         print_comparison(table, settings, laps=laps, written=written)
@@ -128,53 +126,20 @@ def compare(
 
 def simulate(
     *,
-    trajectory: str,
     out: Path,
-    vehicle: str = "hovergames",
-    controller: str = "hovergames",
-    radius: float = 2.0,
-    omega: float = 0.7,
-    speed_scale: float = 2.1,
-    speed: float | None = None,
-    yaw_rate: float = 2.0,
-    duration: float = 40.0,
-    rate: float = 100.0,
+    asked: Annotated[SimulationOptions, EACH],
     sweep: list[str] | None = None,
-    precision: Literal["float32", "float64"] = "float64",
     forces: Path | None = None,
-    engine: Annotated[EngineOptions, EACH] = EngineOptions(),
     quiet: Quiet = False,
 ) -> None:
     """Simulate a vehicle and its controller on a trajectory, and write the flight.
 
     Parameters
     ----------
-    trajectory
-        Fly this shape, such as circle, from rest; a name that does not exist lists all of them.
     out
         Write FILE.csv, or FILE.bag with the topics of a MAVROS lab; .png, .svg and .pdf draw it.
-    vehicle
-        Fly this vehicle file, or a shipped one by its name, say hovergames_updated.
-    controller
-        Fly this controller file, or a shipped one by its name: hovergames_sitl.
-    radius
-        Set the radius in m.
-    omega
-        Set the angular rate of the trajectory in rad/s.
-    speed_scale
-        Set the publisher's velocity scaler.
-    speed
-        Choose the velocity scaler so that the reference peaks at this speed in m/s.
-    yaw_rate
-        Set the rate of the yaw spin in rad/s.
-    duration
-        Fly for this many s.
-    rate
-        Write samples at this rate in Hz.
     sweep
         Vary a coefficient: NAME=LOW:HIGH:COUNT. Several of them give all combinations.
-    precision
-        Compute in this precision. float32 is twice as fast for many vehicles, and 0.02 mm off.
     forces
         Write force and moment of each term along the flights into this FILE.csv, too.
     """
@@ -192,27 +157,11 @@ def simulate(
         raise InputError(out, "a figure is of one flight, without forces", "write a .csv")
     if drawn:
         check_figure(out)
-    flights = fly(
-        vehicle,
-        controller,
-        {
-            "name": trajectory,
-            "radius": radius,
-            "omega": omega,
-            "speed_scale": speed_scale,
-            "yaw_rate": yaw_rate,
-        },
-        speed=speed,
-        duration=duration,
-        rate=rate,
-        grid=grid_of(sweep or ()) or None,
-        precision=precision,
-        forces=forces is not None,
-    )
-    with engine_for(engine.workers, engine.cluster):
+    flights = fly(asked, grid=grid_of(sweep or ()) or None, forces=forces is not None)
+    with engine_for(asked.workers, asked.cluster):
         if drawn:
             flight = next(flights)
-            write_figure(flight_figure(flight, f"{vehicle}: {trajectory}"), out)
+            write_figure(flight_figure(flight, f"{asked.vehicle}: {asked.trajectory}"), out)
             summaries: tuple[Summary, ...] = (summary_of(flight),)
         else:
             summaries = write_flights(flights, out, forces=forces)
@@ -222,12 +171,8 @@ def simulate(
 
 def sensitivity(
     *,
-    examined: Annotated[ExaminationOptions, EACH],
+    asked: Annotated[ExaminationOptions, EACH],
     arena: str | None = None,
-    global_method: Annotated[Literal["morris", "sobol"] | None, Parameter(name="--global")] = None,
-    samples: int | None = None,
-    span: float = 30.0,
-    profile: list[str] | None = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -238,14 +183,6 @@ def sensitivity(
     arena
         Propose next flights that fit into X,Y,Z in m: from wall to wall, and up. Default: what the
         recorded flights took, and a little more.
-    global_method
-        Also compute the indices of Morris or Sobol over the range of the coefficients.
-    samples
-        Compute them from this many trajectories (Morris, default 16) or base points (Sobol, 64).
-    span
-        Vary coefficients without bounds in the job file by this many percent for them.
-    profile
-        Profile the likelihood of these coefficients: fit the others again along a grid of values.
     """
     from tuner.cli.options import lengths
     from tuner.cli.progress import listening
@@ -253,25 +190,16 @@ def sensitivity(
     from tuner.core.runtime import configure
 
     configure()
-    from tuner.core.disk import folder_for
     from tuner.engine import engine_for
-    from tuner.job.sensitivity import SensitivityRequest, examine_vehicle
+    from tuner.job.sensitivity import examine_vehicle
 
-    request = SensitivityRequest(
-        arena=None if arena is None else lengths("--arena", arena),
-        global_method=global_method,
-        samples=samples,
-        span=span / 100.0,
-        profiles=profile or (),
-    )
     with (
-        engine_for(examined.workers, examined.cluster),
+        engine_for(asked.workers, asked.cluster),
         listening(quiet=quiet, verbose=verbose) as listener,
     ):
         result = examine_vehicle(
-            Options(**vars(examined)),
-            request,
-            out=folder_for(examined.out),
+            asked,
+            None if arena is None else lengths("--arena", arena),
             command=TYPED.get(),
             on_message=listener.on_message,
         )

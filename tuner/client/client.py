@@ -18,7 +18,7 @@ from tuner.core.errors import InputError, ServerFaultError
 from tuner.core.shipped import Kind, configs_folder, find_config
 from tuner.core.yaml_document import read_yaml
 from tuner.core.yaml_section import Section
-from tuner.options import FILES, FitOptions, Options, taking
+from tuner.options import FILES, FitOptions, taking
 from tuner.recordings.cache import digest
 from tuner.recordings.topics import load_topic_map
 from tuner.result import Run, read_run
@@ -351,7 +351,7 @@ def request_of(options: FitOptions) -> tuple[tuple[Path, ...], dict[str, Any]]:
     InputError
         A path, name or value cannot be used, here or by any server.
     """
-    settled = settle(Options(**vars(options)))
+    settled = settle(options)
     names = (field.name for field in fields(FitOptions) if field.name not in FILES)
     request = {name: getattr(options, name) for name in names}
     request["settings"] = _settings(settled)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import glob
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -18,7 +18,7 @@ from tuner.core.shipped import Kind, find_config
 from tuner.core.validation import config_error
 from tuner.core.yaml_section import build, section_of
 from tuner.ground.bench_json import joint_prior
-from tuner.options import FILES, IN_JOB_FILE, Options
+from tuner.options import FILES, IN_JOB_FILE, FlightOptions, Options
 from tuner.vehicle.controller import ControllerFile, read_controller
 from tuner.vehicle.joint_prior import JointPrior
 from tuner.vehicle.vehicle import VehicleFile, check_names, read_vehicle, with_values
@@ -58,13 +58,13 @@ class Settings:
     bench: JointPrior | None = None
 
 
-def settle(options: Options, *, fits: bool = True) -> Settings:
+def settle(asked: FlightOptions, *, fits: bool = True) -> Settings:
     """Read what the options and the flights' job file name, and let the command line win.
 
     Parameters
     ----------
-    options
-        Of the command line, or as Python and HTTP give them.
+    asked
+        Of the command line, or as Python and HTTP give them; those that a fit has.
     fits
         Whether a fit follows, for which some flight must not be held out.
 
@@ -73,8 +73,10 @@ def settle(options: Options, *, fits: bool = True) -> Settings:
     InputError
         A path, name or value cannot be used.
     """
-    given = {name: value for name, value in vars(options).items() if name not in FILES}
-    build(section_of(type(options), leaving=FILES), given, "command line")
+    given = {name: value for name, value in vars(asked).items() if name not in FILES}
+    build(section_of(type(asked), leaving=FILES), given, "command line")
+    known: dict[str, Any] = {f.name: getattr(asked, f.name, f.default) for f in fields(Options)}
+    options = Options(**known)
     flights = find_flights(options.flights)
     job_path = Path(options.config).expanduser() if options.config else find_job_file(flights)
     job = read_job(job_path) if job_path else JobFile()

@@ -20,7 +20,7 @@ import equinox as eqx
 import numpy as np
 
 from sim_jax.crash import AIRBORNE
-from tuner.config import Options, Settings, settle
+from tuner.config import Settings, settle
 from tuner.config.job import InletName
 from tuner.core.errors import InputError
 from tuner.core.shipped import find_config
@@ -47,6 +47,7 @@ from tuner.objective.segments import (
 from tuner.objective.space import Space
 from tuner.objective.start import recent_command
 from tuner.objective.windows import Window, windows_of
+from tuner.options import RecordingOptions
 from tuner.recordings.flight import Array
 from tuner.search.job_flights import Recording, as_logged, read_usable
 from tuner.search.least_squares import FAR
@@ -376,7 +377,7 @@ FEWEST_POSES = 10
 
 
 def compare(
-    options: Options,
+    options: RecordingOptions,
     vehicles: Sequence[str] | Mapping[str, str | VehicleFile],
     out: Sequence[Path] = (),
     *,

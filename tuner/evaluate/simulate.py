@@ -35,6 +35,7 @@ from tuner.evaluate.forces import Forces, forces_of
 from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
 from tuner.objective.flown import CODE
 from tuner.objective.trajectory import Published, at_speed, published
+from tuner.options import SimulationOptions
 from tuner.recordings.flight import Array, Series
 from tuner.recordings.interpolation import resample
 from tuner.vehicle import (
@@ -62,60 +63,41 @@ class Plan(Section):
 
 
 def fly(
-    vehicle: str | VehicleFile,
-    controller: str | ControllerFile,
-    trajectory: Mapping[str, object],
-    *,
-    speed: float | None = None,
-    duration: float = 40.0,
-    rate: float = 100.0,
-    grid: Mapping[str, Array] | None = None,
-    precision: Precision = "float64",
-    forces: bool = False,
+    asked: SimulationOptions, *, grid: Mapping[str, Array] | None = None, forces: bool = False
 ) -> Iterator[Simulation]:
     """Fly a trajectory once, or with each vehicle of a grid.
 
     Parameters
     ----------
-    vehicle, controller
-        What flies: the thing itself, a path, or the name of a shipped file.
-    trajectory
-        The fields of `TrajectorySettings`.
-    speed
-        m/s at which the reference peaks; None keeps the velocity scaler.
-    duration
-        s.
-    rate
-        Hz of the result.
-    grid
-        Coefficient -> (B,) values.
-    precision
-        What to compute in.
-    forces
-        Whether to give what acted along each flight, term by term.
+    asked
+        What flies, for how long and along what; all but the engine, which is the one in force.
+    grid, forces
+        As of `simulate`.
 
     Raises
     ------
     InputError
         Something named does not exist, or cannot be flown.
     """
-    options = {
-        "trajectory": dict(trajectory),
-        "duration": duration,
-        "rate": rate,
-        "precision": precision,
-    }
-    plan = build(Plan, options, "command line")
-    shape = plan.trajectory if speed is None else at_speed(plan.trajectory, speed)
+    given = vars(asked)
+    shape = {name: given[name] for name in TrajectorySettings.model_fields if name != "name"}
+    plan = build(
+        Plan,
+        {name: given[name] for name in Plan.model_fields}
+        | {"trajectory": {"name": asked.trajectory, **shape}},
+        "command line",
+    )
     check_names(grid or (), "grid")
+    vehicle, controller = asked.vehicle, asked.controller
     if isinstance(vehicle, str):
         vehicle = read_vehicle(find_config("vehicles", vehicle, Path()))
     if isinstance(controller, str):
         controller = read_controller(find_config("controllers", controller, Path()))
+    trajectory, speed = plan.trajectory, asked.speed
     return simulate(
         vehicle,
         controller,
-        shape,
+        trajectory if speed is None else at_speed(trajectory, speed),
         duration=plan.duration,
         rate=plan.rate,
         grid=grid,

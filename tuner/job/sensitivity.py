@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tuner.config import Options, Settings, settle
-from tuner.core.disk import make_folder
+from tuner.config import Settings, settle
+from tuner.core.disk import folder_for, make_folder
 from tuner.core.errors import InputError, did_you_mean
 from tuner.core.runtime import versions
 from tuner.design.proposals import Proposals
@@ -21,6 +21,7 @@ from tuner.job.results import write_knowledge, write_next_flight
 from tuner.objective.alternatives import alternatives_of
 from tuner.objective.criterion import Criterion, Point
 from tuner.objective.normal import Objective
+from tuner.options import ExaminationOptions
 from tuner.report import render
 from tuner.report.contents import About, Recording, write_traces
 from tuner.search.findings import UNMATCHED, loop_findings
@@ -34,7 +35,7 @@ from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.global_indices import global_sensitivity
 from tuner.uncertainty.profile_likelihood import profile_likelihood
-from tuner.uncertainty.records import Method, Profiles
+from tuner.uncertainty.records import Profiles
 from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.vehicle import check_names, initial_values
 
@@ -112,36 +113,10 @@ class SensitivityResult:
     findings: tuple[Finding, ...]
 
 
-@dataclass(frozen=True)
-class SensitivityRequest:
-    """What is computed beside the local sensitivity.
-
-    Attributes
-    ----------
-    arena
-        m along x, y and up; None takes what the recorded flights took, and some more.
-    global_method
-        The method whose global indices are computed; None computes none.
-    samples
-        Their number of samples; None for the method's default.
-    span
-        Share by which coefficients are varied for them, where the job file gives no bounds.
-    profiles
-        Coefficients whose likelihood is profiled.
-    """
-
-    arena: Sequence[float] | None = None
-    global_method: Method | None = None
-    samples: int | None = None
-    span: float = 0.3
-    profiles: Sequence[str] = ()
-
-
 def examine_vehicle(
-    options: Options,
-    request: SensitivityRequest,
+    asked: ExaminationOptions,
+    arena: Sequence[float] | None = None,
     *,
-    out: Path,
     command: str = "",
     on_message: Callable[[str], None] = lambda _: None,
 ) -> SensitivityResult:
@@ -149,13 +124,11 @@ def examine_vehicle(
 
     Parameters
     ----------
-    options
-        Flights, vehicle and everything else that decides the simulation; held-out flights are
-        examined like the others.
-    request
-        What else is asked for.
-    out
-        The folder to write into.
+    asked
+        Flights, vehicle, everything else that decides the simulation, and what else is computed;
+        held-out flights are examined like the others.
+    arena
+        m along x, y and up; None takes what the recorded flights took, and some more.
     command
         What the user typed, for the record.
     on_message
@@ -166,17 +139,10 @@ def examine_vehicle(
     InputError
         The input cannot be used; nothing was written.
     """
-    settings, logged = as_logged(settle(options, fits=False))
-    arena = None if request.arena is None else Arena.of(request.arena)
-    check_names(request.profiles, "--profile")
-    if not 0 < request.span <= 10:
-        raise InputError(
-            "--span",
-            f"{100 * request.span:g} % is not above 0 and at most 1000",
-            "give 30 for ±30 %",
-        )
-    if request.samples is not None and request.samples < 2:
-        raise InputError("--samples", f"{request.samples} is too few", "give at least 2")
+    settings, logged = as_logged(settle(asked, fits=False))
+    room = None if arena is None else Arena.of(arena)
+    check_names(asked.profile or (), "--profile")
+    out = folder_for(asked.out)
     recordings, noticed = read_usable(settings, holdout=())
     job = job_of(settings, recordings)
     make_folder(out)
@@ -188,8 +154,8 @@ def examine_vehicle(
     )
     knowledge = write_knowledge(out, job, examination, fitted)
     on_message("simulating what could be flown next")
-    proposals = write_next_flight(out, job, examination, fitted, arena)
-    _write_requested(request, job, fitted, examination, folder=out, on_message=on_message)
+    proposals = write_next_flight(out, job, examination, fitted, room)
+    _write_requested(asked, job, fitted, examination, folder=out, on_message=on_message)
     write_traces(out, {"simulated": comparison_of(job, fitted).fly(settings.vehicle)})
     _about(settings, job, fitted, command).write(out)
     render(out)
@@ -197,7 +163,7 @@ def examine_vehicle(
 
 
 def _write_requested(
-    request: SensitivityRequest,
+    asked: ExaminationOptions,
     job: Job,
     fitted: Fitted,
     examination: Examination,
@@ -206,23 +172,21 @@ def _write_requested(
     on_message: Callable[[str], None],
 ) -> None:
     """Write the global indices and the profiles that were requested."""
-    if request.global_method is not None:
-        on_message(
-            f"flying vehicles between the bounds for {request.global_method.capitalize()}'s indices"
-        )
+    if asked.global_ is not None:
+        on_message(f"flying vehicles between the bounds for {asked.global_.capitalize()}'s indices")
         indices = global_sensitivity(
             fitted.objective,
             fitted.point,
             fitted.criterion,
-            method=request.global_method,
+            method=asked.global_,
             flights=[flight.name for flight in job.fitted],
-            bounds=_ranges(job, examination, request.span),
-            samples=request.samples,
+            bounds=_ranges(job, examination, asked.span / 100.0),
+            samples=asked.samples,
             seed=job.settings.job.search.seed,
         )
         indices.write(folder)
     profiles = []
-    for name in request.profiles:
+    for name in asked.profile or ():
         on_message(f"fitting the others again for each value of {name}")
         uncertainty = _uncertainty_with(examination, name)
         profiles.append(

@@ -8,6 +8,7 @@ import pytest
 from tuner.core.errors import InputError
 from tuner.evaluate.simulate import fly, grid_of
 from tuner.evaluate.write import roll_pitch_yaw, summary_of, write_csv, write_flights
+from tuner.options import SimulationOptions
 from tuner.recordings.loader import load_flight
 
 COLUMNS = [
@@ -139,7 +140,8 @@ def test_a_wrong_sweep_is_named(sweep, expected):
 
 def test_a_grid_goes_into_one_table(tmp_path):
     grid = grid_of(["motor_constant=1.3e-5:1.5e-5:2", "inertia_xx=0.025"])
-    flights = fly("hovergames_updated", "hovergames", {"name": "hover"}, duration=4.0, grid=grid)
+    hover = SimulationOptions(trajectory="hover", vehicle="hovergames_updated", duration=4.0)
+    flights = fly(hover, grid=grid)
     summaries = write_flights(flights, tmp_path / "g.csv")
     table = pd.read_csv(tmp_path / "g.csv")
     assert list(table.columns) == ["motor_constant", "inertia_xx", *COLUMNS]
@@ -151,7 +153,7 @@ def test_a_grid_goes_into_one_table(tmp_path):
 @pytest.mark.parametrize(
     ("options", "expected"),
     [
-        ({"trajectory": {"name": "circle", "radius": -1.0}}, "trajectory.radius is -1.0"),
+        ({"radius": -1.0}, "trajectory.radius is -1.0"),
         ({"duration": 0.0}, "duration is 0.0"),
         ({"rate": float("inf")}, "rate is inf"),
         ({"vehicle": "nope"}, "shipped vehicles"),
@@ -159,13 +161,9 @@ def test_a_grid_goes_into_one_table(tmp_path):
     ],
 )
 def test_what_cannot_be_flown_is_refused_in_one_line(tmp_path, options, expected):
-    usual = {
-        "vehicle": "hovergames",
-        "controller": "hovergames",
-        "trajectory": {"name": "hover"},
-    }
+    asked = SimulationOptions(**{"trajectory": "hover"} | options)
     with pytest.raises(InputError) as error:
-        write_flights(fly(**usual | options), tmp_path / "c.csv")
+        write_flights(fly(asked), tmp_path / "c.csv")
     assert expected in str(error.value)
     assert "\n" not in str(error.value)
     assert not list(Path(tmp_path).iterdir())

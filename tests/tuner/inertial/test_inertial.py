@@ -17,6 +17,7 @@ from tuner.inertial.prediction import rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import least_noticed, vehicle_of
 from tuner.job.without_pose import fit_without_pose
+from tuner.options import SimulationOptions
 from tuner.recordings import inspect_recordings
 from tuner.recordings.inertial import read_inertial
 from tuner.recordings.notes import NoteCode
@@ -120,7 +121,9 @@ def test_intervals_hold_the_vehicle_that_flew(simulation, flown, tmp_path):
 def test_air_that_drags_at_the_rotors_is_not_taken_for_inertia(name, tmp_path):
     """At 4 m/s the moment of the shipped rotor drag is three times that of the turning, or more."""
     vehicle = read_vehicle(configs_folder() / "vehicles" / "hovergames.yaml")
-    (flown,) = fly(vehicle, ControllerFile(), {"name": name}, speed=4.0, duration=30.0, rate=400.0)
+    (flown,) = fly(
+        SimulationOptions(trajectory=name, vehicle=vehicle, speed=4.0, duration=30.0, rate=400.0)
+    )
     settings = settings_for(log_file(flown, tmp_path / "log00", noise=0.0), vehicle)
     fitted = fit_without_pose(settings, without_pose(settings)[0], out=tmp_path / "run")
     truth = values_of(vehicle)

@@ -97,8 +97,8 @@ def test_the_command_asks_for_what_was_typed_and_prints_a_line_for_each_coeffici
 ):
     asked = []
 
-    def examine(options, request, *, out, **_):
-        asked.append((list(options.flights), list(options.fit), request.arena, out))
+    def examine(options, arena, **_):
+        asked.append((list(options.flights), list(options.fit), arena, options.out))
         return examined
 
     monkeypatch.setattr("tuner.job.sensitivity.examine_vehicle", examine)
