@@ -14,7 +14,14 @@ from tuner.core.disk import exists
 from tuner.core.errors import ExportError
 from tuner.core.runtime import configure
 from tuner.engine import engine_for
-from tuner.options import ExaminationOptions, Options, RecordingOptions, SimulationOptions, taking
+from tuner.options import (
+    ExaminationOptions,
+    ExportOptions,
+    Options,
+    RecordingOptions,
+    SimulationOptions,
+    taking,
+)
 from tuner.recordings.flight import Array
 from tuner.recordings.loader import load_flight
 from tuner.result import Run, read_run
@@ -231,16 +238,8 @@ def simulate(
         return tuple(fly(asked, grid=grid, forces=forces))
 
 
-def export(
-    run: Run | Named,
-    format: str,  # noqa: A002 (the option's name)
-    *,
-    into: Named | None = None,
-    out: Named | None = None,
-    simulator: str = "",
-    accept: str = "",
-    draws: int | None = None,
-) -> Exported:
+@taking(ExportOptions)
+def export(run: Run | Named, format: str, **options: Any) -> Exported:  # noqa: A002 (the option's name)
     """Write a run's coefficients for a simulator, once they fly there as in it; ``tune export``.
 
     Parameters
@@ -249,16 +248,8 @@ def export(
         A run, its result folder, or a vehicle file, whose numbers no flight has been compared with.
     format
         The name of a target, as ``yaml``, ``sdf`` or ``px4``.
-    into
-        With ``sdf``, the model to put them into; None gives the tags alone.
-    out
-        Where to write; None is the model itself, or ``export/`` in the result folder.
-    simulator
-        Which of a format's simulators it is for, as of ``tune export``.
-    accept
-        A reason to export in spite of conditions that are not met.
-    draws
-        How many draws of the run's joint posterior are written besides, into the folder ``out``.
+    options
+        Those of `tune export` by their names: all other fields of `ExportOptions`.
 
     Raises
     ------
@@ -272,22 +263,19 @@ def export(
     from tuner.exporters.export import export as export_run  # noqa: PLC0415 (jax)
     from tuner.exporters.export import export_draws, export_vehicle  # noqa: PLC0415
 
-    given: dict[str, Any] = {
-        "today": date.today(),  # the user's own day
-        "out": None if out is None else Path(out),
-        "simulator": simulator,
-        "accept": accept,
-    }
-    model = None if into is None else Path(into)
-    if draws is not None and model is not None:
+    paths = {name: Path(options[name]) for name in ("into", "out") if options.get(name) is not None}
+    asked = ExportOptions(format, **options | paths)
+    today = date.today()  # the user's own day
+    if asked.draws is not None and asked.into is not None:
         raise ExportError("--draws", "do not go with --into", "leave one of them out")
-    if draws is None and not isinstance(run, Run) and exists(Path(run)) and Path(run).is_file():
-        return export_vehicle(Path(run), format, into=model, **given)
-    given |= {"refly": refly, "refit": kept_effective}
-    of = run if isinstance(run, Run) else read_run(run)
-    if draws is not None:
-        return export_draws(of, format, draws, **given)
-    return export_run(of, format, into=model, **given)
+    if isinstance(run, Run):
+        of = run
+    elif asked.draws is None and exists(Path(run)) and Path(run).is_file():
+        return export_vehicle(Path(run), asked, today=today)
+    else:
+        of = read_run(run)
+    writes = export_run if asked.draws is None else export_draws
+    return writes(of, asked, refly=refly, today=today, refit=kept_effective)
 
 
 def text_of(named: Path | T) -> str | T:

@@ -189,6 +189,42 @@ class SimulationOptions(EngineOptions, TrajectoryOptions):
     """A trajectory, what flies it, and where that is computed."""
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """The format that coefficients are written in, and where.
+
+    Attributes
+    ----------
+    format
+        Write a vehicle file with confidence intervals (yaml), numbers with units (json), a model of
+        Gazebo classic (sdf) or gz-sim (gz-sim; or sdf, where the model is one), parameters of PX4
+        (px4), MuJoCo's MJCF (mujoco), parameters of crazyflow (drone-models) or RotorPy (rotorpy),
+        or arguments of Isaac Lab's multirotor (isaaclab).
+    into
+        Put the coefficients into this model (.sdf or .sdf.jinja), and into what it includes from
+        folders beside its own. Default: write the tags alone.
+    out
+        Write this file; a folder, where the model is split over several. Default: the model itself,
+        or export/ in the result folder.
+    simulator
+        Write for this simulator of a format's: gazebo-classic or gz-sim (sdf), sih or gz-sim
+        (px4). Default: the one that the model is for, or the first.
+    accept
+        Export although a condition is not met, and record this reason in the file.
+    draws
+        Also write so many draws of the joint posterior into the folder --out: a table, a file for
+        each in the format, and Isaac Lab's ranges. Default folder: export/draws of the result.
+    """
+
+    format: str
+    _: KW_ONLY
+    into: Path | None = None
+    out: Path | None = None
+    simulator: str = ""
+    accept: str = ""
+    draws: int | None = None
+
+
 def taking(options: type) -> Callable[[F], F]:
     """Show the fields of a class in the signature of a function of ``**options``."""
 

@@ -26,6 +26,7 @@ from tuner.exporters.target import (
     target_of,
     write,
 )
+from tuner.options import ExportOptions
 from tuner.report.result_texts import what_is_exported, what_is_lost
 from tuner.result import (
     EXPORTS,
@@ -63,16 +64,12 @@ class Exported:
 
 def export(
     run: Run,
-    kind: str,
+    asked: ExportOptions,
     *,
     refly: Refly,
     today: date,
     refit: Refit | None = None,
-    into: Path | None = None,
-    out: Path | None = None,
     copies: Path | None = None,
-    simulator: str = "",
-    accept: str = "",
 ) -> Exported:
     """Write a run's coefficients in a format, if they hold there.
 
@@ -81,8 +78,9 @@ def export(
     run
         A result folder. A target that lacks some of its terms gets its effective coefficients,
         unless its job wants the physical ones.
-    kind
-        The name of a target, as ``yaml``, ``sdf`` or ``px4``.
+    asked
+        The format, and where to write. A reason to export in spite of gates that are not met goes
+        into the provenance.
     refly
         Flies the run's flights with a vehicle.
     today
@@ -90,17 +88,8 @@ def export(
     refit
         Finds the effective coefficients for a simulator that lacks some of what acts; without it,
         those for Gazebo stand in.
-    into
-        With ``sdf``, the model to patch; without, the tags alone are written.
-    out
-        Where to write; by default the model itself, or ``export/`` in the result folder.
     copies
         Folder for a copy of the model, which then stays as it is.
-    simulator
-        Which of the format's simulators it is for, where a model to patch does not say; empty for
-        its usual one.
-    accept
-        A reason to export in spite of gates that are not met; it goes into the provenance.
 
     Raises
     ------
@@ -109,16 +98,16 @@ def export(
     OutputError
         The file cannot be written.
     """
-    target = target_of(kind)
+    target, into, out = target_of(asked.format), asked.into, asked.out
     own = f"{FOLDER}/{file_name(run.vehicle.name, target.suffix)}"
     if out is None or out.suffix:  # before anything is computed
         check_file(out or into or inside(run.folder, own), folder_is_made=True)
-    choices = Choices(into, simulator)
+    choices = Choices(into, asked.simulator)
     target = target.chosen(choices)
     physical, (run, effective) = run, in_simulator(run, target, refit)
     vehicle, decided = exported_vehicle(run, today)
     check_every_coefficient(physical.vehicle, target)
-    line = provenance(run, today, accept)
+    line = provenance(run, today, asked.accept)
     if effective is not None:
         assert target.simulator is not None
         line = f"{what_is_exported(effective, target.simulator.title)}; {line}"
@@ -140,12 +129,12 @@ def export(
     if draft.flier is not None and target.simulator is not None and run.result.flights:
         gate, sentence = check_in_simulator(run, draft, refly, target.simulator.title)
         gates, flown = (*gates, gate), (sentence,)
-    refuse(run.folder, gates, accept, "fit again")
+    refuse(run.folder, gates, asked.accept, "fit again")
     write(draft, *places)
     notes = (*decided, *flown, *draft.notes, *not_carried(vehicle, target))
     if places[0].is_relative_to(run.folder):
         file = places[0].relative_to(run.folder).as_posix()
-        _record(run.folder, ExportRecord(format=kind, file=file, gates=gates))
+        _record(run.folder, ExportRecord(format=asked.format, file=file, gates=gates))
     return Exported(places[0], gates, notes)
 
 
@@ -155,26 +144,15 @@ def _record(folder: Path, made: ExportRecord) -> None:
     ExportRecords(exports={**known.exports, made.format: made}).write(folder)
 
 
-def export_vehicle(
-    file: Path,
-    kind: str,
-    *,
-    today: date,
-    into: Path | None = None,
-    out: Path | None = None,
-    simulator: str = "",
-    accept: str = "",
-) -> Exported:
+def export_vehicle(file: Path, asked: ExportOptions, *, today: date) -> Exported:
     """Write the coefficients of a vehicle file in a format: no flight says that they are right.
 
     Parameters
     ----------
     file
         Of the vehicle; what its ``source`` says of each number is handed on.
-    out
-        Where to write; by default the model itself, or beside the vehicle file.
-    kind, today, into, simulator, accept
-        As of `export`.
+    asked, today
+        As of `export`; by default it is written beside the vehicle file.
 
     Raises
     ------
@@ -183,17 +161,17 @@ def export_vehicle(
     ExportError, OutputError
         As of `export`.
     """
-    vehicle, choices = read_vehicle(file), Choices(into, simulator)
-    target = target_of(kind).chosen(choices)
+    vehicle, choices = read_vehicle(file), Choices(asked.into, asked.simulator)
+    target = target_of(asked.format).chosen(choices)
     check_every_coefficient(vehicle, target)
-    line, sources = provenance_of_file(vehicle, file, today, accept)
+    line, sources = provenance_of_file(vehicle, file, today, asked.accept)
     draft = target.draft(vehicle, line, replace(choices, simulator=target.simulator_name))
     beside = file.with_name(f"{file.stem}{target.suffix}")
     if beside.name == file.name:
         beside = file.with_name(f"{file.stem}_exported{target.suffix}")
-    places = _places(draft, out or into or beside, into)
+    places = _places(draft, asked.out or asked.into or beside, asked.into)
     gates = (*draft.gates, check_hover(target.flown(vehicle), draft.vehicle), *not_flown())
-    refuse(file, gates, accept, "correct the vehicle file or the model")
+    refuse(file, gates, asked.accept, "correct the vehicle file or the model")
     write(draft, *places)
     computed = () if target.simulator is None else target.simulator.deviations
     lacks = tuple(f"{target.simulator_name} computes otherwise: {what}" for what in computed)
@@ -203,46 +181,31 @@ def export_vehicle(
 
 def export_draws(
     run: Run,
-    kind: str,
-    count: int,
+    asked: ExportOptions,
     *,
     refly: Refly,
     today: date,
     refit: Refit | None = None,
-    out: Path | None = None,
-    simulator: str = "",
-    accept: str = "",
 ) -> Exported:
     """Write draws of a run's joint posterior in a format, once the run itself may be exported.
 
     Parameters
     ----------
-    run, kind, refly, today, refit, simulator, accept
-        As of `export`.
-    count
-        How many.
-    out
-        Folder; by default ``export/draws`` in the result folder.
+    run, asked, refly, today, refit
+        As of `export`; written into a folder, by default ``export/draws`` in the result folder.
 
     Raises
     ------
     InputError
         As `export` raises, or the run has no covariance to draw from.
     """
-    folder = out or run.folder / FOLDER / "draws"
-    draws = draws_of(run, count)
-    target = target_of(kind).chosen(Choices(simulator=simulator))
+    assert asked.draws is not None
+    folder = asked.out or run.folder / FOLDER / "draws"
+    draws = draws_of(run, asked.draws)
+    target = target_of(asked.format).chosen(Choices(simulator=asked.simulator))
     name = file_name(run.vehicle.name, target.suffix)
-    done = export(
-        run,
-        kind,
-        refly=refly,
-        today=today,
-        refit=refit,
-        out=inside(folder, name),
-        simulator=simulator,
-        accept=accept,
-    )
+    first = replace(asked, out=inside(folder, name))
+    done = export(run, first, refly=refly, today=today, refit=refit)
     flying, _ = in_simulator(run, target, refit)
     choices = Choices(simulator=target.simulator_name)
     notes = write_draws(
@@ -251,7 +214,7 @@ def export_draws(
         folder,
         target.suffix,
         lambda vehicle, line: target.draft(vehicle, line, choices),
-        provenance=f"draw of the posterior; {provenance(run, today, accept)}",
+        provenance=f"draw of the posterior; {provenance(run, today, asked.accept)}",
         ranges=ISAAC_LAB.flown if target.simulator is ISAAC_LAB else None,
     )
     return replace(done, path=folder, notes=(*done.notes, *notes))
@@ -333,15 +296,8 @@ def exports_of_job(
     for kind in wanted.formats:
         into = wanted.into if target_of(kind).patches else None
         try:
-            done = export(
-                run,
-                kind,
-                refly=refly,
-                today=today,
-                refit=refit,
-                into=into,
-                copies=folder / FOLDER,
-            )
+            asked, copies = ExportOptions(kind, into=into), folder / FOLDER
+            done = export(run, asked, refly=refly, today=today, refit=refit, copies=copies)
             yield kind, done.path
         except InputError as error:
             _record(folder, ExportRecord(format=kind, refused=str(error)))

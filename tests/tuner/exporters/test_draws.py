@@ -11,6 +11,7 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of
 from tuner.exporters.export import export_draws
 from tuner.exporters.target import assigned
+from tuner.options import ExportOptions
 from tuner.uncertainty.sensitivity_json import Knowledge
 from tuner.vehicle import read_vehicle, values_of
 
@@ -85,9 +86,8 @@ def test_bounds_and_rigid_bodies_are_kept(run):
 
 
 def test_draws_become_a_table_files_and_ranges(run, tmp_path):
-    done = export_draws(
-        run, "isaaclab", 30, refly=as_the_run_says, today=TODAY, out=tmp_path / "draws"
-    )
+    asked = ExportOptions("isaaclab", draws=30, out=tmp_path / "draws")
+    done = export_draws(run, asked, refly=as_the_run_says, today=TODAY)
     assert any("30 draws of the joint posterior" in note for note in done.notes)
     with (tmp_path / "draws" / "draws.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -101,7 +101,8 @@ def test_draws_become_a_table_files_and_ranges(run, tmp_path):
 
 
 def test_each_draw_is_a_vehicle_file(run, tmp_path):
-    export_draws(run, "yaml", 3, refly=as_the_run_says, today=TODAY, out=tmp_path / "d")
+    asked = ExportOptions("yaml", draws=3, out=tmp_path / "d")
+    export_draws(run, asked, refly=as_the_run_says, today=TODAY)
     vehicles = [read_vehicle(path) for path in sorted((tmp_path / "d").glob("draw_*.yaml"))]
     assert len({v.aerodynamics.motor_constant for v in vehicles}) == 3
     assert {values_of(v)["mass"] for v in vehicles} == {2.243}

@@ -9,6 +9,7 @@ from tuner.core.errors import ExportError, InputError
 from tuner.exporters.export import export, exports_of_job
 from tuner.exporters.gates import check
 from tuner.exporters.target import Draft, write
+from tuner.options import ExportOptions
 from tuner.report.result_texts import export_sentence
 from tuner.result import EffectiveResult, LostTerm, PoseRmse
 from tuner.vehicle import read_vehicle
@@ -17,7 +18,7 @@ TODAY = date(2024, 5, 6)
 
 
 def exported(run, kind="yaml", refly=as_the_run_says, **options):
-    return export(run, kind, refly=refly, today=TODAY, **options)
+    return export(run, ExportOptions(kind, **options), refly=refly, today=TODAY)
 
 
 def test_yaml_carries_source_date_run_and_confidence(make_run):

@@ -11,6 +11,7 @@ from tuner.exporters import effective
 from tuner.exporters.effective import kept_effective, refly
 from tuner.exporters.export import export
 from tuner.exporters.simulators import GZ_SIM
+from tuner.options import ExportOptions
 from tuner.result import (
     CoefficientResult,
     FlightResult,
@@ -89,7 +90,7 @@ def run(bag, flight, updated, tmp_path):
 def test_a_true_run_flies_again_as_it_says(run):
     again = refly(run, run.vehicle)["small_circle"]
     assert again.model_dump() == pytest.approx(run.result.flights[0].rmse_best.model_dump())
-    done = export(run, "yaml", refly=refly, today=date(2024, 5, 6))
+    done = export(run, ExportOptions("yaml"), refly=refly, today=date(2024, 5, 6))
     assert all(gate.passed for gate in done.gates)
     assert read_vehicle(done.path).aerodynamics == run.vehicle.aerodynamics
 
@@ -114,7 +115,7 @@ def test_numbers_that_fly_otherwise_are_refused(run):
     ):
         other = run.model_copy(update={"vehicle": with_values(run.vehicle, values)})
         with pytest.raises(ExportError, match=expected):
-            export(other, "yaml", refly=refly, today=date(2024, 5, 6))
+            export(other, ExportOptions("yaml"), refly=refly, today=date(2024, 5, 6))
 
 
 def test_a_recording_that_is_gone_or_changed_is_said(run, tmp_path):
@@ -131,7 +132,7 @@ def test_a_recording_that_is_gone_or_changed_is_said(run, tmp_path):
             update={"result": run.result.model_copy(update={"flights": flights})}
         )
         with pytest.raises(ExportError, match=expected):
-            export(other, "yaml", refly=refly, today=date(2024, 5, 6))
+            export(other, ExportOptions("yaml"), refly=refly, today=date(2024, 5, 6))
 
 
 def test_the_command_exports_and_says_what_it_did(run, capsys, tmp_path):
@@ -163,8 +164,8 @@ def test_a_simulator_gets_coefficients_of_its_own_and_flies_as_it_computes(run, 
     run = run.model_copy(update={"result": result})
     today = date(2024, 5, 6)
     with pytest.raises(ExportError, match="small_circle"):  # physical ones fly otherwise there
-        export(run, "gz-sim", refly=refly, today=today)
-    done = export(run, "gz-sim", refly=refly, refit=kept_effective, today=today)
+        export(run, ExportOptions("gz-sim"), refly=refly, today=today)
+    done = export(run, ExportOptions("gz-sim"), refly=refly, refit=kept_effective, today=today)
     assert all(gate.passed for gate in done.gates)
     vehicle, found = kept_effective(run, GZ_SIM)
     assert found.rmse_effective.position < found.rmse_unfitted.position

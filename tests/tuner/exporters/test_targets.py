@@ -14,6 +14,7 @@ from tuner.exporters.export import export_vehicle
 from tuner.exporters.flier import flier
 from tuner.exporters.simulators import SIMULATORS, hover_command, thrust_to_weight
 from tuner.exporters.target import Choices, target_of, write
+from tuner.options import ExportOptions
 from tuner.search.job_flights import Recording
 from tuner.vehicle import ControllerFile, read_vehicle, values_of, write_vehicle
 
@@ -66,7 +67,7 @@ def test_a_vehicle_file_is_exported_without_a_run(kind, tmp_path):
         "new-vehicle --mass 1.4 --wheelbase 0.45 --propeller 10x4.5 --motor-kv 920 --cells 3 "
         f"--quiet --out {tmp_path}/quad.yaml".split()
     )
-    done = export_vehicle(tmp_path / "quad.yaml", kind, today=TODAY)
+    done = export_vehicle(tmp_path / "quad.yaml", ExportOptions(kind), today=TODAY)
     assert done.path.parent == tmp_path
     assert "by scaling laws, not measured; no flight was compared" in done.path.read_text()
     assert any(note.startswith("motor_constant 1.459e-05") for note in done.notes)
@@ -87,7 +88,7 @@ def test_a_vehicle_file_goes_into_a_model_that_fits_it(tmp_path, capsys):
     write_vehicle(vehicle.replace(mass=8.0), file)
     before = model.read_text()
     with pytest.raises(ExportError, match="cannot hover"):
-        export_vehicle(file, "sdf", today=TODAY, into=model)
+        export_vehicle(file, ExportOptions("sdf", into=model), today=TODAY)
     assert model.read_text() == before
 
 

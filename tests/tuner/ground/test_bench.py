@@ -14,6 +14,7 @@ from tuner.config import TrajectorySettings
 from tuner.exporters.effective import refly
 from tuner.exporters.export import export
 from tuner.job.ground import bench
+from tuner.options import ExportOptions
 from tuner.report import render
 from tuner.result import read_run
 from tuner.vehicle import ControllerFile, read_vehicle, values_of
@@ -56,7 +57,7 @@ def test_the_page_shows_which_samples_were_used(example):
 
 def test_the_result_is_exported_like_a_fit_s(example, tmp_path):
     path = tmp_path / "quad.yaml"
-    export(example, "yaml", refly=refly, today=datetime.date(2026, 1, 1), out=path)
+    export(example, ExportOptions("yaml", out=path), refly=refly, today=datetime.date(2026, 1, 1))
     assert values_of(read_vehicle(path)) == values_of(example.vehicle)
 
 
