@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
-from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Scope
+from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried
 
 _OF_SETUP = NotCarried("it belongs to the set-up, not to the vehicle")
 _OUTSIDE = {"sdf": _OF_SETUP, "px4": _OF_SETUP}
@@ -13,23 +14,16 @@ _CLOCKS = "clocks of the recording"
 _SMOOTHED = "smoothing error of the motion capture"
 
 
-def _frame(name: str, unit: str, meaning: str, source: str, *, prior_sd: float) -> Coefficient:
+_setup = partial(Coefficient, scope="setup", exported_as=_OUTSIDE)
+#: What is zero unless each flight, or each window, says otherwise.
+_flight = partial(Coefficient, scope="flight", scale="linear", neutral=0.0)
+_window = partial(Coefficient, scope="window", scale="linear", neutral=0.0, count=3)
+
+
+def _frame(name: str, unit: str, meaning: str, source: str, prior_sd: float) -> Coefficient:
     """Return the row of one axis of where something sits on the vehicle, off by what is usual."""
-    return Coefficient(
-        name=name,
-        unit=unit,
-        meaning=meaning,
-        source=source,
-        scope="setup",
-        place=(EFFECTS, name),
-        scale="linear",
-        bounds=(-0.3, 0.3),
-        prior_sd=prior_sd,
-        step=0.01,
-        neutral=0.0,
-        group=name[:-2],
-        exported_as=_OUTSIDE,
-    )
+    more = _setup(name, unit, meaning, source, place=(EFFECTS, name), scale="linear", neutral=0.0)
+    return replace(more, bounds=(-0.3, 0.3), prior_sd=prior_sd, step=0.01, group=name[:-2])
 
 
 _marker = partial(
@@ -41,59 +35,17 @@ def _factor(
     name: str, meaning: str, source: str, *, group: str, bounds: float, prior_sd: float
 ) -> Coefficient:
     """Return the row of a factor of the set-up that is one where all is as it is said to be."""
-    return Coefficient(
-        name=name,
-        unit="",
-        meaning=meaning,
-        source=source,
-        scope="setup",
-        place=(EFFECTS, name),
-        bounds=bounds,
-        prior_sd=prior_sd,
-        step=0.5 * prior_sd,
-        neutral=1.0,
-        group=group,
-        exported_as=_OUTSIDE,
-    )
+    more = _setup(name, "", meaning, source, place=(EFFECTS, name), bounds=bounds, neutral=1.0)
+    return replace(more, prior_sd=prior_sd, step=0.5 * prior_sd, group=group)
 
-
-def _around(
-    name: str,
-    unit: str,
-    prior_sd: float,
-    meaning: str,
-    source: str,
-    *,
-    scope: Scope,
-    group: str = "",
-    count: int = 1,
-) -> Coefficient:
-    """Return the row of what is zero unless each flight, or each window, says otherwise."""
-    return Coefficient(
-        name=name,
-        unit=unit,
-        meaning=meaning,
-        source=source,
-        scope=scope,
-        scale="linear",
-        prior_sd=prior_sd,
-        neutral=0.0,
-        group=group,
-        count=count,
-    )
-
-
-_of_flight = partial(_around, scope="flight")
-_of_window = partial(_around, scope="window", count=3)
 
 SURROUNDING_ROWS = (
     # what the set-up adds
-    Coefficient(
-        name="estimate_latency",
-        unit="s",
-        meaning="age of the state that the controllers see",
-        source="motion capture, network and estimator of the laboratory",
-        scope="setup",
+    _setup(
+        "estimate_latency",
+        "s",
+        "age of the state that the controllers see",
+        "motion capture, network and estimator of the laboratory",
         place=("setup", "estimate_latency"),
         scale="linear",
         bounds=(0.0, 0.1),
@@ -101,15 +53,13 @@ SURROUNDING_ROWS = (
         step=0.01,
         free=True,
         neutral=0.0,
-        exported_as=_OUTSIDE,
         informed_by="closed loop",
     ),
-    Coefficient(
-        name="actuator_latency",
-        unit="s",
-        meaning="from a motor command to its effect",
-        source="output driver and speed controller",
-        scope="setup",
+    _setup(
+        "actuator_latency",
+        "s",
+        "from a motor command to its effect",
+        "output driver and speed controller",
         place=("setup", "actuator_latency"),
         scale="linear",
         bounds=(0.0, 0.04),
@@ -118,21 +68,18 @@ SURROUNDING_ROWS = (
         free=True,
         hold_rank=3,
         neutral=0.0,
-        exported_as=_OUTSIDE,
         informed_by="commands and rotor speed",
     ),
-    Coefficient(
-        name="gyro_cutoff",
-        unit="Hz",
-        meaning="low-pass filter of the gyro",
-        source="PX4 IMU_GYRO_CUTOFF",
-        scope="setup",
+    _setup(
+        "gyro_cutoff",
+        "Hz",
+        "low-pass filter of the gyro",
+        "PX4 IMU_GYRO_CUTOFF",
         place=("setup", "gyro_cutoff"),
         bounds=4.0,
         prior_sd=0.5,
         fallback=("filters", "gyro_cutoff"),
         leaf=("controller", "filters", "gyro_cutoff"),
-        exported_as=_OUTSIDE,
     ),
     *(
         _marker(
@@ -156,7 +103,7 @@ SURROUNDING_ROWS = (
             "rad",
             f"rotation vector from the body's axes to the autopilot's, {direction}",
             "how the autopilot is mounted; PX4 SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF",
-            prior_sd=0.02,
+            0.02,
         )
         for axis, direction in (("x", "forward"), ("y", "left"))
     ),
@@ -186,47 +133,48 @@ SURROUNDING_ROWS = (
         )
     ),
     # what a recording may get wrong by a constant
-    _of_flight(
-        "pose", "s", 0.02, "lateness of the clock that stamps the motion capture's poses", _CLOCKS
+    _flight(
+        "pose",
+        "s",
+        "lateness of the clock that stamps the motion capture's poses",
+        _CLOCKS,
+        prior_sd=0.02,
     ),
-    _of_flight(
+    _flight(
         "flight_controller",
         "s",
-        0.02,
         "lateness of the clock that stamps what the flight controller publishes",
         _CLOCKS,
+        prior_sd=0.02,
     ),
     *(
-        _of_flight(
+        _flight(
             f"gyro_{axis}",
             "rad/s",
-            0.02,
             f"bias of the recorded body rate about {direction}",
             "gyro bias",
+            prior_sd=0.02,
         )
         for axis, direction in _AXES.items()
     ),
     # what surrounds a flight
     *(
-        _of_flight(
+        _flight(
             f"wind_{axis}",
             "m/s",
-            0.5,
             f"steady velocity of the air towards world {axis} during a flight",
             "air conditioning of the hall; the vehicle's own wash",
+            prior_sd=0.5,
             group="wind",
         )
         for axis in "xy"
     ),
-    Coefficient(
-        name="battery_decline",
-        unit="1/s",
-        meaning="share of the rotor speeds that is lost each second of a flight",
-        source="thesis 10.4, where no voltage was recorded: Ω·(1 - λt)",
-        scope="flight",
-        scale="linear",
+    _flight(
+        "battery_decline",
+        "1/s",
+        "share of the rotor speeds that is lost each second of a flight",
+        "thesis 10.4, where no voltage was recorded: Ω·(1 - λt)",
         prior_sd=0.004,
-        neutral=0.0,
         group="battery_decline",
         exported_as={
             "sdf": NotCarried("the motor plugins know no battery", 0.0),
@@ -234,65 +182,65 @@ SURROUNDING_ROWS = (
         },
     ),
     *(
-        _of_flight(
+        _flight(
             f"accelerometer_{axis}",
             "m/s²",
-            0.5,
             f"bias of the recorded specific force along {direction}",
             "accelerometer bias, and the tilt of the sensor in the body",
+            prior_sd=0.5,
             group="accelerometer",
         )
         for axis, direction in _AXES.items()
     ),
     # by how much the start of a window differs from the recorded state
-    _of_window(
+    _window(
         "position",
         "m",
-        0.01,
         "position at the start of a window, from the smoothed recording's",
         _SMOOTHED,
+        prior_sd=0.01,
     ),
-    _of_window(
+    _window(
         "velocity",
         "m/s",
-        0.1,
         "velocity at the start of a window, from the smoothed recording's",
         _SMOOTHED,
+        prior_sd=0.1,
     ),
-    _of_window(
+    _window(
         "attitude",
         "rad",
-        0.03,
         "attitude at the start of a window about the body's axes, from the recording's",
         _SMOOTHED,
+        prior_sd=0.03,
     ),
-    _of_window(
+    _window(
         "body_rate",
         "rad/s",
-        0.3,
         "body rate at the start of a window, from the smoothed recording's",
         "smoothing error of the gyro",
+        prior_sd=0.3,
     ),
-    _of_window(
+    _window(
         "rotor_speed",
         "",
-        0.05,
         "share by which a rotor turns faster at the start of a window than recorded",
         "smoothing error of the tachometer, or of the command's lag",
+        prior_sd=0.05,
         count=4,
     ),
-    _of_window(
+    _window(
         "rate_integral",
         "",
-        0.05,
         "output of the rate controller's integrator at the start of a window",
         "no recording holds it",
+        prior_sd=0.05,
     ),
-    _of_window(
+    _window(
         "trim",
         "",
-        0.02,
         "steady difference between commanded and acting torque during a window",
         "uneven rotors and an offset mass; the integrator takes it in closed loop",
+        prior_sd=0.02,
     ),
 )
