@@ -27,7 +27,11 @@ PEERS = {
     ),
     api.compare: (compare_command, {"vehicles": "vehicle"}, {"quiet", "laps", "plot"}),
     api.simulate: (simulate_command, {"grid": "sweep"}, {"quiet", "out"}),
-    api.sensitivity: (sensitivity_command, {"free": "fit", "fixed": "fix"}, {"quiet", "verbose"}),
+    api.sensitivity: (
+        sensitivity_command,
+        {"free": "fit", "fixed": "fix", "global_method": "global_"},
+        {"quiet", "verbose"},
+    ),
     api.export: (export_command, {}, {"quiet"}),
 }
 
