@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.air import wandering
 from sim_jax.constants import GRAVITY
 from tuner.core.disk import write_text
-from tuner.job.new_vehicle import new_vehicle
-from tuner.vehicle.scaling_laws import INCH, Airframe
+from tuner.vehicle.scaling_laws import INCH, Airframe, new_vehicle
 
 Numbers = NDArray[np.float64]
 

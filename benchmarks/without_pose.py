@@ -21,7 +21,7 @@ from tuner.core.errors import InputError
 from tuner.evaluate.predict import Predictions, predict
 from tuner.job.without_pose import fit_without_pose
 from tuner.recordings.flight import Flight, Series
-from tuner.recordings.inertial import InertialFlight
+from tuner.recordings.loader import InertialFlight
 from tuner.recordings.states import initial_state
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import without_pose

@@ -77,8 +77,8 @@ def new_vehicle(
     like
         Scale from this known vehicle, and take from it what is not given.
     """
-    from tuner.job.new_vehicle import new_vehicle as make
     from tuner.vehicle.scaling_laws import KNOWN
+    from tuner.vehicle.scaling_laws import new_vehicle as make
 
     if layout != "x":
         remedy = "describe it with the body axes turned by 45 degrees, as an x"

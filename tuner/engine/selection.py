@@ -1,15 +1,152 @@
-"""The engine that ``--workers`` and ``--cluster`` name."""
+"""The cluster file, and the engine that ``--workers`` and ``--cluster`` name."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from annotated_types import Interval
+from pydantic import StringConstraints, model_validator
 
 from tuner.core.errors import ConfigError, InputError
-from tuner.core.yaml_section import build
-from tuner.engine.cluster_file import ClusterFile, read_cluster
+from tuner.core.yaml_section import Section, Whole, build, read_model, refuse
 from tuner.engine.engine import HERE, Engine, using
+
+Memory = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)? ?[KMGT]i?B$")]
+Address = Annotated[
+    str, StringConstraints(pattern=r"^(tcp|tls|ws|wss|ucx)://[^\s/]+:[0-9]{1,5}/?$")
+]
+System = Literal["slurm", "pbs", "lsf", "sge"]
+SCHEMES = ("tcp://", "tls://", "ws://", "wss://", "ucx://")
+
+
+class Tls(Section):
+    """Certificates by which workers, scheduler and client know each other; paths of PEM files."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+class JobQueue(Section):
+    """A batch system from which `dask_jobqueue` gets workers, one a job.
+
+    Attributes
+    ----------
+    system
+        The batch system.
+    queue, account, walltime
+        As the batch system names them.
+    directives
+        Further lines of the job script's head, without the comment sign that begins them.
+    prologue
+        Commands before the worker, as ``module load python``.
+    python
+        The Python of the nodes that has tune installed; None takes this one.
+    interface
+        The network interface by which the nodes reach each other, as ``ib0``.
+    scratch
+        A folder of the nodes for the workers' files.
+    logs
+        A folder for the jobs' output.
+    """
+
+    system: System
+    queue: str | None = None
+    account: str | None = None
+    walltime: str | None = None
+    directives: tuple[str, ...] = ()
+    prologue: tuple[str, ...] = ()
+    python: str | None = None
+    interface: str | None = None
+    scratch: str | None = None
+    logs: str | None = None
+
+
+class Kubernetes(Section):
+    """Workers that `dask_kubernetes` starts as pods; its operator runs in the cluster.
+
+    Attributes
+    ----------
+    image
+        Has tune with its extra ``cluster`` installed, the same versions as here.
+    namespace, name
+        Of the Dask cluster that is made.
+    """
+
+    image: str
+    namespace: str | None = None
+    name: str = "tune"
+
+
+class ClusterFile(Section):
+    """Where workers come from; without ``address``, ``queue`` and ``kubernetes``, this machine.
+
+    Attributes
+    ----------
+    workers
+        Their number.
+    cores
+        Processor cores of each.
+    memory
+        Of each, as ``2GiB``: a worker that takes more is ended and its task computed again. None
+        shares the machine's out, and is possible on this machine alone.
+    gpus
+        Of this machine, which its workers take in turn, each one alone.
+    address, tls
+        A running scheduler; its workers bring their own cores and memory.
+    jobs, kubernetes
+        What starts workers.
+    store
+        Folder or URL that all workers reach, from which they get data by content; None takes the
+        folder of what this program keeps, which must then be on a disk that all share.
+    """
+
+    workers: Annotated[Whole, Interval(ge=1, le=10_000)] = 1
+    cores: Annotated[Whole, Interval(ge=1, le=1024)] = 1
+    memory: Memory | None = None
+    gpus: Annotated[Whole, Interval(ge=0, le=64)] = 0
+    address: Address | None = None
+    tls: Tls | None = None
+    jobs: JobQueue | None = None
+    kubernetes: Kubernetes | None = None
+    store: str | None = None
+
+    @model_validator(mode="after")
+    def _contradict_nothing(self) -> Self:
+        given = [key for key in ("address", "jobs", "kubernetes") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise refuse(f"both '{given[0]}' and '{given[1]}' are given", "keep one of them")
+        if given and given != ["address"] and self.memory is None:
+            raise refuse(f"'{given[0]}' needs the memory of a worker", "add memory: 2GiB")
+        if given and self.gpus:
+            raise refuse("'gpus' counts those of this machine", "leave it out")
+        if self.tls is not None and given != ["address"]:
+            raise refuse("'tls' belongs to an address", "give address: tls://HOST:8786")
+        return self
+
+
+def read_cluster(reference: str) -> ClusterFile:
+    """Read a cluster file; the address of a scheduler stands for a file that names it alone.
+
+    Raises
+    ------
+    ConfigError
+        In one line: the file, the key, its value, what it should be.
+    """
+    if reference.startswith(SCHEMES):
+        return build(ClusterFile, {"address": reference}, "--cluster")
+    path = Path(reference).expanduser()
+    file = read_model(ClusterFile, path)
+    if file.tls is None:
+        return file
+    folder = path.parent
+    found = {name: folder / getattr(file.tls, name) for name in Tls.model_fields}
+    return file.replace(tls=Tls(**found))
+
 
 PACKAGES = ("dask", "distributed", "dask_jobqueue", "dask_kubernetes", "cloudpickle", "fsspec")
 

@@ -22,7 +22,7 @@ from tuner.ground.measurement import Curve, Measurement, Remark
 from tuner.inertial.fit import OUTPUTS, STEADY, Response, fit_response
 from tuner.inertial.signals import stretches_of
 from tuner.objective.motor_order import order_findings
-from tuner.recordings.inertial import InertialFlight
+from tuner.recordings.loader import InertialFlight
 from tuner.vehicle import VehicleFile
 
 NUMBERS = (

@@ -20,7 +20,7 @@ from tuner.inertial.prediction import AHEAD, rate_errors
 from tuner.inertial.signals import stretches_of
 from tuner.job.ground import BenchResult, conflicts_of, known_of, vehicle_of, written
 from tuner.job.listener import SILENT, Listener
-from tuner.recordings.inertial import InertialFlight
+from tuner.recordings.loader import InertialFlight
 from tuner.search.job_flights import left_out_of
 from tuner.vehicle import VehicleFile, values_of, with_values
 

@@ -30,7 +30,6 @@ from tuner.recordings.defects import is_stale
 from tuner.recordings.flight import SIGNALS, Array, Series
 from tuner.recordings.formats import is_tabular, open_recording
 from tuner.recordings.frames import noted_contradiction
-from tuner.recordings.inertial import flying, is_inertial, obstacle
 from tuner.recordings.inspection import (
     Informed,
     Inlet,
@@ -40,7 +39,7 @@ from tuner.recordings.inspection import (
     TopicReport,
 )
 from tuner.recordings.interpolation import RATE, derivative, resample, smooth, upward
-from tuner.recordings.loader import keep_flights
+from tuner.recordings.loader import flying, is_inertial, keep_flights, obstacle
 from tuner.recordings.missions import yaw_spin
 from tuner.recordings.notes import Note, NoteCode
 from tuner.recordings.recording import Samples, Topic

@@ -26,8 +26,7 @@ from tuner.objective.windows import require_windows
 from tuner.recordings.defects import is_stale
 from tuner.recordings.flight import Flight
 from tuner.recordings.frames import noted_contradiction
-from tuner.recordings.inertial import InertialFlight, read_inertial
-from tuner.recordings.loader import load_flights
+from tuner.recordings.loader import InertialFlight, load_flights, read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.recordings.ulog import parameters_of
 from tuner.search.inlet_choice import FED_BY, choose_inlet

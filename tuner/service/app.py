@@ -26,13 +26,11 @@ from tuner.engine.selection import engine_for
 from tuner.service import tokens
 from tuner.service.errors import ServiceError
 from tuner.service.http import api, watching
-from tuner.service.metrics import Metrics
 from tuner.service.safety import Guard
-from tuner.service.service import Service
+from tuner.service.service import Metrics, Service
 from tuner.service.settings import ServiceSettings
 from tuner.service.shapes import API, Problem
-from tuner.service.web.pages import web
-from tuner.service.web.rendering import render
+from tuner.service.web.pages import render, web
 from tuner.service.words import over_http
 
 logger = logging.getLogger(__name__)

@@ -22,11 +22,10 @@ from tuner.core.errors import InputError
 from tuner.core.runtime import installed
 from tuner.service import jobs, recordings
 from tuner.service.errors import NotKnownError, ServiceError, TooManyError, UnavailableError
-from tuner.service.history import history
-from tuner.service.metrics import Metrics
+from tuner.service.jobs import history
 from tuner.service.request import JobRequest
 from tuner.service.safety import REPORT_POLICY
-from tuner.service.service import Service
+from tuner.service.service import Metrics, Service
 from tuner.service.shapes import (
     API,
     Accepted,

@@ -27,8 +27,7 @@ from tuner.service.errors import (
     TooLargeError,
     TooManyError,
 )
-from tuner.service.metrics import Metrics
-from tuner.service.service import Service
+from tuner.service.service import Metrics, Service
 from tuner.service.settings import size_in_words
 
 COOKIE = "tune_session"

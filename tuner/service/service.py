@@ -1,20 +1,27 @@
-"""The parts of one server, made once and handed to whoever answers a request."""
+"""The parts of one server, made once and handed to whoever answers; its metrics."""
 
 from __future__ import annotations
 
 import shutil
 import threading
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from tuner.core.content_store import ContentStore
 from tuner.core.disk import make_folder, write_text
 from tuner.core.errors import InputError
 from tuner.engine.engine import Engine
+from tuner.service import jobs
 from tuner.service.database import Database
 from tuner.service.dispatcher import Dispatcher
+from tuner.service.errors import UnavailableError
 from tuner.service.queue import Queue
 from tuner.service.settings import ServiceSettings
 
@@ -102,3 +109,50 @@ def _only_server(data: Path) -> IO[str]:
             data, "is used by another server", "stop that one, or name another folder with --data"
         ) from None
     return file
+
+
+class Metrics:
+    """The counters of one server."""
+
+    def __init__(self, service: Service) -> None:
+        self.registry = CollectorRegistry()
+        self.registry.register(_Table(service))
+        self.seconds = Histogram(
+            "tune_request_seconds",
+            "Time to answer, by route.",
+            ("method", "route", "status"),
+            registry=self.registry,
+        )
+        self.uploaded = Counter(
+            "tune_uploaded_bytes", "Bytes of recordings that were received.", registry=self.registry
+        )
+
+    def text(self) -> bytes:
+        """Return all of them in Prometheus' format."""
+        return generate_latest(self.registry)
+
+
+class _Table(Collector):
+    """What the job table and the dispatcher say."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    def collect(self) -> Iterator[Metric]:
+        deaths = CounterMetricFamily("tune_worker_deaths", "Workers that died.")
+        deaths.add_metric([], self._service.dispatcher.deaths)
+        yield deaths
+        up = GaugeMetricFamily("tune_database_up", "Whether the database answers.")
+        try:
+            found = jobs.counts(self._service.database)
+        except UnavailableError:
+            found = {}
+        up.add_metric([], float(bool(found)))
+        yield up
+        gauge = GaugeMetricFamily("tune_jobs", "Jobs by state.", labels=["state"])
+        for state, count in found.items():
+            gauge.add_metric([state], count)
+        yield gauge
+
+    def describe(self) -> Iterator[Metric]:
+        return iter(())

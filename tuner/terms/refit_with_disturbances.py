@@ -29,8 +29,7 @@ from tuner.terms.innovations import Innovations, outside
 from tuner.terms.search_with_terms import candidates_of
 from tuner.terms.selection_state import Selected
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.examination import Examination, examine
-from tuner.uncertainty.full_problem import full_problem_of
+from tuner.uncertainty.examination import Examination, examine, full_problem_of
 from tuner.uncertainty.holding import with_undetermined_held
 from tuner.uncertainty.lacking import lack_of
 

@@ -17,7 +17,7 @@ from tuner.objective.normal import Objective
 from tuner.search.levenberg_marquardt import advance, begin
 from tuner.uncertainty.covariance import WIDE
 from tuner.uncertainty.estimates import Uncertainty
-from tuner.uncertainty.full_problem import FullProblem
+from tuner.uncertainty.examination import FullProblem
 from tuner.uncertainty.records import THRESHOLD, Profile
 from tuner.vehicle import COEFFICIENTS
 

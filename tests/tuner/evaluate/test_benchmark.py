@@ -10,7 +10,7 @@ from benchmarks.regression import Regression
 from benchmarks.without_pose import posed
 from tuner.core.errors import InputError
 from tuner.evaluate.predict import hold
-from tuner.recordings.inertial import InertialFlight
+from tuner.recordings.loader import InertialFlight
 
 
 def test_linear_regression_predicts_better_than_one_that_holds(full_flight):

@@ -19,7 +19,7 @@ from tuner.job.ground import least_noticed, vehicle_of
 from tuner.job.without_pose import fit_without_pose
 from tuner.options import SimulationOptions
 from tuner.recordings import inspect_recordings
-from tuner.recordings.inertial import read_inertial
+from tuner.recordings.loader import read_inertial
 from tuner.recordings.notes import NoteCode
 from tuner.result import BEST_FIT_FILE
 from tuner.search.job_flights import read_usable, without_pose

@@ -20,8 +20,8 @@ from tuner.objective.explained import levers
 from tuner.objective.motor_order import order_findings
 from tuner.recordings import Flight, load_flight
 from tuner.recordings.flight import Series
-from tuner.recordings.inertial import read_inertial
 from tuner.recordings.inspector import suggested_map
+from tuner.recordings.loader import read_inertial
 from tuner.recordings.matlab import MAGIC
 from tuner.recordings.notes import NoteCode, note_in_words
 from tuner.search.job_flights import read_recordings

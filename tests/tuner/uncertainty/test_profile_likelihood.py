@@ -16,7 +16,7 @@ from tuner.job.sensitivity import _uncertainty_with
 from tuner.objective.normal import Objective
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, uncertainty_of
-from tuner.uncertainty.full_problem import FullProblem, full_problem_of
+from tuner.uncertainty.examination import FullProblem, full_problem_of
 from tuner.uncertainty.profile_likelihood import profile_likelihood
 from tuner.uncertainty.records import Profile, Profiles
 

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import secrets
 import tempfile
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any
 
 import anyio.to_thread
 from fastapi import APIRouter, Form, Query, Request
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from pydantic import ValidationError
 from starlette.datastructures import FormData
 from starlette.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
@@ -22,22 +25,90 @@ from tuner.core.shipped import configs_folder
 from tuner.core.validation import config_error
 from tuner.core.yaml_document import read_yaml
 from tuner.evaluate.records import RMSE_UNITS
+from tuner.recordings.notes import Damage, Note, damage_sentence, note_in_words
 from tuner.report.outcome import flights_table, outcome, warnings_of
+from tuner.report.section import figures
 from tuner.service import jobs, recordings, tokens
 from tuner.service.errors import NoTokenError, ServiceError
-from tuner.service.history import history, vehicles
 from tuner.service.http import Served, service_of, upload
+from tuner.service.jobs import history, vehicles
 from tuner.service.queue import MOST_EVENTS
+from tuner.service.recordings import flight_name
 from tuner.service.request import JobRequest
-from tuner.service.safety import COOKIE
+from tuner.service.safety import COOKIE, VISITOR
 from tuner.service.service import Service
 from tuner.service.settings import size_in_words
-from tuner.service.shapes import API
+from tuner.service.shapes import API, iso
 from tuner.service.tables import FINISHED, JobRow, RecordingRow, State
 from tuner.service.web import comparing
-from tuner.service.web.drawing import history_bars, rmse_curve
-from tuner.service.web.rendering import render
+from tuner.service.web.comparing import history_bars, rmse_curve
 from tuner.service.words import on_the_web
+
+#: State -> what is said of it, and the class of its badge, as the report's verdicts have.
+STATES: Mapping[str, tuple[str, str]] = {
+    State.QUEUED: ("waiting", "kept"),
+    State.RUNNING: ("running", "weak"),
+    State.DONE: ("done", "well"),
+    State.FAILED: ("failed", "not"),
+    State.CANCELLED: ("cancelled", "kept"),
+}
+
+
+@cache
+def environment() -> Environment:
+    """Return the templates; whatever stands in them is escaped."""
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader("tuner.service.web"), PackageLoader("tuner.report")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    filters: dict[str, Callable[..., object]] = {
+        "figures": figures,
+        "short": lambda value: "–" if value is None else f"{value:.2g}",
+        "percent": lambda value: "–" if value is None else f"{100 * value:+.2f} %",
+        "mm": lambda value: "" if value is None else f"{1000 * value:.2f} mm",
+        "megabytes": lambda size: f"{size / 1e6:.1f} MB",
+        "ago": _ago,
+        "moment": lambda value: "" if value is None else iso(value),
+        "lasting": _lasting,
+        "flight": flight_name,
+        "web": on_the_web,
+        "note": lambda raw: note_in_words(Note.read(raw)),
+        "damage": lambda raw: damage_sentence(Damage.read(raw)),
+    }
+    made.filters |= filters
+    made.globals |= {"states": STATES, "visitor": VISITOR.get}
+    return made
+
+
+def render(template: str, status: int = 200, /, **values: object) -> HTMLResponse:
+    """Return a page."""
+    text = environment().get_template(template).render(**values)
+    return HTMLResponse(text, status_code=status)
+
+
+def _ago(seconds: float | None) -> str:
+    """Return how long ago a time was, in words."""
+    if seconds is None:
+        return ""
+    passed = max(0.0, time.time() - seconds)
+    for size, word in ((86400.0, "day"), (3600.0, "hour"), (60.0, "minute")):
+        if passed >= size:
+            count = int(passed / size)
+            return f"{count} {word}{'' if count == 1 else 's'} ago"
+    return "just now"
+
+
+def _lasting(seconds: float | None) -> str:
+    """Return a duration in words."""
+    if seconds is None:
+        return ""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
 
 web = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
