@@ -19,8 +19,8 @@ from tuner.cli import main
 from tuner.cli.results import print_run
 from tuner.evaluate.write import write_flights
 from tuner.report.contents import read_contents
+from tuner.report.page import sections_of
 from tuner.report.paper import plot_file
-from tuner.report.sections import sections_of
 from tuner.result import read_run
 
 pytestmark = pytest.mark.slow

@@ -167,7 +167,7 @@ def _written(folder: Path, exports: Sequence[object], seconds: float | None) -> 
 def print_sections(folder: Path) -> None:
     """Print what a result folder's page says, its figures left out."""
     from tuner.report.contents import read_contents
-    from tuner.report.sections import sections_of
+    from tuner.report.page import sections_of
 
     screen = console()
     for section in sections_of(read_contents(folder)):
@@ -203,7 +203,7 @@ def print_sensitivity(result: SensitivityResult, *, verbose: bool = False) -> No
     """Print what is known of each coefficient, what to fly next, and where everything lies."""
     from tuner.findings.findings import one_line
     from tuner.report.contents import read_contents
-    from tuner.report.sections import sections_of
+    from tuner.report.page import sections_of
     from tuner.uncertainty.verdict_texts import direction_in_words
 
     screen = console()

@@ -22,7 +22,7 @@ from tuner.core.numerics import symmetric_eigen
 from tuner.exporters.target import Draft, write
 from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
 from tuner.result import Run
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import Knowledge
 from tuner.vehicle import COEFFICIENTS, VehicleFile, values_of, with_values
 
 Array = NDArray[np.float64]

@@ -49,8 +49,7 @@ from tuner.search.normal_equations import normal_equations
 from tuner.search.problem import SPIN_CHANNELS, Job
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, knowledge_of
-from tuner.uncertainty.records import Sources
-from tuner.uncertainty.sensitivity_json import Knowledge, write_files
+from tuner.uncertainty.records import Knowledge, Sources, write_files
 from tuner.uncertainty.verdict import (
     NOT_EXAMINED,
     NOT_FITTED,

@@ -35,8 +35,7 @@ from tuner.uncertainty.estimates import Uncertainty
 from tuner.uncertainty.examination import Examination, examine
 from tuner.uncertainty.global_indices import global_sensitivity
 from tuner.uncertainty.profile_likelihood import profile_likelihood
-from tuner.uncertainty.records import Profiles
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import Knowledge, Profiles
 from tuner.vehicle import check_names, initial_values
 
 

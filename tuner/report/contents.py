@@ -20,8 +20,7 @@ from tuner.ground.bench_json import BenchRecord
 from tuner.recordings.flight import Array
 from tuner.result import ExportRecord, ExportRecords, Run, RunResult, read_run
 from tuner.search.iteration import Iteration
-from tuner.uncertainty.records import GlobalSensitivity, Profiles
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import GlobalSensitivity, Knowledge, Profiles
 
 if TYPE_CHECKING:
     from tuner.evaluate.rmse import FlightErrors

@@ -16,7 +16,7 @@ from tuner.ground.bench_json import BenchRecord, bench_in_words
 from tuner.report.result_texts import metres, simulator_lacks
 from tuner.report.section import Cell, Table
 from tuner.result import FlightResult, RunResult
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import Knowledge
 from tuner.uncertainty.verdict import Verdict
 from tuner.uncertainty.verdict_texts import verdict_in_words
 

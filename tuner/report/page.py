@@ -6,7 +6,8 @@ import base64
 import gzip
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -25,11 +26,56 @@ from tuner.report.outcome import (
 )
 from tuner.report.paper import write_plots
 from tuner.report.section import Section
-from tuner.report.sections import sections_of
+from tuner.report.sections.bench import bench
+from tuner.report.sections.coefficients import coefficients
+from tuner.report.sections.flights import flights, forces
+from tuner.report.sections.search import search, selection
+from tuner.report.sections.sensitivity import (
+    effects,
+    global_sensitivity,
+    information,
+    next_flight,
+    profiles,
+    residuals,
+)
+from tuner.report.sections.tables import effective, next_log, provenance, refits, remarks, sources
 
 REPORT_FILE = "report.html"
 LIBRARIES = ("d3.min.js", "plot.umd.min.js")
 """Observable Plot and what it draws with."""
+
+
+#: In the order in which a reader needs them.
+SECTIONS: tuple[Callable[[Contents], Section | None], ...] = (
+    coefficients,
+    flights,
+    selection,
+    effective,
+    bench,
+    sources,
+    refits,
+    next_flight,
+    next_log,
+    profiles,
+    global_sensitivity,
+    remarks,
+    forces,
+    effects,
+    information,
+    residuals,
+    search,
+    provenance,
+)
+
+
+def sections_of(contents: Contents) -> tuple[Section, ...]:
+    """Return the sections that apply."""
+    sections = (section(contents) for section in SECTIONS)
+    return tuple(
+        replace(section, charts=[chart for chart in section.charts if chart.is_worth_drawing])
+        for section in sections
+        if section is not None
+    )
 
 
 def render(folder: str | Path, *, plots: bool = False) -> Path:

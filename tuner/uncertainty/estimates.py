@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit  # scipy.stats takes a quarter of a second to import
 
-from tuner.core.numerics import Z95, Inverse, scaled_inverse
+from tuner.core.numerics import Z95, Inverse, scaled_inverse, symmetric_eigen
 from tuner.findings.findings import Code, Finding
 from tuner.objective.alternatives import DRAWS, LACK, READINGS, STEP
 from tuner.objective.criterion import Point
@@ -18,11 +18,10 @@ from tuner.objective.information import FisherInformation, information_at
 from tuner.objective.space import Space
 from tuner.search.fitted import Fitted
 from tuner.uncertainty.covariance import Covariance, covariance_of
-from tuner.uncertainty.directions import Direction, weakest
 from tuner.uncertainty.overdispersion import IndependentErrors, flights_apart
 from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict, judge
-from tuner.vehicle import COEFFICIENTS
+from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict, judge
+from tuner.vehicle import COEFFICIENTS, scale_group
 from tuner.vehicle.coefficient import Parameter
 
 Array = NDArray[np.float64]
@@ -420,3 +419,52 @@ def left_out(information: FisherInformation) -> Array | None:
     given = np.diag(inverse.sandwiched(np.zeros_like(total), information.given))
     # one degree of freedom is the estimate's own
     return independent.widened(beyond * np.maximum(known - given, 0.0), alike - 1.0)
+
+
+NAMED = 0.3
+"""Move of a coefficient, relative to the largest, from which it takes part in a direction."""
+ALIKE = 0.1
+"""Deviation of a direction's moves from those of a common factor below which it is one."""
+UNDETERMINED = 1.0
+"""Standard error along a direction above which the flights do not determine it at all."""
+
+
+def weakest(
+    covariance: Array, reference: Array, names: Sequence[str], *, count: int = 3
+) -> tuple[Direction, ...]:
+    """Return the worst-determined combinations, worst first.
+
+    Parameters
+    ----------
+    covariance
+        (K, K) of the scaled coordinates, from the flights alone.
+    reference
+        (K,) scaled coordinates' change that counts as one hundred percent.
+    names
+        K coefficients.
+    count
+        How many at most.
+    """
+    values, vectors = symmetric_eigen(covariance / np.outer(reference, reference))
+    directions = []
+    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:count]:
+        largest = vector[np.argmax(np.abs(vector))]
+        moves = dict(zip(names, (vector / largest).tolist(), strict=True))
+        error = float(abs(largest) * np.sqrt(max(value, 0.0)))
+        directions.append(
+            Direction(
+                moves={name: move for name, move in moves.items() if abs(move) >= NAMED},
+                error=error,
+                null=error > UNDETERMINED,
+                common_scale=is_common_scale(moves),
+            )
+        )
+    return tuple(directions)
+
+
+def is_common_scale(moves: Mapping[str, float]) -> bool:
+    """Return whether a direction multiplies masses and forces by one factor."""
+    group = [name for name in scale_group() if name in moves]
+    others = [abs(move) for name, move in moves.items() if name not in group]
+    alike = [abs(moves[name] - 1.0) < ALIKE for name in group]
+    return "mass" in group and all(alike) and max(others, default=0.0) < ALIKE

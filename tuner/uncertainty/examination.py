@@ -22,10 +22,10 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty, at_rest, references, uncertainty_at
 from tuner.uncertainty.lacking import Lack
 from tuner.uncertainty.local_sensitivity import LocalSensitivity, local_sensitivity
-from tuner.uncertainty.records import Residual
-from tuner.uncertainty.sensitivity_json import (
+from tuner.uncertainty.records import (
     CoefficientKnowledge,
     Knowledge,
+    Residual,
 )
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.coefficient import Parameter

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tuner.objective.batch import evaluate
 from tuner.objective.criterion import Criterion, Jacobian, Point
 from tuner.objective.normal import Objective
-from tuner.uncertainty.sensitivity_json import EffectOverTime, OutputSensitivity
+from tuner.uncertainty.records import EffectOverTime, OutputSensitivity
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 from tuner.core.files import Part
 from tuner.core.numerics import Z95
-from tuner.uncertainty.directions import Direction
 
 WELL_KNOWN = 0.05
 """Half the 95 % interval, relative to the coefficient's reference, below which it is well known."""
@@ -25,6 +24,30 @@ CONFUSED = 0.9
 """Correlation above which two coefficients are called hard to distinguish."""
 INFLATED = 2.0
 """Inflation of the standard error above which the reason mentions model error."""
+
+
+class Direction(Part):
+    """A combination of coefficients.
+
+    Attributes
+    ----------
+    moves
+        Name -> relative change (logarithmic coefficients) or change in units of the coefficient's
+        reference; the largest is ±1. Only coefficients that move by more than
+        `tuner.uncertainty.estimates.NAMED`.
+    error
+        Standard error along the direction from the flights alone: 0.1 means that all moves times
+        ten percent are one standard error away.
+    null
+        Whether the flights do not determine it at all.
+    common_scale
+        Whether it multiplies masses and forces by one factor, which changes no motion.
+    """
+
+    moves: dict[str, float]
+    error: float
+    null: bool
+    common_scale: bool
 
 
 class Verdict(StrEnum):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from tuner.core.numerics import Z95
 from tuner.core.phrases import listed, percent, quantity
-from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import Reason, ReasonCode, Verdict
+from tuner.uncertainty.verdict import Direction, Reason, ReasonCode, Verdict
 from tuner.vehicle import scale_group
 
 NEGLIGIBLE = 0.01

@@ -12,7 +12,7 @@ from tuner.exporters.draws import draws_of
 from tuner.exporters.export import export_draws
 from tuner.exporters.target import assigned
 from tuner.options import ExportOptions
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import Knowledge
 from tuner.vehicle import read_vehicle, values_of
 
 NAMES = ("inertia_xx", "motor_constant", "moment_constant", "estimate_latency")

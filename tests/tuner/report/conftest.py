@@ -8,7 +8,7 @@ import pytest
 
 from tests.tuner.report import making
 from tuner.report import render
-from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.verdict import Direction
 
 FREE = (
     "inertia_xx",

@@ -27,16 +27,15 @@ from tuner.result import (
     Status,
 )
 from tuner.search.iteration import Iteration
-from tuner.uncertainty.directions import Direction
-from tuner.uncertainty.records import Residual
-from tuner.uncertainty.sensitivity_json import (
+from tuner.uncertainty.records import (
     CoefficientKnowledge,
     EffectOverTime,
     Knowledge,
     OutputSensitivity,
+    Residual,
     write_files,
 )
-from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict, judge
+from tuner.uncertainty.verdict import NOT_FITTED, Direction, Reason, ReasonCode, Verdict, judge
 from tuner.uncertainty.verdict_texts import judgement_in_words
 from tuner.vehicle import COEFFICIENTS, VehicleFile, read_vehicle, values_of, write_vehicle
 from tuner.vehicle.selection_table import SelectionCode, SelectionRow

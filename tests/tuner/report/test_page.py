@@ -14,9 +14,9 @@ from tuner.core.errors import InputError
 from tuner.findings.findings import Code, Finding
 from tuner.report import render
 from tuner.report.contents import SearchRecord, read_contents
-from tuner.report.sections import sections_of
+from tuner.report.page import sections_of
 from tuner.result import ExportRecord, ExportRecords, Gate, read_run
-from tuner.uncertainty.directions import Direction
+from tuner.uncertainty.verdict import Direction
 
 WITH_MASS = (
     "mass",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tuner.uncertainty.directions import is_common_scale, weakest
+from tuner.uncertainty.estimates import is_common_scale, weakest
 
 NAMES = ("mass", "inertia_xx", "motor_constant", "input_scaling")
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.verdict import (
+    Direction,
     Reason,
     ReasonCode,
     Verdict,

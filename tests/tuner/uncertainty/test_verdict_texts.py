@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tuner.uncertainty.directions import Direction
 from tuner.uncertainty.records import ErrorParts
-from tuner.uncertainty.verdict import NOT_FITTED, Reason, ReasonCode, Verdict
+from tuner.uncertainty.verdict import NOT_FITTED, Direction, Reason, ReasonCode, Verdict
 from tuner.uncertainty.verdict_texts import (
     direction_in_words,
     judgement_in_words,

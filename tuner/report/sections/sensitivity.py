@@ -10,8 +10,7 @@ from tuner.design.proposals import proposals_in_words
 from tuner.report.chart import FITTED, GREY, PALETTE, Bars, Chart, Heat, Line, Look, Panel
 from tuner.report.contents import Contents
 from tuner.report.section import Cell, Section, Table, figures
-from tuner.uncertainty.records import MEANING, THRESHOLD, GlobalSensitivity, Profile
-from tuner.uncertainty.sensitivity_json import Knowledge
+from tuner.uncertainty.records import MEANING, THRESHOLD, GlobalSensitivity, Knowledge, Profile
 from tuner.uncertainty.verdict_texts import direction_in_words
 
 FAINTEST = 1e-4
