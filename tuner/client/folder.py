@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,8 +14,6 @@ from tuner.core.disk import exists
 from tuner.core.errors import InputError
 from tuner.core.files import ResultFile
 from tuner.options import FitOptions
-
-logger = logging.getLogger(__name__)
 
 SUFFIXES = (".bag", ".mcap", ".db3", ".ulg", ".csv", ".parquet")
 LOOK = 2.0

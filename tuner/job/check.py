@@ -46,17 +46,6 @@ GAP = 0.25
 """s without a pose inside a mission that a user should know of."""
 
 
-def check(job: Job) -> tuple[Finding, ...]:
-    """Look for what would make the search fail or its numbers worthless.
-
-    Returns
-    -------
-    tuple of Finding
-        ``failure`` for what makes the fit pointless, ``warning`` for what to look at.
-    """
-    return (*check_recordings(job), *check_information(job))
-
-
 def check_recordings(job: Job) -> tuple[Finding, ...]:
     """Look at what was recorded, and at where the search would begin, without a simulation."""
     return (

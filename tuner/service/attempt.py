@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import queue
 import shutil
@@ -26,8 +25,6 @@ from tuner.service.request import FLIGHTS, CheckedRequest
 from tuner.service.settings import Limits
 from tuner.service.tables import State
 from tuner.service.worker import RESULT, Assignment
-
-logger = logging.getLogger(__name__)
 
 WORKER = [sys.executable, "-m", "tuner.service.worker"]
 CHECKPOINTS = "checkpoint*.npz"

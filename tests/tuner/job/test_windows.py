@@ -10,7 +10,7 @@ from tuner.config.job import FlightSettings, Search
 from tuner.core.errors import ConfigError
 from tuner.evaluate.comparison import Comparison
 from tuner.findings.findings import Code
-from tuner.job.check import check
+from tuner.job.check import check_information, check_recordings
 from tuner.search.estimation import search
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
@@ -21,6 +21,10 @@ from tuner.vehicle import values_of, with_values
 
 WRONG = {"inertia_xx": 1.3, "inertia_yy": 0.8, "motor_constant": 1.1, "moment_constant": 0.8}
 FREE = ("inertia_xx", "inertia_yy", "motor_constant", "moment_constant", "rotor_drag_coefficient")
+
+
+def check(job):
+    return (*check_recordings(job), *check_information(job))
 
 
 def job_through(inlet, flight, bag, updated, *, free=FREE, method="gradient"):
