@@ -7,7 +7,7 @@ and gusts included. What leaves the search's bounds, or is no rigid body, is dra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,8 @@ from tuner.core.disk import inside, make_folder, write_text
 from tuner.core.errors import ConfigError, ExportError, InputError
 from tuner.core.files import csv_text
 from tuner.core.numerics import symmetric_eigen
-from tuner.exporters.target import Draft, write
+from tuner.exporters.simulators import ISAAC_LAB
+from tuner.exporters.target import Choices, Target, write
 from tuner.exporters.targets.isaaclab import configuration, isaaclab_text
 from tuner.result import Run
 from tuner.uncertainty.records import Knowledge
@@ -151,14 +152,7 @@ def _flies(vehicle: VehicleFile, names: Sequence[str], row: Array) -> bool:
 
 
 def write_draws(
-    draws: Draws,
-    base: VehicleFile,
-    folder: Path,
-    suffix: str,
-    drafted: Callable[[VehicleFile, str], Draft],
-    *,
-    provenance: str,
-    ranges: Callable[[VehicleFile], VehicleFile] | None,
+    draws: Draws, base: VehicleFile, folder: Path, target: Target, provenance: str
 ) -> tuple[str, ...]:
     """Write a table, a file for each draw, and what Isaac Lab samples between.
 
@@ -166,14 +160,10 @@ def write_draws(
     ----------
     draws, base
         The draws, and the vehicle that they are draws of.
-    folder, suffix
-        Where the files lie, and what their names end with.
-    drafted
-        A vehicle and its provenance -> its file.
+    folder, target
+        Where the files lie, and their format.
     provenance
         One line.
-    ranges
-        A vehicle -> as Isaac Lab flies it; None for another format.
 
     Returns
     -------
@@ -189,15 +179,17 @@ def write_draws(
             continue
     rows = [(number + 1, *values_of(v).values()) for number, v in enumerate(vehicles)]
     write_text(folder / TABLE, csv_text(("draw", *values_of(base)), rows))
+    choices = Choices(simulator=target.simulator_name)
     for number, vehicle in enumerate(vehicles):
         name = f"draw_{number + 1:05d}"
-        draft = drafted(vehicle.replace(name=f"{base.name}_{name}"), f"{provenance}; {name}")
-        write(draft, inside(folder, f"{name}{suffix}"))
+        named = vehicle.replace(name=f"{base.name}_{name}")
+        draft = target.draft(named, f"{provenance}; {name}", choices)
+        write(draft, inside(folder, f"{name}{target.suffix}"))
     notes = [f"{len(vehicles)} draws of the joint posterior are in {folder / TABLE}"]
     if len(vehicles) < len(draws.values):
         notes.append(f"{len(draws.values) - len(vehicles)} more are no rigid body and left out")
-    if ranges is not None:
-        text = isaaclab_text(_ranges([ranges(vehicle) for vehicle in vehicles]), provenance)
+    if target.simulator is ISAAC_LAB:
+        text = isaaclab_text(_ranges(list(map(ISAAC_LAB.flown, vehicles))), provenance)
         write_text(folder / RANGES, text)
         notes.append(f"the central 95 % of each number are the ranges in {folder / RANGES}")
     return tuple(notes)

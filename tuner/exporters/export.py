@@ -15,7 +15,7 @@ from tuner.core.disk import check_file, file_name, inside
 from tuner.core.errors import ExportError, InputError
 from tuner.exporters.draws import draws_of, write_draws
 from tuner.exporters.gates import Refly, check, check_hover, check_in_simulator, not_flown
-from tuner.exporters.simulators import GAZEBO_CLASSIC, ISAAC_LAB, Simulator
+from tuner.exporters.simulators import GAZEBO_CLASSIC, Simulator
 from tuner.exporters.target import (
     Choices,
     Draft,
@@ -207,16 +207,8 @@ def export_draws(
     first = replace(asked, out=inside(folder, name))
     done = export(run, first, refly=refly, today=today, refit=refit)
     flying, _ = in_simulator(run, target, refit)
-    choices = Choices(simulator=target.simulator_name)
-    notes = write_draws(
-        draws,
-        flying.vehicle,
-        folder,
-        target.suffix,
-        lambda vehicle, line: target.draft(vehicle, line, choices),
-        provenance=f"draw of the posterior; {provenance(run, today, asked.accept)}",
-        ranges=ISAAC_LAB.flown if target.simulator is ISAAC_LAB else None,
-    )
+    line = f"draw of the posterior; {provenance(run, today, asked.accept)}"
+    notes = write_draws(draws, flying.vehicle, folder, target, line)
     return replace(done, path=folder, notes=(*done.notes, *notes))
 
 
