@@ -13,10 +13,11 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.air import air
 from sim_jax.disturbance import Disturbance
+from sim_jax.numeric import Array as JaxArray
 from sim_jax.rollout import rollout
 from sim_jax.state import Setpoints
 from tuner.disturbances.recorded import SETPOINTS
-from tuner.objective.flight import Trace, beginning_of, trace_of
+from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.normal import Objective
 from tuner.objective.residuals import Reading, at_stamps
 from tuner.objective.segments import CLOCKS, OFFSETS, Measured
@@ -92,14 +93,14 @@ def recorded(
     if log_voltage is not None:
         segments = replace(objective.segments, log_voltage=jnp.asarray(log_voltage))
         flown = replace(objective, segments=segments)
-    trace, setpoints = _flown(model, flown, pushing)
-    if bool(jnp.isfinite(trace.crash_time).any()):
+    channels, crash_time, setpoints = _flown(model, flown, pushing)
+    if bool(jnp.isfinite(crash_time).any()):
         return None
     still = np.zeros((len(OFFSETS), objective.segments.count))
     rate, measured = float(objective.schedule.log_rate), {}
     reading = Reading(still, still[: len(CLOCKS)], rate, objective.samples)
     for channel, old in objective.segments.measured.items():
-        logged = np.moveaxis(np.asarray(trace.channels[channel]), -1, 0)
+        logged = np.moveaxis(np.asarray(channels[channel]), -1, 0)
         read = at_stamps(logged, channel, np.asarray(old.time).T, reading)
         clean = np.moveaxis(read, 0, -1)
         known = np.asarray(old.weight)
@@ -128,7 +129,8 @@ def _air(objective: Objective, model: Model, random: np.random.Generator) -> Dis
 @eqx.filter_jit
 def _flown(
     model: Model, objective: Objective, pushing: Disturbance | None
-) -> tuple[Trace, Setpoints]:
+) -> tuple[dict[str, JaxArray], JaxArray, Setpoints]:
+    """Return channel -> (samples, columns, F), the times (F,) of crashes, and the set-points."""
     segments = objective.segments
     start, inlet, around = beginning_of(model, segments, objective.schedule)
     flown = rollout(
@@ -141,7 +143,8 @@ def _flown(
         environment=replace(around, disturbance=pushing),
         limits=objective.limits,
     )
-    return trace_of(flown, model, segments), flown.log.setpoints
+    channels = recorded_of(flown.log, model, around, {}, segments.measured)
+    return channels, flown.crash_time, flown.log.setpoints
 
 
 def _turned(attitude: Array, by: Array) -> Array:

@@ -6,19 +6,16 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
-import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from sim_jax.autopilot import gyro_of, gyro_rate
-from sim_jax.crash import Limits
 from sim_jax.environment import Environment
 from sim_jax.inlet import Inlet
 from sim_jax.markers import markers_of
 from sim_jax.numeric import Array
 from sim_jax.plant import Sample
 from sim_jax.rigid_body import Motion
-from sim_jax.rollout import Rollout, rollout
 from sim_jax.schedule import Schedule
 from sim_jax.state import Start
 from sim_jax.terms.air import Air
@@ -34,21 +31,6 @@ from tuner.vehicle.model import Model
 MOTION, TURNED, SETPOINTS = "motion", "turned", "setpoints"
 """What no recording holds: the centre of mass's position, velocity and body rate; the body's
 attitude; and the set-points of rate and thrust."""
-
-
-class Trace(eqx.Module):
-    """What a rollout is compared by, logged at ``schedule.log_rate``; its pose is the markers'.
-
-    Attributes
-    ----------
-    channels
-        Channel -> (samples, columns, F).
-    crash_time
-        (F,) s, infinite for a segment that flew.
-    """
-
-    channels: dict[str, Float[Array, "samples c F"]]
-    crash_time: Float[Array, " F"]
 
 
 def recorded_of(
@@ -96,56 +78,6 @@ def _parts(vector: Vec3) -> tuple[Array, Array, Array]:
     return vector.x, vector.y, vector.z
 
 
-def trace_of(
-    flown: Rollout,
-    model: Model,
-    segments: Segments,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> Trace:
-    """Return what simulated segments are compared by; ``conditions`` as of `simulate_segments`."""
-    environment = environment_of(model, segments, conditions)
-    recorded = recorded_of(flown.log, model, environment, conditions, segments.measured)
-    return Trace(recorded, flown.crash_time)
-
-
-def simulate_segments(
-    model: Model,
-    segments: Segments,
-    schedule: Schedule,
-    *,
-    samples: int,
-    horizon: Int[Array, ""] | None,
-    limits: Limits,
-    states: Float[Array, "L F"] | None = None,
-    conditions: Mapping[str, Float[Array, " F"]] = MappingProxyType({}),
-) -> Rollout:
-    """Simulate every segment up to a horizon in samples.
-
-    Parameters
-    ----------
-    model, segments, schedule, samples, horizon, limits
-        As of `sim_jax.rollout.rollout`.
-    states
-        How far the starts lie from the recorded ones, in the segments' standard deviations.
-    conditions
-        Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
-    """
-    start, inlet, environment = beginning_of(
-        model, segments, schedule, states=states, conditions=conditions
-    )
-    return rollout(
-        model.vehicle,
-        model.controller,
-        schedule,
-        inlet,
-        start,
-        samples=samples,
-        environment=environment,
-        horizon=horizon,
-        limits=limits,
-    )
-
-
 def beginning_of(
     model: Model,
     segments: Segments,
@@ -156,7 +88,14 @@ def beginning_of(
 ) -> tuple[Start, Inlet, Environment]:
     """Return what segments start from, what is fed in and what surrounds them.
 
-    The arguments are those of `simulate_segments`.
+    Parameters
+    ----------
+    model, segments, schedule
+        What flies.
+    states
+        How far the starts lie from the recorded ones, in the segments' standard deviations.
+    conditions
+        Name, of `tuner.vehicle.conditions` -> what surrounds each segment, in its unit.
     """
     start, inlet = segments.start, segments.inlet
     gyro, markers = gyro_of(model.vehicle), markers_of(model.vehicle)

@@ -39,7 +39,7 @@ from tuner.disturbances.predictor import (
 from tuner.disturbances.refit import _equations, with_least_innovations
 from tuner.objective.alternatives import STEP, alternatives_of
 from tuner.objective.criterion import Point
-from tuner.objective.flight import beginning_of, trace_of
+from tuner.objective.flight import beginning_of, recorded_of
 from tuner.objective.information import information_at, information_from_jacobian
 from tuner.objective.normal import Objective
 from tuner.recordings.flight import Flight, InitialState, Series
@@ -71,7 +71,8 @@ def flown(objective: Objective, pushes: jax.Array):
         environment=replace(around, disturbance=pushing),
         limits=objective.limits,
     )
-    return trace_of(flight, model, segments).channels, flight.log.setpoints
+    channels = recorded_of(flight.log, model, around, {}, segments.measured)
+    return channels, flight.log.setpoints
 
 
 def gusty(exact: Objective, seed: int) -> tuple[Objective, list[Flight]]:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from lanes import joined
+from sim_jax.rollout import rollout
 from tuner.config import Options, settle
 from tuner.objective import flown
-from tuner.objective.flight import simulate_segments, trace_of
+from tuner.objective.flight import beginning_of, recorded_of
 from tuner.search.job_flights import recordings_of
 from tuner.search.problem import job_of
 from tuner.vehicle.model import with_coefficients
@@ -52,16 +53,18 @@ def test_a_kernel_flies_as_jax_does_and_so_do_its_derivatives(objective):
 
     def fly(moved):
         changed = with_coefficients(model, dict(zip(MOVING, moved, strict=True)))
-        rolled = simulate_segments(
-            changed,
-            segments,
+        start, inlet, around = beginning_of(changed, segments, schedule, states=states)
+        rolled = rollout(
+            changed.vehicle,
+            changed.controller,
             schedule,
+            inlet,
+            start,
             samples=SAMPLES,
-            horizon=None,
+            environment=around,
             limits=objective.limits,
-            states=states,
         )
-        return trace_of(rolled, changed, segments).channels
+        return recorded_of(rolled.log, changed, around, {}, names)
 
     at = jnp.stack([jnp.asarray(values[name]) for name in MOVING])
     want, slopes = fly(at), jax.jit(jax.jacfwd(fly))(at)
