@@ -1,9 +1,10 @@
-"""What is released: one version, a wheel and an sdist that work where nothing else of ours is."""
+"""What is released: one version, and a checkout and an sdist that work once they are installed."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -14,6 +15,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+
+from tests.docs.pages import Family, commands
 
 ROOT = Path(__file__).resolve().parents[1]
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
@@ -73,19 +76,43 @@ print(load_topic_map("thesis_lab").name)
 """
 
 
+INSTALL = (
+    "git clone REPOSITORY tune && cd tune",
+    "make demo",  # `tests.docs.test_setting_up` runs it
+    "python3 -m venv .venv && . .venv/bin/activate",
+    "pip install .",
+    "pip install '.[service,matlab]'",  # the same, and more of a package index
+)
+"""What the page asks for that tells how to install."""
+OFFLINE = {
+    "PIP_NO_INDEX": "1",
+    "PIP_NO_DEPS": "1",
+    "PIP_NO_BUILD_ISOLATION": "0",  # as pip reads it: without one
+    "PIP_IGNORE_INSTALLED": "1",
+    "PIP_QUIET": "1",
+    "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+}
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", ["whl", "tar.gz"])
+@pytest.mark.parametrize("source", ["checkout", "sdist"])
 def test_it_is_installed_and_works_in_a_clean_environment(
-    built: Path, tmp_path: Path, suffix: str
+    built: Path, tmp_path: Path, source: str
 ) -> None:
-    (package,) = built.glob(f"*.{suffix}")
+    page = ROOT / "docs" / "tutorials" / "install.md"
+    assert tuple(commands(page, Family.SET_UP)) == INSTALL
+    clone, _, make_environment, install, _ = INSTALL
+    (package,) = built.glob("*.tar.gz")
     assert VERSION in package.name
-    venv.create(tmp_path / "venv")
-    python, tune = (str(tmp_path / "venv" / "bin" / name) for name in ("python", "tune"))
+    environment = tmp_path / "tune" / ".venv"
+    python, tune = (str(environment / "bin" / name) for name in ("python", "tune"))
+    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    site = environment / "lib" / version / "site-packages"
     # what it depends on is this environment's, behind its own; of ours it has the package alone
-    (site,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    borrowed = sysconfig.get_path("purelib")
+    borrow = f"echo {borrowed} > {site}/dependencies.pth && export PYTHONPATH={borrowed}"
+    clean = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | OFFLINE
+    clean["PATH"] = f"{Path(sys.executable).parent}:{clean['PATH']}"
 
     def run(*words: str) -> str:
         outcome = subprocess.run(
@@ -99,12 +126,17 @@ def test_it_is_installed_and_works_in_a_clean_environment(
         assert outcome.returncode == 0, outcome.stderr
         return outcome.stdout
 
-    offline = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
-    pip = (sys.executable, "-m", "pip", "--python", str(python), "install", "--ignore-installed")
-    run(*pip, *offline, str(package))
-    where = run(str(python), "-c", "import tuner, sim_jax; print(tuner.__file__, sim_jax.__file__)")
-    assert where.count(str(site)) == 2
-    for folder in ("tuner", "sim_jax"):
+    if source == "checkout":
+        run("sh", "-c", f"{clone.replace('REPOSITORY', str(ROOT))} && test -f Makefile")
+        shutil.rmtree(tmp_path / "tune")  # it is what was committed; what is here is tried
+        shutil.copytree(built.parent / "source", tmp_path / "tune")
+    else:
+        venv.create(environment, with_pip=False)
+        make_environment, install = ". .venv/bin/activate", f"python -m pip install {package}"
+    run("sh", "-c", " && ".join(("cd tune", make_environment, borrow, install)))
+    where = run(str(python), "-c", "import lanes, tuner, sim_jax as s; print(lanes, tuner, s)")
+    assert where.count(str(site)) == 3
+    for folder in ("lanes", "sim_jax", "tuner"):
         for file in (ROOT / folder).rglob("*"):
             if file.is_file() and file.suffix != ".pyc":
                 assert (site / file.relative_to(ROOT)).exists(), file

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,8 +15,7 @@ from docs.generate.house import house_page, rooms
 from docs.generate.messages import IN_OTHER_WORDS, ORDER, STAGES, TOPICS, known_messages, sites
 from docs.generate.pages import OPENAPI, REFERENCE, SCHEMA
 from docs.generate.pages import PAGES as GENERATED
-from tests.docs.pages import PAGES, ROOT, anchors, blocks, commands, links, name_of
-from tuner.cli.app import COMMANDS, app
+from tests.docs.pages import PAGES, ROOT, anchors, blocks, links, name_of
 from tuner.config import read_job
 from tuner.engine.selection import read_cluster
 from tuner.findings.findings import Code
@@ -40,26 +38,11 @@ PROGRAM = re.compile(
     r"|pytest (tests/[\w/.]+))([^`]*)`"
 )
 
-EVERY_COMMAND = [(page, line) for page in PAGES for line in commands(page)]
-
 
 @pytest.mark.parametrize("name", sorted(set(GENERATED) - {OPENAPI}))
 def test_a_generated_page_is_what_the_code_says(name):
     written = (REFERENCE / name).read_text(encoding="utf-8")
     assert written == GENERATED[name](), "run `python -m docs.generate`"
-
-
-@pytest.mark.parametrize(("page", "line"), EVERY_COMMAND, ids=lambda x: getattr(x, "stem", None))
-def test_a_command_is_understood(page: Path, line: str):
-    words = shlex.split(line.replace("[", "").replace("]", ""), comments=True)
-    command, bound, _ = app.parse_args(words[1:], exit_on_error=False, print_error=False)
-    assert callable(command), page
-    assert bound.arguments or len(words) == 2  # a command that needs none
-
-
-def test_every_command_is_shown():
-    shown = {line.split()[1] for _, line in EVERY_COMMAND}
-    assert set(COMMANDS) <= shown
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)

@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+import shutil
 import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
-from tests.docs.pages import DOCS, ROOT
+from tests.docs.checkout import make_checkout, typed
+from tests.docs.pages import DOCS
 
 pytestmark = pytest.mark.skipif(find_spec("mkdocs") is None, reason="needs the extra 'docs'")
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(folder)]
-    quiet = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    built = subprocess.run(
-        command, cwd=ROOT, env=quiet, check=False, capture_output=True, text=True
-    )
-    assert built.returncode == 0, built.stdout + built.stderr
-    return folder
+    place = make_checkout(tmp_path_factory.mktemp("site"))
+    (place / "docs").unlink()
+    shutil.copytree(DOCS, place / "docs", ignore=shutil.ignore_patterns("__pycache__"))
+    typed("make docs", place)
+    return place / "build" / "site"
 
 
 def test_every_page_is_built(site: Path):
