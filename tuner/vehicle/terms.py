@@ -6,6 +6,9 @@ neutral value, it does not act and costs nothing. Coefficients of one group are 
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
 from tuner.vehicle.coefficient import EFFECTS, Coefficient, NotCarried, Written
 
 _AXES = {"x": "forward", "y": "left", "z": "up"}
@@ -13,111 +16,36 @@ _CENTRED = {"x": 0.01, "y": 0.01, "z": 0.03}
 """m by which the centre of mass is usually elsewhere: builders balance a vehicle about its rotors,
 but how far below them its battery hangs is rarely measured."""
 
-
-def _effect(
-    name: str,
-    unit: str,
-    meaning: str,
-    source: str,
-    *,
-    group: str,
-    limit: float,
-    prior_sd: float,
-    step: float,
-    gazebo: str | Written = "Gazebo's motor model has no such term",
-    px4: str | Written = "the SIH model has no such term",
-    mass_exponent: int = 0,
-    length_exponent: float = 0.0,
-    informed_by: str | None = None,
-    stands_in: bool = False,
-    expected: bool = False,
-    begin: float | None = None,
-    acts_as: str = "",
-    reads: str = "",
-    neutral: float = 0.0,
-) -> Coefficient:
-    """Return the row of an effect that is searched within a limit about its neutral value.
-
-    ``gazebo`` and ``px4`` are where SDF and PX4 hold it, or why they do not.
-    """
-    held = {
-        target: entry if isinstance(entry, Written) else NotCarried(entry, neutral)
-        for target, entry in (("sdf", gazebo), ("px4", px4))
-    }
-    return Coefficient(
-        name=name,
-        unit=unit,
-        meaning=meaning,
-        source=source,
-        place=(EFFECTS, name),
-        scale="linear",
-        bounds=(neutral - limit, neutral + limit),
-        prior_sd=prior_sd,
-        step=step,
-        mass_exponent=mass_exponent,
-        length_exponent=length_exponent,
-        neutral=neutral,
-        group=group,
-        stands_in=stands_in,
-        expected=expected,
-        begin=begin,
-        acts_as=acts_as,
-        reads=reads,
-        exported_as=held,
-        informed_by=informed_by,
-    )
+#: What does nothing at zero, and what does nothing at one and is searched by its logarithm.
+_effect = partial(Coefficient, scale="linear", neutral=0.0)
+_ratio = partial(Coefficient, scale="log", neutral=1.0)
 
 
-def _ratio(
-    name: str,
-    meaning: str,
-    source: str,
-    *,
-    group: str,
-    bounds: float,
-    prior_sd: float,
-    sdf: Written | None = None,
-) -> Coefficient:
-    """Return the row of a ratio that does nothing at one and is searched by its logarithm."""
-    return Coefficient(
-        name=name,
-        unit="",
-        meaning=meaning,
-        source=source,
-        place=(EFFECTS, name),
-        bounds=bounds,
-        prior_sd=prior_sd,
-        step=0.5 * prior_sd,
-        neutral=1.0,
-        group=group,
-        exported_as={
-            "sdf": sdf or NotCarried("Gazebo's motor model has no such ratio", 1.0),
-            "px4": NotCarried("the SIH model has no such ratio", 1.0),
-        },
-    )
-
-
-EFFECT_ROWS = (
+_ROWS = (
     _effect(
         "battery_exponent",
         "",
         "power of the battery's voltage with which rotor speeds go",
         "thesis 10.4: speed × (V/V_ref)^γ",
         group="battery",
-        limit=3.0,
+        bounds=3.0,
         prior_sd=0.5,
         step=0.2,
         reads="battery_voltage",
-        gazebo="the motor plugins know no battery",
-        px4="the SIH model's thrust does not depend on the battery",
+        exported_as={
+            "sdf": NotCarried("the motor plugins know no battery", 0.0),
+            "px4": NotCarried("the SIH model's thrust does not depend on the battery", 0.0),
+        },
     ),
     _ratio(
         "rotor_drag_ratio_y",
+        "",
         "rotor drag along left over that along forward",
         "thesis 10.4, drag that differs between axes",
         group="rotor_drag_ratio",
         bounds=5.0,
         prior_sd=0.4,
+        step=0.2,
     ),
     *(
         _effect(
@@ -126,13 +54,13 @@ EFFECT_ROWS = (
             f"drag of the body along {direction} per air velocity",
             "Faessler, Franchi and Scaramuzza 2018: -c·v",
             group="linear_drag",
-            limit=2.0,
+            bounds=2.0,
             prior_sd=0.2,
             step=0.1,
             mass_exponent=1,
             length_exponent=-0.5,
             stands_in=True,
-            px4=Written("SIH_KDV"),
+            exported_as={"px4": Written("SIH_KDV")},
         )
         for axis, direction in _AXES.items()
     ),
@@ -142,14 +70,16 @@ EFFECT_ROWS = (
         "drag of the body per squared air velocity, opposite to it",
         "quadratic drag of a bluff body, F = -d‖v‖v",
         group="fuselage_drag",
-        limit=0.5,
+        bounds=0.5,
         prior_sd=0.05,
         step=0.02,
         mass_exponent=1,
         length_exponent=-1.0,
-        gazebo="the motor plugins know no drag of the body",
-        px4="the SIH model's drag is linear in the velocity",
         informed_by="speed",
+        exported_as={
+            "sdf": NotCarried("the motor plugins know no drag of the body", 0.0),
+            "px4": NotCarried("the SIH model's drag is linear in the velocity", 0.0),
+        },
     ),
     _effect(
         "thrust_exponent",
@@ -157,12 +87,14 @@ EFFECT_ROWS = (
         "power of the rotor speed with which thrust and drag torque grow, about the hover's",
         "thrust stands: blades at low Reynolds numbers, or that bend",
         group="thrust_exponent",
-        limit=0.7,
+        bounds=0.7,
         prior_sd=0.05,
         step=0.05,
         neutral=2.0,
-        gazebo="the motor plugins' thrust goes with the squared rotor speed",
-        px4="the SIH model's thrust goes with the command",
+        exported_as={
+            "sdf": NotCarried("the motor plugins' thrust goes with the squared rotor speed", 2.0),
+            "px4": NotCarried("the SIH model's thrust goes with the command", 2.0),
+        },
     ),
     _effect(
         "thrust_inflow_coefficient",
@@ -170,11 +102,16 @@ EFFECT_ROWS = (
         "thrust lost per rotor speed and axial air velocity, signed",
         "blade element theory, advance ratio (thesis 6): T = kΩ² - k_v·Ω·v∥",
         group="thrust_inflow",
-        limit=5e-3,
+        bounds=5e-3,
         prior_sd=2e-4,
         step=1e-4,
         mass_exponent=1,
-        gazebo="the motor plugins' thrust falls with the length of the axial airspeed, unsigned",
+        exported_as={
+            "sdf": NotCarried(
+                "the motor plugins' thrust falls with the length of the axial airspeed, unsigned",
+                0.0,
+            )
+        },
     ),
     *(
         _effect(
@@ -183,24 +120,28 @@ EFFECT_ROWS = (
             f"centre of mass towards {direction}, from where rotor positions count",
             "a battery is never quite in the middle",
             group="center_of_mass",
-            limit=0.1,
+            bounds=0.1,
             prior_sd=_CENTRED[axis],
             step=0.005,
             length_exponent=1.0,
-            gazebo=Written("pose", "centre"),
-            px4="the control allocation is left as it flew",
+            exported_as={
+                "sdf": Written("pose", "centre"),
+                "px4": NotCarried("the control allocation is left as it flew", 0.0),
+            },
         )
         for axis, direction in _AXES.items()
     ),
     *(
         _ratio(
             f"rotor_thrust_scale_{number}",
+            "",
             f"thrust and torque of rotor {number} over the motor constant's; their product is 1",
             "motors and propellers differ by some percent",
             group="rotor_thrust_scale" if number < 4 else "",
             bounds=1.5,
             prior_sd=0.03,
-            sdf=Written("motorConstant", "rotor"),
+            step=0.015,
+            exported_as={"sdf": Written("motorConstant", "rotor")},
         )
         for number in range(1, 5)
     ),
@@ -211,7 +152,7 @@ EFFECT_ROWS = (
             f"steady moment about {direction}",
             "blades and motors that are mounted unevenly",
             group="torque_trim",
-            limit=0.5,
+            bounds=0.5,
             prior_sd=0.02,
             step=0.005,
             mass_exponent=1,
@@ -226,12 +167,16 @@ EFFECT_ROWS = (
         "moment of inertia of one rotor about its axis",
         "Euler's equations of a body with rotors: -ω × h - dh/dt",
         group="rotor_inertia",
-        limit=1e-2,
+        bounds=1e-2,
         prior_sd=5e-5,
         step=2e-5,
         mass_exponent=1,
         length_exponent=2.0,
-        gazebo="the rotor links' inertia turns no body in the motor model's moment",
+        exported_as={
+            "sdf": NotCarried(
+                "the rotor links' inertia turns no body in the motor model's moment", 0.0
+            )
+        },
     ),
     _effect(
         "time_constant_slope",
@@ -239,7 +184,7 @@ EFFECT_ROWS = (
         "relative growth of the time constants per relative rotor speed above hover",
         "thesis 5: bench and flight disagree",
         group="time_constant_slope",
-        limit=3.0,
+        bounds=3.0,
         prior_sd=0.5,
         step=0.2,
     ),
@@ -249,7 +194,7 @@ EFFECT_ROWS = (
         "second lag of the motors, between a command's speed and the rotor's own lag",
         "motor current, and speed controllers that smooth their command",
         group="motor_lag",
-        limit=0.03,
+        bounds=0.03,
         prior_sd=0.003,
         step=0.002,
         begin=0.004,
@@ -261,7 +206,7 @@ EFFECT_ROWS = (
         "moment across the velocity per rotor speed and in-plane air velocity",
         "Mahony, Kumar and Corke 2012; Prouty: k·Ω·(e_z × v⊥)",
         group="flapping_moment",
-        limit=1e-3,
+        bounds=1e-3,
         prior_sd=2e-5,
         step=5e-6,
         mass_exponent=1,
@@ -273,7 +218,7 @@ EFFECT_ROWS = (
         "gain of thrust near the ground over Cheeseman and Bennett's",
         "Cheeseman and Bennett 1955: T/(1 - g·(R/4h)²)",
         group="ground_effect",
-        limit=8.0,
+        bounds=8.0,
         prior_sd=2.0,  # four rotors lift by more than one: Sanchez-Cuevas, Heredia, Ollero 2017
         step=0.5,
         expected=True,
@@ -285,13 +230,13 @@ EFFECT_ROWS = (
             f"damping of rotation about {_AXES[axis]}",
             source,
             group="angular_drag",
-            limit=0.5,
+            bounds=0.5,
             prior_sd=usual,
             step=0.5 * usual,
             mass_exponent=1,
             length_exponent=1.5,
             stands_in=True,
-            px4=Written("SIH_KDW"),
+            exported_as={"px4": Written("SIH_KDW")},
         )
         for axis, usual, source in (
             ("x", 0.01, "what is left of inflow and flapping: -c·ω"),
@@ -301,16 +246,14 @@ EFFECT_ROWS = (
         )
     ),
     *(
-        Coefficient(
-            name=f"torque_gain_{axis}",
-            unit="",
-            meaning=f"share of the angular acceleration about {direction} that predicts turning",
-            source="Ljung, System Identification, 13.4: inputs that answer unseen disturbances",
-            place=(EFFECTS, f"torque_gain_{axis}"),
+        _ratio(
+            f"torque_gain_{axis}",
+            "",
+            f"share of the angular acceleration about {direction} that predicts turning",
+            "Ljung, System Identification, 13.4: inputs that answer unseen disturbances",
             bounds=50.0,
             prior_sd=0.7,
             step=0.2,
-            neutral=1.0,
             exported_as={
                 target: NotCarried(
                     "a simulated loop's rotors answer what it simulates, and no more"
@@ -321,3 +264,23 @@ EFFECT_ROWS = (
         for axis, direction in _AXES.items()
     ),
 )
+
+
+def _completed(row: Coefficient) -> Coefficient:
+    """Return a row with its place, and what Gazebo and PX4 say where it says nothing of them.
+
+    A number searched itself has its bounds about its neutral value.
+    """
+    ratio = row.scale == "log"
+    kind, neutral, bounds = "ratio" if ratio else "term", row.neutral or 0.0, row.bounds
+    if not ratio and isinstance(bounds, float):
+        bounds = (neutral - bounds, neutral + bounds)
+    lost = {
+        "sdf": NotCarried(f"Gazebo's motor model has no such {kind}", neutral),
+        "px4": NotCarried(f"the SIH model has no such {kind}", neutral),
+    }
+    held = lost | dict(row.exported_as)
+    return replace(row, place=(EFFECTS, row.name), bounds=bounds, exported_as=held)
+
+
+EFFECT_ROWS = tuple(map(_completed, _ROWS))
