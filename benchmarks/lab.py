@@ -3,8 +3,9 @@
 ``TUNE_LAB_SEEDS`` names the seeds, ``0,1,2`` by default: a fit takes some minutes. With
 ``TUNE_LAB_WORKERS`` so many processes take a seed each. Two laboratories of three have an effect
 that a fit may not know (`benchmarks.lab_effects`); ``TUNE_LAB_EFFECT`` names it for all, ``none``
-the right model for all, which has a section of its own. ``TUNE_LAB_KEPT`` names a file that keeps
-each laboratory as soon as it is fitted, and from which the next run with the same effect goes on.
+the right model, ``several`` two or three effects, and both have sections of their own.
+``TUNE_LAB_KEPT`` names a file that keeps each laboratory as soon as it is fitted, and from which
+the next run with the same effect goes on.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from benchmarks.lab_effects import CHOICE, KNOWN, effect_of
-from benchmarks.lab_flights import METER, SECONDS, TRAJECTORIES, VOLTS, Lab, drawn, write
+from benchmarks.lab_flights import METER, RATE, SECONDS, TRAJECTORIES, VOLTS, Lab, drawn, write
 from benchmarks.oracle import oracle_error
 from benchmarks.table import Section, figure, table
 from sim_jax.schedule import Schedule
@@ -152,11 +153,13 @@ def section(trials: Sequence[Trial]) -> Section:
         f"in vain. {_held_of_all(trials)}"
         f"{np.mean([trial.seconds for trial in trials]):.0f} s of processor time a fit."
     )
+    several = any(trial.lab.effect.several for trial in trials)
     effects = any(trial.lab.effect.name for trial in trials)
     if effects:
+        have = "All have two or three effects" if several else "Two of three have an effect"
         text += (
-            " Two laboratories of three have an effect beside these terms, some of which no "
-            f"coefficient describes:\n\n{_by_effect(trials)}\n\nAnd by coefficient:"
+            f" {have} beside these terms, some of which no coefficient describes:\n\n"
+            f"{_by_effect(trials)}\n\nAnd by coefficient:"
         )
     head = [
         "coefficient",
@@ -168,7 +171,9 @@ def section(trials: Sequence[Trial]) -> Section:
         "of an oracle's",
         "hold the truth",
     ]
-    title = f"Simulated lab flights{' with effects' if effects else ''}"
+    title = "Simulated lab flights"
+    if effects:
+        title += " with several effects" if several else " with effects"
     return Section(title, text, head, list(_rows(trials)))
 
 
@@ -196,8 +201,9 @@ def _held_of_all(trials: Sequence[Trial]) -> str:
 def _by_effect(trials: Sequence[Trial]) -> str:
     """Return the table of what became of laboratories with each effect, and without any."""
     rows = []
-    for name in dict.fromkeys(sorted(trial.lab.effect.name for trial in trials)):
-        having = [trial for trial in trials if trial.lab.effect.name == name]
+    effects = [{effect.name for effect in trial.lab.effect.each} for trial in trials]
+    for name in sorted(set[str]().union(*effects)):
+        having = [trial for trial, names in zip(trials, effects, strict=True) if name in names]
         off = [
             (_deviation(trial, coefficient), coefficient)
             for trial in having
@@ -268,7 +274,7 @@ def searched(job: Job, folder: Path) -> Selected:
 
 def trial_of(seed: int) -> Trial:
     """Fly and fit the laboratory of a seed."""
-    effect = effect_of(seed, seconds=SECONDS, flights=len(TRAJECTORIES) - 1)
+    effect = effect_of(seed, seconds=SECONDS, flights=len(TRAJECTORIES) - 1, log_rate=RATE)
     lab = drawn(seed, effect)
     with tempfile.TemporaryDirectory() as name:
         job, said = job_at(lab, Path(name), seed=seed)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,17 +25,24 @@ from tuner.vehicle import ControllerFile
 
 Numbers = NDArray[np.float64]
 
-KNOWN = ("thrust_exponent", "rate_gain", "autopilot_tilt", "gyro_scale", "motor_lag")
-"""Groups of terms."""
-UNKNOWN = (
+EFFECTS = (
+    "thrust_exponent",
+    "rate_gain",
+    "autopilot_tilt",
+    "gyro_scale",
+    "motor_lag",
     "rotor_damage",
-    "filtered_speeds",
+    "tachometer_lag",
     "translational_lift",
     "integral_gain",
     "gyro_filter",
 )
+"""As they are drawn: a seed's effect goes with their order."""
+UNKNOWN = ("rotor_damage", "translational_lift", "integral_gain", "gyro_filter")
+KNOWN = tuple(name for name in EFFECTS if name not in UNKNOWN)
+"""Groups of terms."""
 CHOICE = os.environ.get("TUNE_LAB_EFFECT", "drawn")
-"""An effect's name for all laboratories, ``none``, or ``drawn``."""
+"""An effect's name for all laboratories, ``none``, ``drawn``, or ``several``: two or three."""
 ROTORS = 4
 
 
@@ -46,15 +53,18 @@ class Effect:
     Attributes
     ----------
     name
-        Of `KNOWN` or `UNKNOWN`; empty for nothing.
+        Of `EFFECTS`, of several all of them; empty for nothing.
     values
         Coefficients of the registry.
     size
-        Of what is in no row: share of its thrust that a rotor loses; s of the filter through which
-        rotor speeds went before they were logged; gain of thrust per squared air velocity across
-        the rotors, s²/m²; factor on the controller file's I, or on its gyro's cutoff.
+        Of what this project's simulator does not fly: share of its thrust that a rotor loses; s of
+        the filter through which rotor speeds went before they were logged; gain of thrust per
+        squared air velocity across the rotors, s²/m²; factor on the controller file's I, or on its
+        gyro's cutoff.
     rotor, flight, begin
         Which rotor loses thrust, in which flight, from which s on.
+    several
+        What it is made of, where that is more than one.
     """
 
     name: str = ""
@@ -63,19 +73,25 @@ class Effect:
     rotor: int = 0
     flight: int = 0
     begin: float = 0.0
+    several: tuple[Effect, ...] = ()
+
+    @property
+    def each(self) -> tuple[Effect, ...]:
+        """What there is, one by one."""
+        return self.several or (self,)
 
 
 NOTHING = Effect()
 
 
-def effect_of(seed: int, *, seconds: float, flights: int) -> Effect:
-    """Return the effect of a laboratory whose fitted flights last so many seconds."""
+def effect_of(seed: int, *, seconds: float, flights: int, log_rate: float) -> Effect:
+    """Return the effect of a laboratory whose fitted flights last so many s, logged at a rate."""
     random = np.random.default_rng([seed, 3])
 
     def signed(low: float, high: float) -> float:
         return float(random.choice([-1.0, 1.0]) * random.uniform(low, high))
 
-    has, name = random.random() < 2.0 / 3.0, str(random.choice([*KNOWN, *UNKNOWN]))
+    has, name = random.random() < 2.0 / 3.0, str(random.choice(EFFECTS))
     values = {
         "thrust_exponent": {"thrust_exponent": 2.0 + signed(0.03, 0.1)},
         "rate_gain": {
@@ -88,7 +104,7 @@ def effect_of(seed: int, *, seconds: float, flights: int) -> Effect:
     }
     sizes = {
         "rotor_damage": random.uniform(0.03, 0.07),
-        "filtered_speeds": random.uniform(0.005, 0.02),
+        "tachometer_lag": random.uniform(0.005, 0.02),
         "translational_lift": random.uniform(0.002, 0.006),
         "integral_gain": float(np.exp(signed(0.2, 0.5))),
         "gyro_filter": float(np.exp(signed(0.2, 0.5))),
@@ -99,24 +115,40 @@ def effect_of(seed: int, *, seconds: float, flights: int) -> Effect:
         flight=int(random.integers(flights)),
         begin=float(random.uniform(0.4, 0.8) * seconds),
     )
+    kept = _kept(sizes["tachometer_lag"], log_rate)
+    values["tachometer_lag"] = {"tachometer_lag": kept / (1.0 - kept) / log_rate}
+
+    def one(name: str) -> Effect:
+        return replace(drawn, name=name, values=values.get(name, {}), size=sizes.get(name, 0.0))
+
+    if CHOICE == "several":
+        names = random.choice(EFFECTS, random.integers(2, 4), replace=False)
+        parts = tuple(one(str(name)) for name in names)
+        together = {name: value for part in parts for name, value in part.values.items()}
+        return Effect(", ".join(names), together, several=parts)
     if CHOICE != "drawn":
         has, name = CHOICE != "none", CHOICE
-    if not has:
-        return NOTHING
-    return Effect(
-        name, values.get(name, {}), sizes.get(name, 0.0), drawn.rotor, drawn.flight, drawn.begin
-    )
+    return one(name) if has else NOTHING
+
+
+def _kept(seconds: float, rate: float) -> float:
+    """Return the share that a logger's low-pass keeps of what it had, sample by sample.
+
+    It is late by that share over the rest of it, in samples.
+    """
+    return float(np.exp(-1.0 / rate / seconds))
 
 
 def controller_with(effect: Effect, file: ControllerFile) -> ControllerFile:
     """Return the controller that flies, which is not the file's."""
-    if effect.name == "integral_gain":
-        axes = {name: getattr(file.rate, name) for name in ("roll", "pitch", "yaw")}
-        changed = {name: axis.replace(i=effect.size * axis.i) for name, axis in axes.items()}
-        return file.replace(rate=file.rate.replace(**changed))
-    if effect.name == "gyro_filter":
-        cutoff = effect.size * (file.filters.gyro_cutoff or 0.0)
-        return file.replace(filters=file.filters.replace(gyro_cutoff=cutoff))
+    for part in effect.each:
+        if part.name == "integral_gain":
+            axes = {name: getattr(file.rate, name) for name in ("roll", "pitch", "yaw")}
+            changed = {name: axis.replace(i=part.size * axis.i) for name, axis in axes.items()}
+            file = file.replace(rate=file.rate.replace(**changed))
+        if part.name == "gyro_filter":
+            cutoff = part.size * (file.filters.gyro_cutoff or 0.0)
+            file = file.replace(filters=file.filters.replace(gyro_cutoff=cutoff))
     return file
 
 
@@ -147,21 +179,24 @@ class Beyond(ReferenceInlet):
 
 def inlet_with(effect: Effect, inlet: ReferenceInlet) -> ReferenceInlet:
     """Return the loop's inlet with what no coefficient describes."""
-    parts = (inlet.points, inlet.spins, inlet.yaw_rate, inlet.level_held)
-    size = jnp.asarray(effect.size)
-    if effect.name == "translational_lift":
-        return Beyond(*parts, lift=size)
-    if effect.name == "rotor_damage":
-        loss = np.zeros((ROTORS, len(inlet.spins)))
-        loss[effect.rotor, effect.flight] = effect.size
-        return Beyond(*parts, loss=jnp.asarray(loss), begin=jnp.asarray(effect.begin))
-    return inlet
+    beyond: dict[str, Array] = {}
+    for part in effect.each:
+        if part.name == "translational_lift":
+            beyond["lift"] = jnp.asarray(part.size)
+        if part.name == "rotor_damage":
+            loss = np.zeros((ROTORS, len(inlet.spins)))
+            loss[part.rotor, part.flight] = part.size
+            beyond |= {"loss": jnp.asarray(loss), "begin": jnp.asarray(part.begin)}
+    if not beyond:
+        return inlet
+    return Beyond(inlet.points, inlet.spins, inlet.yaw_rate, inlet.level_held, **beyond)
 
 
 def logged_speeds(effect: Effect, speeds: Numbers, rate: float) -> Numbers:
     """Return rotor speeds (n, rotors) as they were filtered before they were logged."""
-    if effect.name != "filtered_speeds":
-        return speeds
-    keep = np.exp(-1.0 / rate / effect.size)
-    settled = speeds[:1] * keep
-    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], speeds, axis=0, zi=settled)[0])
+    for part in effect.each:
+        if part.name == "tachometer_lag":
+            keep = _kept(part.size, rate)
+            settled = speeds[:1] * keep
+            speeds = np.asarray(lfilter([1.0 - keep], [1.0, -keep], speeds, axis=0, zi=settled)[0])
+    return speeds

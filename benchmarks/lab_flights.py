@@ -159,7 +159,7 @@ def drawn(seed: int, effect: Effect = NOTHING) -> Lab:
         vehicle=vehicle.replace(battery=battery),
         groups=(
             *(group for group, there in has.items() if there),
-            *([effect.name] if effect.values else []),
+            *(part.name for part in effect.each if part.values),
         ),
         resistance=between(0.006, 0.012),
         drain=between(2e-4, 6e-4),

@@ -12,7 +12,7 @@ from sim_jax.numeric import Flag, Scalar
 from sim_jax.vehicle import Motor
 
 INSTANT = 1e-9
-"""s of a second lag up to which it is over at once."""
+"""s of a lag up to which it is over at once."""
 
 
 class LagSlope(eqx.Module):

@@ -28,7 +28,16 @@ from sim_jax.numeric import Array
 from sim_jax.rigid_body import Integrator, Motion, Wrench, step_midpoint, step_semi_implicit
 from sim_jax.rotation import Quaternion
 from sim_jax.schedule import Schedule
-from sim_jax.sensing import GyroFilter, filtered, look_back, packed, push, switched, unpacked
+from sim_jax.sensing import (
+    GyroFilter,
+    Tachometer,
+    filtered,
+    look_back,
+    packed,
+    push,
+    switched,
+    unpacked,
+)
 from sim_jax.state import Setpoints, State
 from sim_jax.terms.air import Air
 from sim_jax.terms.total import total_wrench
@@ -51,6 +60,8 @@ class Sample(eqx.Module):
     command: PerRotor
     """0..1, as the mixer gave them."""
     setpoints: Setpoints
+    read_speed: PerRotor | None = None
+    """rad/s, as of `State`."""
 
 
 _INTEGRATORS: dict[str, Integrator] = {
@@ -74,6 +85,7 @@ class Plant(eqx.Module):
     gyro: GyroFilter
     senses: Gyro | None = None
     """What the gyro reads; None where that is the body rate."""
+    tachometer: Tachometer | None = None
 
     def position_control(
         self, state: State, step: Int[Array, ""], reference: ReferenceInlet
@@ -224,7 +236,12 @@ class Plant(eqx.Module):
         if state.reference_history is not None:
             history = push(state.reference_history, jnp.stack(state.reference_speed), step)
             state = replaced(state, reference_history=history)
+        turning = state.rotor_speed
         state = self.physics(state, step)
+        if self.tachometer is not None and state.read_speed is not None:
+            speeds = zip(state.read_speed, turning, state.rotor_speed, strict=True)
+            read = tuple(self.tachometer.reading(*each) for each in speeds)
+            state = replaced(state, read_speed=read)
         if state.lagged_speed is not None:
             held = zip(state.lagged_speed, *self._asked(state, step), strict=True)
             lagged = tuple(self.lag.lag_reference(*speeds) for speeds in held)
@@ -257,7 +274,7 @@ class Plant(eqx.Module):
         body = forgetful(advance) if self.reversible else advance
         end, command = repeat(count, body, (state, state.command))
         logged = where(crashed, start.command, command)
-        row = Sample(start.motion, start.rotor_speed, logged, state.setpoints)
+        row = Sample(start.motion, start.rotor_speed, logged, state.setpoints, start.read_speed)
         broken = crashed | self.limits.broken_by(end.motion)
         now = (number + 1) / schedule.block_rate
         crash_time = jnp.where(broken & ~crashed, now, start.crash_time).astype(
@@ -281,7 +298,7 @@ class Plant(eqx.Module):
 
 def _flight(state: State) -> dict[str, PyTree[Array]]:
     """Return what stays as it is once a vehicle has crashed."""
-    motors = ("rotor_speed", "command", "reference_speed", "lagged_speed")
+    motors = ("rotor_speed", "command", "reference_speed", "lagged_speed", "read_speed")
     return {name: getattr(state, name) for name in ("motion", "integral", "gyro", *motors)}
 
 

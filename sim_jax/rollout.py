@@ -21,13 +21,13 @@ from sim_jax.numeric import Array, Scalar
 from sim_jax.plant import Plant, Sample
 from sim_jax.precision import Precision, in_precision, precision_of
 from sim_jax.schedule import Schedule
-from sim_jax.sensing import GyroFilter
+from sim_jax.sensing import GyroFilter, Tachometer
 from sim_jax.state import Start, State, first_state, hover_speed
 from sim_jax.trees import forgetful
 from sim_jax.vehicle import Vehicle
 
-SECOND_LAG = "time_constant_second"
-"""The effect of a second lag."""
+SECOND_LAG, TACHOMETER_LAG = "time_constant_second", "tachometer_lag"
+"""The effects of a second lag of the motors, and of one of what measures their speeds."""
 
 
 class Rollout(eqx.Module):
@@ -102,7 +102,7 @@ def begun(
     dtype = precision_of(arguments) if precision is None else jnp.dtype(precision)
     vehicle, controller, inlet, start, environment = in_precision(arguments, dtype)
     shape = _batch_shape(inlet, (vehicle, controller, start, environment.at_first))
-    senses = gyro_of(vehicle)
+    senses, read_late = gyro_of(vehicle), vehicle.effects.get(TACHOMETER_LAG)
     plant = Plant(
         vehicle=vehicle,
         controller=with_gains_of(controller, vehicle),
@@ -115,6 +115,7 @@ def begun(
         lag=_lag(vehicle, schedule),
         gyro=GyroFilter.at(controller.filters, schedule.rate_control_rate),
         senses=senses,
+        tachometer=None if read_late is None else Tachometer.over(read_late, schedule.step),
     )
     rate = start.motion.body_rate
     return plant, first_state(
@@ -126,6 +127,7 @@ def begun(
         seen=estimated(vehicle, controller, start.motion),
         read=rate if senses is None else senses.reading(rate),
         lags_twice=SECOND_LAG in vehicle.effects,
+        read_late=read_late is not None,
     )
 
 

@@ -1,4 +1,7 @@
-"""What the controllers see: a state estimate that is old, a gyro that is filtered."""
+"""What the controllers see: a state estimate that is old, a gyro that is filtered.
+
+And what tachometers read of the rotors, which nothing acts upon.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from jax import lax
 from jaxtyping import Float, Int
 
 from sim_jax.control.gains import Filters
+from sim_jax.motor import INSTANT
 from sim_jax.numeric import Array, Scalar
 from sim_jax.rigid_body import Motion
 from sim_jax.rotation import Quaternion
@@ -158,3 +162,29 @@ def filtered(gyro: GyroFilter, memory: GyroMemory, rate: Vec3, sample_rate: floa
             memory.acceleration + (acceleration - memory.acceleration) * gyro.derivative_share
         )
     return GyroMemory(newer, older, smooth, acceleration)
+
+
+class Tachometer(eqx.Module):
+    """A low-pass of first order on the recorded rotor speeds, exact for speeds that are linear.
+
+    Below zero its lag is a lead: the law goes on smoothly through zero, where it does nothing.
+    """
+
+    lag: Scalar
+    """s."""
+    kept: Scalar
+    """Share of a difference that a step leaves."""
+    step: float = eqx.field(static=True)
+    """s."""
+
+    @staticmethod
+    def over(lag: Scalar, step: float) -> Tachometer:
+        """Prepare the filter for steps of so many s."""
+        acts = lag > INSTANT
+        kept = jnp.where(acts, jnp.exp(-step / jnp.where(acts, lag, 1.0)), 0.0)
+        return Tachometer(lag, kept, step)
+
+    def reading(self, read: Scalar, before: Scalar, after: Scalar) -> Scalar:
+        """Return what is read after a step, of a speed before and after it and what was read."""
+        behind = self.lag * (after - before) / self.step
+        return after - behind + self.kept * (read - before + behind)

@@ -52,6 +52,8 @@ class State(eqx.Module):
     """rad/s, what the command asks of the motors."""
     lagged_speed: PerRotor | None
     """rad/s, that as a second lag of the motors leaves it; None without one."""
+    read_speed: PerRotor | None
+    """rad/s, rotor speeds as tachometers with a lag read them; None without one."""
     estimate_history: Float[Array, "past_estimates 10 *batch"] | None
     reference_history: Float[Array, "past_references rotors *batch"] | None
     crash_time: Scalar
@@ -87,11 +89,13 @@ def first_state(
     seen: Motion,
     read: Vec3,
     lags_twice: bool = False,
+    read_late: bool = False,
 ) -> State:
     """Return the state at time 0, every leaf in the full shape of the batch.
 
     ``seen``: the start's motion as position and attitude control see it; ``read``: its body rate as
-    the gyro reads it, rad/s; ``lags_twice``: whether the motors have a second lag.
+    the gyro reads it, rad/s; ``lags_twice``: whether the motors have a second lag; ``read_late``:
+    whether tachometers have one.
     """
     dtype = jnp.result_type(*jax.tree.leaves(start))
     start, seen, read = jax.tree.map(
@@ -121,6 +125,7 @@ def first_state(
         command=start.command,
         reference_speed=references,
         lagged_speed=references if lags_twice else None,
+        read_speed=start.rotor_speed if read_late else None,
         estimate_history=estimate_history,
         reference_history=reference_history,
         crash_time=jnp.full(shape, jnp.inf, dtype),

@@ -47,15 +47,25 @@ def test_laboratories_differ_in_what_they_have():
 
 
 def test_two_laboratories_of_three_have_an_effect_and_all_effects_are_drawn():
-    effects = [effect_of(seed, seconds=SECONDS, flights=3) for seed in range(300)]
+    effects = [effect_of(seed, seconds=SECONDS, flights=3, log_rate=100.0) for seed in range(300)]
     names = Counter(effect.name for effect in effects)
     assert set(names) == {"", *KNOWN, *UNKNOWN}
     assert 80 < names[""] < 120
     for effect in effects:
         assert bool(effect.values) == (effect.name in KNOWN)
-        assert bool(effect.size) == (effect.name in UNKNOWN)
+        assert bool(effect.size) == (effect.name in (*UNKNOWN, "tachometer_lag"))
     assert set(KNOWN) <= set(term_groups())
     assert not set(UNKNOWN) & set(COEFFICIENTS)
+
+
+def test_several_effects_are_two_or_three_of_them(monkeypatch):
+    monkeypatch.setattr(lab_effects, "CHOICE", "several")
+    for seed in SEEDS:
+        effect = effect_of(seed, seconds=SECONDS, flights=3, log_rate=100.0)
+        names = [part.name for part in effect.each]
+        assert len(set(names)) == len(names) in (2, 3)
+        assert set(names) <= {*KNOWN, *UNKNOWN}
+        assert {g for g in drawn(seed, effect).groups if g in KNOWN} == {*names} & {*KNOWN}
 
 
 @pytest.mark.slow
@@ -65,7 +75,7 @@ def test_what_no_coefficient_describes_changes_the_recordings(monkeypatch, tmp_p
     monkeypatch.setattr(lab_effects, "CHOICE", name)
     monkeypatch.setattr(lab_flights, "PHYSICS", 400)
     monkeypatch.setattr(lab_flights, "SAGS", 1)
-    effect = effect_of(0, seconds=SECONDS, flights=3)
+    effect = effect_of(0, seconds=SECONDS, flights=3, log_rate=100.0)
     flown = []
     monkeypatch.setattr(lab_flights, "write_bag", lambda simulation, _: flown.append(simulation))
     for lab in (drawn(0), drawn(0, effect)):
@@ -115,6 +125,14 @@ def test_the_table_counts_errors_and_intervals_that_hold_the_truth():
     assert effects.title == "Simulated lab flights with effects"
     by_effect = "| rotor damage |  | 1 |  | 0 of 1 | 1 (motor_constant) | motor_constant +8.0 |  |"
     assert by_effect in effects.text.splitlines()
+    both = Effect("rotor_damage, gyro_filter", several=(loss, Effect("gyro_filter", size=1.3)))
+    with_both = replace(trials[1], lab=replace(lab, effect=both))
+    several = section([with_effect, with_both])
+    assert several.title == "Simulated lab flights with several effects"
+    for name, count in (("rotor damage", 2), ("gyro filter", 1)):
+        assert any(
+            line.startswith(f"| {name} |  | {count} |") for line in several.text.splitlines()
+        )
 
 
 def test_a_run_goes_on_from_the_laboratories_that_a_file_keeps(tmp_path, monkeypatch):

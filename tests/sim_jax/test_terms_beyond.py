@@ -13,6 +13,7 @@ from sim_jax.motor import Lag, LagSlope, SwitchedLag
 from sim_jax.rigid_body import Motion, angular_acceleration
 from sim_jax.rollout import rollout
 from sim_jax.schedule import Schedule
+from sim_jax.sensing import Tachometer
 from sim_jax.state import hover_speed
 from sim_jax.terms.air import Air
 from sim_jax.terms.rotor import lifting
@@ -238,3 +239,46 @@ def test_a_second_lag_of_nothing_changes_no_bit_of_a_flight_and_another_delays_i
     base = flown()
     np.testing.assert_array_equal(flown(time_constant_second=0.0), base)
     assert np.abs(flown(time_constant_second=SECOND) - base).max() > 1.0
+
+
+def read_by(lag):
+    """Return what tachometers with a lag read after a step of 2.5 ms, rad/s."""
+    return Tachometer.over(lag, 0.0025).reading(*map(jnp.asarray, (590.0, 600.0, 620.0)))
+
+
+@pytest.mark.parametrize("lag", [5e-4, 0.008])
+def test_tachometers_read_what_the_differential_equation_says(lag):
+    slope = (620.0 - 600.0) / 0.0025
+    exact = solve_ivp(
+        lambda time, read: (600.0 + slope * time - read) / lag,
+        (0.0, 0.0025),
+        [590.0],
+        rtol=1e-11,
+        atol=1e-9,
+        method="LSODA",
+    ).y[0, -1]
+    np.testing.assert_allclose(read_by(jnp.asarray(lag)), exact, rtol=1e-8)
+
+
+@pytest.mark.parametrize("lag", [-0.002, 0.0, 5e-4, 0.008])
+def test_a_tachometers_derivatives_agree_with_differences_also_where_its_lag_vanishes(lag):
+    width = 1e-7 if lag else -1e-7  # below zero it leads
+    difference = (read_by(jnp.asarray(lag + width)) - read_by(jnp.asarray(lag))) / width
+    np.testing.assert_allclose(jax.jacfwd(read_by)(jnp.asarray(lag)), difference, rtol=1e-4)
+
+
+def test_late_tachometers_change_what_is_read_and_no_bit_of_the_flight():
+    def flown(**effects):
+        craft = with_effects(**effects)
+        start = moving_start(craft)
+        schedule = Schedule(log_rate=400)
+        return rollout(craft, controller(), schedule, wobble(craft, 60), start, samples=60).log
+
+    true, late = (np.stack(flown(tachometer_lag=lag).read_speed) for lag in (0.0, 0.01))
+    log = flown(tachometer_lag=0.01)
+    np.testing.assert_array_equal(np.stack(log.rotor_speed), true)
+    base = jax.tree.leaves(flown().motion)
+    assert all((a == b).all() for a, b in zip(jax.tree.leaves(log.motion), base, strict=True))
+    later = np.gradient(late, 1.0 / 400.0, axis=1)
+    np.testing.assert_allclose((late + 0.01 * later)[:, 8:-1], true[:, 8:-1], atol=0.2)
+    assert np.abs(late - true).max() > 2.0

@@ -147,7 +147,7 @@ class Observer(eqx.Module):
         """Return a state moved by a change of its n numbers; its attitude stays a rotation."""
         leaves, structure = jax.tree.flatten(_parts(state))
         moved = [leaf + row for leaf, row in zip(leaves, change[: len(leaves)], strict=True)]
-        motion, rotor_speed, integral, gyro, lagged = jax.tree.unflatten(structure, moved)
+        motion, rotor_speed, integral, gyro, lagged, read = jax.tree.unflatten(structure, moved)
         motion = Motion(
             motion.position, motion.velocity, motion.attitude.normalized(), motion.body_rate
         )
@@ -165,6 +165,7 @@ class Observer(eqx.Module):
             integral=integral,
             gyro=gyro,
             lagged_speed=lagged,
+            read_speed=read,
             reference_history=line,
         )
 
@@ -208,7 +209,7 @@ class Observer(eqx.Module):
             "position": (position.x, position.y, position.z),
             "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
             "body_rate": (rate.x, rate.y, rate.z),
-            "rotor_speed": state.rotor_speed,
+            "rotor_speed": state.rotor_speed if state.read_speed is None else state.read_speed,
             "command": command,
         }
         shape = self.late.shape[1:]
@@ -246,12 +247,13 @@ class Observer(eqx.Module):
         return rows
 
 
-def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory, Any]:
+def _parts(state: State) -> tuple[Motion, Any, Vec3, GyroMemory, Any, Any]:
     """Return what is corrected of a state: 32 numbers with both gyro filters.
 
-    And four with a second lag of the motors.
+    And four with a second lag of the motors, four with one of the tachometers.
     """
-    return state.motion, state.rotor_speed, state.integral, state.gyro, state.lagged_speed
+    lags = state.lagged_speed, state.read_speed
+    return state.motion, state.rotor_speed, state.integral, state.gyro, *lags
 
 
 def commands_in_flight(state: State, count: int) -> int:
@@ -265,7 +267,7 @@ def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
     def filled(tree: Any, sd: float) -> Any:
         return jax.tree.map(lambda _: sd, tree)
 
-    motion, rotor_speed, integral, gyro, lagged = _parts(state)
+    motion, rotor_speed, integral, gyro, lagged, read = _parts(state)
     errors = (
         Motion(
             filled(motion.position, 1e-3),
@@ -282,5 +284,6 @@ def first_errors(state: State, in_flight: int) -> np.ndarray[Any, Any]:
             filled(gyro.acceleration, 0.3),
         ),
         filled(lagged, 3.0),
+        filled(read, 3.0),
     )
     return np.asarray([*jax.tree.leaves(errors), *[3.0] * (in_flight * len(rotor_speed))])

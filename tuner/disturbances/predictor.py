@@ -45,9 +45,9 @@ LEARNT_FROM = 18.0
 """s of each flight from which strengths are learnt: each of the seven takes a filter of its own."""
 SEGMENTS = 8
 """That are filtered side by side while strengths are differentiated by."""
-NUMBERS = 61
+NUMBERS = 65
 """Of a state and its disturbances that samples correct, with four commands on their way and those
-that a second lag holds."""
+that a second lag and the tachometers' hold."""
 NOISIER = 1.05
 """Innovations of a channel over what they are assumed to be, from which it is noisier than that."""
 

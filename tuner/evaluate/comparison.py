@@ -31,7 +31,7 @@ from tuner.evaluate.write import roll_pitch_yaw
 from tuner.findings.findings import one_line
 from tuner.objective.battery import with_reference_voltage
 from tuner.objective.criterion import Point, units_of
-from tuner.objective.flight import MOTION, TURNED
+from tuner.objective.flight import MOTION, SPEEDS, TURNED
 from tuner.objective.flown import Flown, fly
 from tuner.objective.inlets import INLETS, window_seconds
 from tuner.objective.noise import noise_of
@@ -267,14 +267,14 @@ class _Group:
             limits=self._limits,
             states=states,
             conditions=conditions,
-            channels=(*POSE, "rotor_speed", MOTION, TURNED),
+            channels=(*POSE, SPEEDS, MOTION, TURNED),
         )
         rate, calm = float(self._schedule.log_rate), np.zeros(segments.count)
         acted = acting(
             model.vehicle,
             flown.channels[MOTION],
             flown.channels[TURNED],
-            flown.channels["rotor_speed"],
+            flown.channels[SPEEDS],
             rate=rate,
             wind=(conditions.get("wind_x", calm), conditions.get("wind_y", calm)),
             stride=self._stride,

@@ -32,7 +32,7 @@ from tuner.core.shipped import find_config
 from tuner.core.yaml_section import Number, Section, build
 from tuner.engine import Here, Report, current
 from tuner.evaluate.forces import Forces, forces_of
-from tuner.objective.flight import MOTION, SETPOINTS, TURNED, recorded_of
+from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, recorded_of
 from tuner.objective.flown import CODE
 from tuner.objective.trajectory import Published, at_speed, published
 from tuner.options import SimulationOptions
@@ -320,7 +320,7 @@ def _logged(
         "velocity": motion[..., 3:6],
         "attitude": rows_of[TURNED],
         "body_rate": motion[..., 6:9],
-        "rotor_speed": rows_of["rotor_speed"],
+        "rotor_speed": rows_of[SPEEDS],
         "command": rows_of["command"],
         "rate_setpoint": setpoints[..., 0:3],
         "thrust_setpoint": setpoints[..., 3:],
@@ -346,7 +346,7 @@ def _program(
 
         def sample(state: State, number: Any) -> tuple[State, dict[str, Any]]:
             after, row = plant.sample(state, number)
-            channels = ("rotor_speed", "command", MOTION, TURNED, SETPOINTS)
+            channels = (SPEEDS, "command", MOTION, TURNED, SETPOINTS)
             return after, recorded_of(row, flown, NOTHING_AROUND, {}, channels)
 
         last, logged = lax.scan(sample, first, jnp.arange(lengths["turns"]))

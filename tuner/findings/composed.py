@@ -326,6 +326,15 @@ def _gyro_scale(numbers: Numbers) -> str:
     return f"The gyro's readings are {listed(parts)} than how the recorded attitude turns."
 
 
+def _tachometer_lag(numbers: Numbers) -> str:
+    value, error = numbers["tachometer_lag"], numbers["tachometer_lag_error"]
+    by = "behind" if value > 0.0 else "ahead of"
+    return (
+        f"Recorded rotor speeds are {1e3 * abs(value):.2g} ± {1e3 * error:.1g} ms {by} the rotors "
+        "that turn the vehicle: they look filtered."
+    )
+
+
 def _more(numbers: Numbers, name: str) -> str:
     """Return by how much a factor differs from one, in percent with its standard error."""
     more = 100.0 * (numbers[name] - 1.0)
@@ -351,6 +360,7 @@ _SHOWS: Mapping[str, tuple[Callable[[Numbers], str], str]] = {
         "Mount it straight, or calibrate its level (SENS_BOARD_X_OFF, SENS_BOARD_Y_OFF).",
     ),
     "gyro_scale": (_gyro_scale, "Calibrate the gyro, or compare it with another."),
+    "tachometer_lag": (_tachometer_lag, "Log them unfiltered, or with the gyro's stamps."),
 }
 """Group of terms -> what it says, and what to do."""
 

@@ -28,9 +28,9 @@ from tuner.objective.initial_conditions import ROWS, moved, spun_up, trimmed, wh
 from tuner.objective.segments import Segments
 from tuner.vehicle.model import Model
 
-MOTION, TURNED, SETPOINTS = "motion", "turned", "setpoints"
+MOTION, TURNED, SPEEDS, SETPOINTS = "motion", "turned", "speeds", "setpoints"
 """What no recording holds: the centre of mass's position, velocity and body rate; the body's
-attitude; and the set-points of rate and thrust."""
+attitude; the rotors' speeds; and the set-points of rate and thrust."""
 
 
 def recorded_of(
@@ -60,9 +60,10 @@ def recorded_of(
         "position": (position.x, position.y, position.z),
         "attitude": (attitude.w, attitude.x, attitude.y, attitude.z),
         "body_rate": _parts(rate),
-        "rotor_speed": log.rotor_speed,
+        "rotor_speed": log.rotor_speed if log.read_speed is None else log.read_speed,
         "command": log.command,
         MOTION: (*_parts(motion.position), *_parts(motion.velocity), *_parts(motion.body_rate)),
+        SPEEDS: log.rotor_speed,
         TURNED: tuple(getattr(motion.attitude, axis) for axis in "wxyz"),
         SETPOINTS: (*_parts(log.setpoints.rate), log.setpoints.thrust),
     }

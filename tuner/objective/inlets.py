@@ -174,7 +174,7 @@ class RecordedRotorSpeed(RecordedInlet):
     feeds = RotorSpeedInlet
     needs = ("rotor_speed",)
     silences = ("command", "rotor_speed", "acceleration")
-    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *OF_MOTORS)
+    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *OF_MOTORS, "tachometer_lag")
     frees = STEADY_TORQUE
     terms = AIR
     ignores = ("rotor_speed", "rate_integral")
@@ -219,7 +219,7 @@ class RecordedAttitude(RecordedInlet):
     feeds = AttitudeInlet
     needs = ("attitude",)
     silences = ("attitude", "body_rate", "command", "rotor_speed")
-    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *TURNING)
+    bypasses = ("estimate_latency", *OF_RATE_CONTROL, *TURNING, "tachometer_lag")
     ignores = ("attitude", "body_rate", "rate_integral", "trim")
     starts_recorded = False
     window = 1.0

@@ -7,7 +7,14 @@ from tuner.search.fitted import Fitted
 from tuner.uncertainty.estimates import Uncertainty
 from tuner.vehicle import COEFFICIENTS, term_groups
 
-SHOWN = ("thrust_exponent", "motor_lag", "rate_gain", "autopilot_tilt", "gyro_scale")
+SHOWN = (
+    "thrust_exponent",
+    "motor_lag",
+    "rate_gain",
+    "autopilot_tilt",
+    "gyro_scale",
+    "tachometer_lag",
+)
 """Groups of terms of which is said what they mean."""
 
 

@@ -34,7 +34,7 @@ from tuner.equation_error.rate_controller import AXES, PARTS, Answer, Signals, a
 from tuner.equation_error.unexplained import Law, Pair, unexplained
 from tuner.findings.findings import Code, Finding
 from tuner.objective.criterion import units_of
-from tuner.objective.flight import MOTION, SETPOINTS, TURNED, environment_of
+from tuner.objective.flight import MOTION, SETPOINTS, SPEEDS, TURNED, environment_of
 from tuner.objective.flown import Flown, fly
 from tuner.objective.normal import Objective
 from tuner.objective.recorded_inputs import zero_order_hold
@@ -46,7 +46,7 @@ from tuner.vehicle.model import Model
 
 MATTERS = 0.5
 """Standard errors without it, from which the move of a coefficient is said."""
-_CHANNELS = ("position", "attitude", "rotor_speed", "body_rate", "command")
+_CHANNELS = ("position", "attitude", SPEEDS, "body_rate", "command")
 LOOP_SIGNALS = ("rate_setpoint", "body_rate", "command")
 """What a rate controller hears and says, as recorded."""
 WITHIN_PERIOD = 1.5e-3
@@ -128,11 +128,15 @@ def lack_of(fitted: Fitted, flights: Sequence[Flight]) -> Lack | None:
         if driven[number] and "command" in flight.series
     }
     speeds = _driven(commands, model, environment, schedule)
+    read_late = float(model.vehicle.effects.get("tachometer_lag", 0.0))  # to first order
     read = []
     for number, flight in enumerate(flights):
         series = dict(flight.series)
         if number in speeds:
             series["rotor_speed"] = speeds[number]
+        elif read_late and "rotor_speed" in series:
+            late = series["rotor_speed"]
+            series["rotor_speed"] = Series(late.time - read_late, late.values)
         read.append(_recorded(replace(flight, series=series), model, conditions, number))
     flown = fly(
         objective.model,
@@ -379,7 +383,7 @@ def _simulated(
     def at(name: str) -> Array:
         return _at(Series(clock, channels[name][number]), part.time)
 
-    rows, attitude, speeds = at(MOTION), at(TURNED), at("rotor_speed")
+    rows, attitude, speeds = at(MOTION), at(TURNED), at(SPEEDS)
     attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
     position, velocity, turning = (Vec3.of(rows[:, at].T) for at in _PARTS)
     motion = Motion(position, velocity, Quaternion.of(attitude.T), turning)

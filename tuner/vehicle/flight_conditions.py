@@ -132,6 +132,21 @@ SURROUNDING_ROWS = (
             ("yaw", "yaw", "MC_YAWRATE_K"),
         )
     ),
+    Coefficient(
+        name="tachometer_lag",
+        unit="s",
+        meaning="lag of the recorded rotor speeds behind the rotors' own",
+        source="low-pass filters of speed controllers, bridges and loggers",
+        scope="setup",
+        place=(EFFECTS, "tachometer_lag"),
+        scale="linear",
+        bounds=(-0.1, 0.1),
+        prior_sd=0.01,
+        step=0.002,
+        neutral=0.0,
+        group="tachometer_lag",
+        exported_as=_OUTSIDE,
+    ),
     # what a recording may get wrong by a constant
     _flight(
         "pose",

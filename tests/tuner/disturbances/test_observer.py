@@ -44,7 +44,11 @@ def begun_with(**effects):
 
 
 @pytest.mark.parametrize("in_flight", [0, 2])
-@pytest.mark.parametrize("effects", [{}, {"time_constant_second": 0.006}], ids=["one", "two"])
+@pytest.mark.parametrize(
+    "effects",
+    [{}, {"time_constant_second": 0.006, "tachometer_lag": 0.01}],
+    ids=["one lag", "three"],
+)
 def test_numbers_move_by_what_they_are_corrected_by(effects, in_flight):
     observer, state = begun_with(**effects)
     before = observer.numbers(state, TICK, in_flight)

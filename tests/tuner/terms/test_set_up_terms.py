@@ -55,15 +55,15 @@ def test_none_is_found_where_none_flew(monkeypatch, setpoints):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("second", [0.0, 0.012])
-def test_a_second_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, second):
+@pytest.mark.parametrize("value", [0.0, 0.012])
+@pytest.mark.parametrize("name", ["time_constant_second", "tachometer_lag"])
+def test_a_lag_is_found_where_it_flew_and_biases_no_motor(monkeypatch, name, value):
     base = ("time_constant_up", "time_constant_down", "actuator_latency", "inertia_xx")
-    group = {"motor_lag": ("time_constant_second",)}
-    effects = {"time_constant_second": second} if second else {}
-    result = selected(monkeypatch, group, effects=effects, base=base)
-    assert [row.kept for row in result.rows] == [second > 0.0]
+    effects = {name: value} if value else {}
+    result = selected(monkeypatch, {"lag": (name,)}, effects=effects, base=base)
+    assert [row.kept for row in result.rows] == [value > 0.0]
     known = examine(result.fitted, names=FLIGHTS, in_doubt=result.in_doubt).uncertainty.estimates
     space = problem(base).space
-    for name, true in (space.numbers(space.initial) | effects).items():
-        low, high = known[name].ci95
-        assert low < true < high, name
+    for coefficient, true in (space.numbers(space.initial) | effects).items():
+        low, high = known[coefficient].ci95
+        assert low < true < high, coefficient
