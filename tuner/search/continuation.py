@@ -21,7 +21,7 @@ from tuner.search.clocks import clocks_that_differ
 from tuner.search.evolution import CmaEs
 from tuner.search.iteration import Iteration
 from tuner.search.least_squares import LeastSquares, starts_asked_for
-from tuner.search.loop import GAIN, with_loop
+from tuner.search.loop import FROM_START, GAIN, with_loop
 from tuner.search.optimiser import OPTIMISERS, Free, Iterate, StageProblem
 from tuner.search.progress import Progress, criterion_of
 from tuner.search.stages import Stage
@@ -47,6 +47,7 @@ def grow(
     on_progress: OnProgress,
     seed: int = 0,
     worth_polishing: Callable[[Progress], bool] = lambda _: True,
+    start: Progress | None = None,
 ) -> Progress:
     """Run the remaining stages and return where the search ended.
 
@@ -68,15 +69,22 @@ def grow(
         Of an optimiser that draws at random.
     worth_polishing
         Whether to go on where the search stands before its first polish.
+    start
+        Where the search began, if not at ``progress``.
     """
     search = _Search(objective, free, on_progress, seed)
+    start = progress if start is None else start
     while progress.stage < len(stages):
         stage = stages[progress.stage]
+        last = progress.stage + 1 == len(stages)
         polished = progress.stage > 0 and stages[progress.stage - 1].prunes
         if stage.prunes and not polished and not worth_polishing(progress):
             break
-        choices = undecided if stage.decides else ()
-        progress = search.decided(stage, progress, choices, last=progress.stage + 1 == len(stages))
+        if stage.decides:
+            before = stages[start.stage : progress.stage]
+            progress = search.decided(stage, progress, undecided, start, before, last=last)
+        else:
+            progress = search.run(stage, progress, last=last)
     return progress
 
 
@@ -103,19 +111,42 @@ class _Search:
         return replace(_finished(problem, progress), converged=converged)
 
     def decided(
-        self, stage: Stage, progress: Progress, choices: Sequence[str], *, last: bool
+        self,
+        stage: Stage,
+        progress: Progress,
+        choices: Sequence[str],
+        start: Progress,
+        before: Sequence[Stage],
+        *,
+        last: bool,
     ) -> Progress:
-        """Run one stage as the loop flies and with each choice the other way; keep the best."""
+        """Run one stage as the loop flies and with each choice the other way; keep the best.
 
-        def on_progress_of_rival(rival: Progress) -> None:
-            # a checkpoint begins with all of them again
-            self.on_progress(replace(rival, loop=progress.loop))
-
+        Choices of `FROM_START` go through the stages before it too, from the start.
+        """
         best = self.run(stage, progress, last=last)
         for choice in choices:
-            switched = replace(progress, loop=best.loop.switched(choice))
-            rival = replace(self, on_progress=on_progress_of_rival).run(stage, switched, last=last)
-            evaluations = best.evaluations + rival.evaluations - progress.evaluations
+            begin, earlier = (start, before) if choice in FROM_START else (progress, ())
+            evaluations = best.evaluations
+
+            def on_progress(rival: Progress, begin: Progress = begin) -> None:
+                # a checkpoint begins with all of them again
+                made = rival.iterations[len(begin.iterations) :]
+                shown = replace(
+                    progress,
+                    iterations=(*progress.iterations, *made),
+                    evaluations=progress.evaluations + len(made),
+                    steps=len(made),
+                    iterate=rival.iterate,
+                )
+                self.on_progress(shown)
+
+            other = replace(self, on_progress=on_progress)
+            rival = replace(begin, loop=best.loop.switched(choice))
+            for one in earlier:
+                rival = other.run(one, rival, last=False)
+            rival = other.run(stage, rival, last=last)
+            evaluations += rival.evaluations - begin.evaluations
             better = best if best.losses.min() <= GAIN * rival.losses.min() else rival
             best = replace(better, evaluations=evaluations)
         return best

@@ -215,9 +215,10 @@ class _Attempt:
         job, key = self.job, fingerprint(self.job)
         stages, starts = self._stages(), starting_vectors(job)
         free = Free(np.ones(len(job.space), bool), free_offsets(job))
-        progress, spent = beginning(job.objective, starts), 0.0
+        start, spent = beginning(job.objective, starts), 0.0
+        progress = start
         if resume:
-            progress, spent = load(self.checkpoint, key, progress)
+            progress, spent = load(self.checkpoint, key, start)
         began = time.perf_counter() - spent
 
         def on_progress(progress: Progress) -> None:
@@ -237,6 +238,7 @@ class _Attempt:
             on_progress=on_progress,
             seed=job.settings.job.search.seed,
             worth_polishing=lambda progress: not (self.provisional and _is_far_off(progress)),
+            start=start,
         )
         seconds = time.perf_counter() - began
         save(self.checkpoint, key, progress, seconds)

@@ -15,6 +15,12 @@ GAIN = 1.2
 """The controller file's own choice is given up only for one that lowers the loss by this factor."""
 
 
+FROM_START = ("sees_markers",)
+"""Choices that the markers' coefficients take up while a hover is all that is seen: the other way
+is tried from where the search began. From markers that meet a hover as it did not fly, it flies
+worse than the wrong way, and no step leads out."""
+
+
 class Loop(NamedTuple):
     """The choices, 1 or 0 each; named as the controller's leaves are.
 

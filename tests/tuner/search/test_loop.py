@@ -1,5 +1,7 @@
 """What is undecided of the loop is decided by the recordings."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,3 +39,29 @@ def test_who_sees_the_markers_is_found_whatever_the_controller_file_says(flown, 
     found = fit.space.numbers(progress.points.coefficients[0])
     for name, value in FRAME.items():
         assert float(found[name]) == pytest.approx(value, rel=0.05)
+
+
+def test_who_sees_the_markers_is_tried_from_where_the_search_began():
+    """By another choice the first seconds lead the markers to where none of them flies."""
+    fit = problem(tuple(FRAME))
+    stages = schedule_of(fit.samples, fit.schedule.log_rate, robust=True, steps=2)
+    at = next(number for number, stage in enumerate(stages) if stage.decides)
+    start = beginning(fit, np.asarray(fit.space.initial)[None])
+    astray = start.points.coefficients + 3.0
+    reports, seen = [], Loop(sees_markers=1.0)
+    there = replace(start, stage=at, points=Point(astray, start.points.offsets))
+    progress = grow(
+        with_loop(with_data(with_loop(fit, seen), fit.start(fit.space.initial)), Loop()),
+        stages[: at + 1],
+        there,
+        free=Free(np.ones(len(fit.space), bool), np.zeros((len(OFFSETS), 2), bool)),
+        undecided=("sees_markers",),
+        on_progress=reports.append,
+        start=start,
+    )
+    assert progress.loop == seen
+    np.testing.assert_allclose(progress.points.coefficients, start.points.coefficients, atol=1e-3)
+    for report in reports:  # a checkpoint of them begins with the stage again
+        np.testing.assert_array_equal(report.points.coefficients, astray)
+        assert (report.stage, report.loop) == (at, start.loop)
+        assert len(report.iterations) == report.evaluations == report.steps
