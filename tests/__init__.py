@@ -1,5 +1,30 @@
-"""The project's tests; ``checked`` turns sim_jax's annotations into run-time checks."""
+"""The project's tests; ``checked`` turns sim_jax's annotations into run-time checks.
+
+What jax reads when it is imported is set here: double precision, and a cache of compiled programs
+on disk, however small they are, which the processes of a run share, those that tests start
+included.
+
+Most tests compile for ten seconds what then runs for a tenth of one. So LLVM does not optimise what
+they compile, which halves the time to compile and triples that to run, and without XLA's newer
+emitter of kernels two fifths of the rest are saved; `make test-all` has both as the program does
+(``TUNE_TESTS_OPTIMISED``).
+"""
+
+import os
 
 from beartype import BeartypeConf, beartype
 
+from tuner.core.disk import cache_folder
+from tuner.core.runtime import set_environment
+
 checked = beartype(conf=BeartypeConf(is_pep484_tower=True))  # an int passes for a float
+
+if not os.environ.get("TUNE_TESTS_OPTIMISED"):
+    cheap = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = f"{cheap} {os.environ.get('XLA_FLAGS', '')}".strip()
+os.environ.setdefault("JAX_ENABLE_X64", "true")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+set_environment()

@@ -1,33 +1,20 @@
-"""Double precision, the program's own set-up, and bounded memory, for every test that uses jax.
+"""The program's own set-up, and bounded memory, for every test that uses jax.
 
 A test process keeps every program that it has compiled: gibibytes by the end of the suite, for most
 modules compile their own and use them once. When a process has grown too large, by the end of a
 module or before the demo's fit, all of them are dropped, see `tests.memory`. A program that is
-asked for again comes from the compilation cache on disk, however small it is, which the processes
-of a run share, those that tests start included; it is not compiled, but traced again, which takes
-seconds.
-
-Most tests compile for ten seconds what then runs for a tenth of one. So LLVM does not optimise what
-they compile, which halves the time to compile and triples that to run, and without XLA's newer
-emitter of kernels two fifths of the rest are saved; `make test-all` has both as the program does
-(``TUNE_TESTS_OPTIMISED``).
+asked for again comes from the compilation cache on disk, see `tests`; it is not compiled, but
+traced again, which takes seconds.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 from collections import defaultdict
 from pathlib import Path
 
+import jax
 import pytest
-
-os.environ.setdefault("JAX_ENABLE_X64", "true")
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-if not os.environ.get("TUNE_TESTS_OPTIMISED"):
-    cheap = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-    os.environ["XLA_FLAGS"] = f"{cheap} {os.environ.get('XLA_FLAGS', '')}".strip()
-
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
@@ -36,17 +23,14 @@ from tests import memory
 from tests.demo import demo
 from tests.memory import MOST_IN_A_MODULE, MOST_MEMORY
 from tuner.core.disk import cache_folder
-from tuner.core.runtime import collect_rarely, set_environment
+from tuner.core.runtime import collect_rarely
 
 __all__ = ["demo"]
 
-set_environment()
 collect_rarely()
 threadpool_limits(1, user_api="blas")
 keep_code_in(cache_folder() / "kernels_of_tests")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "compiled_by_tests"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+assert jax.config.jax_compilation_cache_dir, "jax was imported before `tests` set its environment"
 
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
