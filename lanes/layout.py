@@ -206,13 +206,8 @@ class Layout:
         memories = []
         for pointer, shape, moved in zip(frame.taken, self.outputs, self.moved, strict=True):
             if moved:
-                in_loop = is_laid_by_loop(shape, self.lengths)
-                inner = tuple(shape.shape)[1 if in_loop else 0 :]
-                of_pass, *rest = lower.row_major((0, *inner), constant(I64, self.columns))
-                stride = b.mul(frame.passes, of_pass)
-                strides = (stride, *rest) if in_loop else tuple(rest)
-                if in_loop:
-                    stride = b.mul(stride, lower.size(shape.shape[0]))
+                of_pass, *rest = lower.row_major((0, *shape.shape), constant(I64, self.columns))
+                stride, strides = b.mul(frame.passes, of_pass), tuple(rest)
                 begins = [
                     b.add(b.mul(segment, stride), b.mul(turn, of_pass))
                     for segment, turn in zip(frame.segment, frame.turn, strict=True)

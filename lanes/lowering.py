@@ -448,24 +448,31 @@ class Lowering:
             parts = [self.b.zext(p, self.e.vector(stored)) for p in map(self.e.splat, parts)]
         vectors = [self.e.splat(part) for part in parts]
         lanes = [self.b.gep(storage.pointer, [self._sum(own, first)]) for own in storage.scattered]
-        whole = len(vectors) // width * width
-        for begin in range(0, whole, width):
-            turned = self._transposed(vectors[begin : begin + width])
-            for lane, row in zip(lanes, turned, strict=True):
+        begin = 0
+        while begin < len(vectors):
+            count = 1 << (min(width, len(vectors) - begin).bit_length() - 1)
+            turned = self._transposed(vectors[begin : begin + count])
+            for number, lane in enumerate(lanes):
+                row = self._some_lanes(turned[number % count], number - number % count, count)
                 pointer = self.b.gep(lane, [constant(I64, begin)])
                 pointer = self.b.bitcast(pointer, row.type.as_pointer())
                 self.b.store(row, pointer).align = _bytes(stored)
-        for place in range(whole, len(vectors)):
-            for number_of, lane in enumerate(lanes):
-                one = self.b.extract_element(vectors[place], constant(ir.IntType(32), number_of))
-                self.b.store(one, self.b.gep(lane, [constant(I64, place)])).align = _bytes(stored)
+            begin += count
+
+    def _some_lanes(self, row: ir.Value, first: int, count: int) -> ir.Value:
+        """Return neighbouring lanes of a vector; one lane as a number."""
+        index = ir.IntType(32)
+        if count == 1:
+            return self.b.extract_element(row, constant(index, first))
+        lanes = ir.Constant(ir.VectorType(index, count), list(range(first, first + count)))
+        return self.b.shuffle_vector(row, row, lanes)
 
     def _transposed(self, rows: list[ir.Value]) -> list[ir.Value]:
-        """Return as many vectors as they have lanes, turned about their diagonal."""
-        width, half = len(rows), len(rows) // 2
+        """Return vectors, a power of two of them, each square of so many lanes transposed."""
+        width, half = self.e.width, len(rows) // 2
         while half:
             turned = list(rows)
-            for i in range(width):
+            for i in range(len(rows)):
                 if i & half:
                     continue
                 # lanes whose number has this bit change places between the two

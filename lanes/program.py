@@ -53,6 +53,8 @@ ONE_BY_ONE = 64
 """Lanes up to which they are copied one after the other."""
 IN_CACHE = 2**18
 """bytes that are laid out at a time."""
+MANY = 256
+"""Lanes from which a block without columns is two vectors wide: one computes while one waits."""
 FEW = 512
 """Blocks without a loop that are computed sooner than another thread begins."""
 
@@ -67,7 +69,7 @@ class Run:
         The function's outputs, a pytree; leaves (lanes, \\*shape).
     columns
         Their derivatives along the Q tangents, leaves (lanes, \\*shape, Q). Those of an output
-        whose first axis is a loop's are left as they were laid, (lanes, turns, passes, \\*rest,
+        whose first axis is a loop's are left as they were laid, (lanes, passes, turns, \\*rest,
         columns of a pass), the last pass filled up: `joined` lays them side by side. None for an
         output that does not move, and if nothing moves.
     """
@@ -76,9 +78,9 @@ class Run:
     columns: Any
 
 
-def joined(columns: NDArray[Any], count: int, *, axis: int = 1) -> NDArray[Any]:
-    """Return derivatives side by side, (..., Q), whose passes lie along an axis."""
-    beside = np.moveaxis(columns, axis, -2)
+def joined(columns: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return derivatives (lanes, passes, ..., columns of a pass) side by side, (lanes, ..., Q)."""
+    beside = np.moveaxis(columns, 1, -2)
     return beside.reshape(*beside.shape[:-2], -1)[..., :count]
 
 
@@ -129,6 +131,7 @@ class Program:
         names = {length for a in leaves for length in a.shape if isinstance(length, str)}
         self.names = tuple(sorted(names))
         self.columns = at_once if self.moving else 0
+        self._kernels: dict[int, _Compiled | None] = {}
         self.key: str | None = None
         if made_of is not None:
             with suppress(UnknownError):
@@ -181,11 +184,16 @@ class Program:
         """Name -> the number that stands for each length while it is traced."""
         return dict(zip((*self.names, "turns"), _STAND_INS, strict=False))
 
-    @cached_property
-    def _compiled(self) -> _Compiled | None:
-        """The kernel, or None where something has no rule."""
+    def _kernel(self, lanes: int = 1) -> _Compiled | None:
+        """Return the kernel for so many lanes, or None where something has no rule."""
+        vectors = 2 if lanes >= MANY and not self.moving else 1
+        if vectors not in self._kernels:
+            self._kernels[vectors] = self._compiled(vectors)
+        return self._kernels[vectors]
+
+    def _compiled(self, vectors: int) -> _Compiled | None:
         try:
-            return _Compiled(self)
+            return _Compiled(self, vectors)
         except UnsupportedError as missing:
             logger.debug("%s runs through XLA: no rule for %s", self.name, missing)
             what = f"{self.name}: no rule for {missing}"
@@ -195,7 +203,7 @@ class Program:
     @property
     def is_kernel(self) -> bool:
         """Whether it runs as a kernel; else through XLA."""
-        return self._compiled is not None
+        return self._kernel() is not None
 
     def __call__(
         self,
@@ -228,7 +236,7 @@ class Program:
         ]
         moved = [np.asarray(t, float) for t in (tangents or [])]
         lengths = self._lengths(leaves, turns)
-        kernel = self._compiled
+        kernel = self._kernel(lanes)
         if kernel is None:
             return self.by_xla(values, tangents, turns=turns)
         return kernel.run(leaves, moved, lengths, lanes, wanted)
@@ -257,7 +265,7 @@ class Program:
 
         def laid(leaf: Any, shape: Any) -> NDArray[Any]:
             last = np.moveaxis(np.asarray(leaf), 0, -1)
-            return last[:, :, None] if is_laid_by_loop(shape, stand_ins) else last
+            return last[:, None] if is_laid_by_loop(shape, stand_ins) else last
 
         return Run(jax.tree.map(np.asarray, found), jax.tree.map(laid, columns, shapes))
 
@@ -287,21 +295,21 @@ def _cores() -> int:
 
 
 class _Compiled:
-    """The kernel of a program."""
+    """The kernel of a program, for blocks of lanes so many vectors wide."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Program, vectors: int) -> None:
         self.program, self.lengths = program, program.stand_ins
         widest = max(
             (np.dtype(a.dtype).itemsize for a in program.arguments if _is_real(a.dtype)), default=8
         )
-        self.width = max(register_bytes() // widest, 1)
+        self.width = max(vectors * register_bytes() // widest, 1)
         self.structure: Any
         self.outputs: list[jax.ShapeDtypeStruct]
         self.moved: list[bool]
         if program.key is None:
             self.structure, self.outputs, self.moved, code = self._made()
         else:
-            head, _, code = kept(program.key, self._to_keep).partition(b"\n")
+            head, _, code = kept(f"{program.key} {self.width}", self._to_keep).partition(b"\n")
             known = json.loads(head)
             self.structure = PyTreeDef.deserialize_using_proto(
                 default_registry, bytes.fromhex(known["structure"])
@@ -390,8 +398,7 @@ class _Compiled:
                 continue
             own = tuple(sizes.get(n, n) for n in shape.shape)
             if moved:
-                axis = 1 if is_laid_by_loop(shape, self.lengths) else 0
-                own = (*own[:axis], passes, *own[axis:], at_once)
+                own = (passes, *own, at_once)
             found.append(np.empty((lanes, *own), shape.dtype))
         ins, outs = _addresses(given), _addresses(found)
         values = (ctypes.c_int64 * max(len(self.lengths), 1))(

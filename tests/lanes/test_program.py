@@ -7,6 +7,7 @@ import logging
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ def flat(run, columns=5):
     return [
         *jax.tree.leaves(rows),
         run.values[1],
-        *(joined(moved_rows[name], columns, axis=2) for name in ("state", "twice")),
+        *(joined(moved_rows[name], columns) for name in ("state", "twice")),
         moved,
     ]
 
@@ -82,6 +83,19 @@ def test_one_program_serves_every_length_and_every_number_of_lanes(program, coun
     want = program.by_xla(values, tangents, turns=turns)
     for mine, theirs in zip(flat(got), flat(want), strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
+
+
+def test_many_lanes_in_wider_blocks_give_what_few_do():
+    still = {name: replace(argument, moves=False) for name, argument in ARGUMENTS.items()}
+    program, count = Program(filtered, still), lanes.program.MANY + 3
+    values, _ = given(count, 9)
+    few = {name: v if name == "gain" else v[..., -5:] for name, v in values.items()}
+    wide, narrow = program(values, lanes=count, turns=9), program(few, lanes=5, turns=9)
+    assert len({kernel.width for kernel in program._kernels.values()}) == 2
+    for many, some in zip(
+        jax.tree.leaves(wide.values), jax.tree.leaves(narrow.values), strict=True
+    ):
+        np.testing.assert_allclose(many[-5:], some, rtol=1e-14)
 
 
 @pytest.mark.parametrize("count", [1, 3, 4, 9])

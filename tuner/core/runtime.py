@@ -11,6 +11,7 @@ Whatever the user has set in the environment stays.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import logging
 import os
@@ -58,6 +59,12 @@ that jax traces is hundreds of thousands of objects that stay, which Python's ow
 again and again."""
 
 
+_KEPT_MEMORY = 2**28
+"""bytes that arrays have left and that stay for the next ones. Every simulation fills arrays anew;
+given back and fetched again, their memory takes the system a third of a sweep's time."""
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _LARGEST = -1, -3, 2**25
+"""Of glibc's mallopt, and the largest threshold that it takes."""
+
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """How many threads linear algebra has, by library."""
 
@@ -91,6 +98,14 @@ def collect_rarely() -> None:
         gc.set_threshold(*_COLLECT_AFTER)
 
 
+def keep_memory() -> None:
+    """Have the C library keep the memory of arrays for the next ones, where it is glibc."""
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if os.name == "posix" else None
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _LARGEST)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT_MEMORY)
+
+
 def configure(*, keep_compiled: bool = True) -> None:
     """Set jax up for simulation; call it once, before the first computation.
 
@@ -106,6 +121,7 @@ def configure(*, keep_compiled: bool = True) -> None:
     """
     set_environment()
     collect_rarely()
+    keep_memory()
     import jax  # noqa: PLC0415 (must come after the environment, and is slow)
 
     if keep_compiled:

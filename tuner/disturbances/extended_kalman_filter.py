@@ -191,7 +191,7 @@ def innovations(
     white = np.moveaxis(run.values[0], 0, -1)
     if directions is None:
         return white, np.zeros((0, *white.shape))
-    by_pass = np.moveaxis(run.columns[1], (2, -1, 0), (0, 1, -1))
+    by_pass = np.moveaxis(run.columns[1], (1, -1, 0), (0, 1, -1))
     return white, by_pass.reshape(-1, *by_pass.shape[2:])
 
 

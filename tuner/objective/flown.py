@@ -53,7 +53,7 @@ class Flown(NamedTuple):
     channels
         Channel -> (F, samples, c).
     columns
-        Channel -> (F, samples, passes, c, columns of a pass) derivatives, as of a `lanes.Run`; None
+        Channel -> (F, passes, samples, c, columns of a pass) derivatives, as of a `lanes.Run`; None
         where nothing moves.
     crash_time
         (F,) s, infinite for a segment that flew.

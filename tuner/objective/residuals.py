@@ -102,7 +102,7 @@ def residuals(
     most = int(used.sum(axis=1).max(initial=0))
     order = np.argsort(~used, axis=1, kind="stable")[:, :most]
     log, moved_log = _Series(flown.channels[name]), flown.columns[name]
-    columns = None if moved_log is None else _Series(moved_log)
+    columns = None if moved_log is None else _Series(moved_log, by_pass=True)
     together = max(block // max(most, 1), 1)
     for first in range(0, len(time), together):
         some = slice(first, first + together)
@@ -135,7 +135,7 @@ def _compared(
     before = reading.columns if reading.coefficients is None else reading.coefficients
     after = before + reading.total - reading.columns
     if columns is not None:
-        moved = joined(place.read(columns), reading.columns, axis=2)
+        moved = joined(place.read(columns), reading.columns)
         by_column[..., :before] = moved[..., :before]
         by_column[..., after:] = moved[..., before:]
     if reading.coefficients is not None:
@@ -199,20 +199,26 @@ def _risen(share: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class _Series:
-    """A log (F, samples, *rest), read at fractional sample numbers (G, m)."""
+    """A log (F, samples, *rest), or (F, passes, samples, *rest), read at fractional sample numbers.
 
-    def __init__(self, rows: NDArray[np.float64]) -> None:
-        self.samples, self.rest = rows.shape[1], rows.shape[2:]
-        self.flat = rows.reshape(rows.shape[0] * self.samples, -1)
+    These are (G, m), and what is read is (G, m, *rest), or (G, passes, m, *rest).
+    """
+
+    def __init__(self, rows: NDArray[np.float64], *, by_pass: bool = False) -> None:
+        self.passes = rows.shape[1] if by_pass else None
+        self.samples, *self.rest = rows.shape[2 if by_pass else 1 :]
+        self.flat = rows.reshape(-1, int(np.prod(self.rest)))
 
     def below(self, place: NDArray[np.float64]) -> NDArray[np.intp]:
         return np.clip(np.floor(place + 1e-6).astype(np.intp), 0, self.samples - 2)
 
     def at(self, segments: NDArray[np.intp], number: NDArray[np.intp]) -> NDArray[np.float64]:
-        rows: NDArray[np.float64] = np.take(
-            self.flat, (segments * self.samples + number).ravel(), axis=0
-        )
-        return rows.reshape(*number.shape, *self.rest)
+        if self.passes is not None:
+            segments = segments[:, None] * self.passes + np.arange(self.passes)[:, None]
+            number = number[:, None]
+        row = segments * self.samples + number
+        rows: NDArray[np.float64] = np.take(self.flat, row.ravel(), axis=0)
+        return rows.reshape(*row.shape, *self.rest)
 
     def mixed(
         self,
@@ -224,6 +230,8 @@ class _Series:
         below = self.below(place)
         first, second = self.at(segments, below), self.at(segments, below + 1)
         share = share_of(place - below)
+        if self.passes is not None:
+            share = share[:, None]
         second -= first
         second *= share.reshape(*share.shape, *[1] * (second.ndim - share.ndim))
         second += first

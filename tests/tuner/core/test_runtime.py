@@ -1,6 +1,7 @@
 import gc
 import json
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -14,11 +15,16 @@ import json, os
 {before}
 from tuner.core import runtime
 runtime.configure()
-import jax, jax.numpy as jnp
+import jax, jax.numpy as jnp, numpy, resource
+def fault():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        [numpy.ones(500_000) for _ in range(10)]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 print(json.dumps(dict(
     dtype=str(jnp.zeros(2).dtype), nproc=os.environ["NPROC"],
     cache=jax.config.jax_compilation_cache_dir,
-    answer=float(jnp.arange(4.0).sum()), line=runtime.describe(),
+    faults=[fault(), fault()], answer=float(jnp.arange(4.0).sum()), line=runtime.describe(),
 )))
 """
 
@@ -46,6 +52,15 @@ def test_one_thread_double_precision_and_a_kept_cache(tmp_path: Path) -> None:
     assert report["answer"] == 6.0
     assert any((tmp_path / "multirotor-tune" / "compiled").iterdir())
     assert "NPROC=1" in str(report["line"])
+
+
+def test_the_memory_of_arrays_stays_for_the_next_ones(tmp_path: Path) -> None:
+    """Else each of these ten of a thousand pages is fetched from the system again."""
+    if platform.libc_ver()[0] != "glibc":
+        pytest.skip("another C library")
+    faults = in_fresh_python(tmp_path)["faults"]
+    assert isinstance(faults, list)
+    assert faults[1] < 1000
 
 
 def test_what_the_user_has_set_stays(tmp_path: Path) -> None:
