@@ -5,6 +5,7 @@ Operands are scalars or vectors of one width; a rule does not see which.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, TypeAlias
@@ -22,7 +23,7 @@ CONTRACT = ("contract",)
 """A product may be fused with a sum. Nothing else of fast-math is safe: without NaN and infinity
 the test for a crash is folded away."""
 
-BOOL = ir.IntType(1)
+BOOL, I32, I64 = (ir.IntType(bits) for bits in (1, 32, 64))
 TYPES: Mapping[np.dtype[Any], ir.Type] = {
     np.dtype(np.float64): ir.DoubleType(),
     np.dtype(np.float32): ir.FloatType(),
@@ -285,9 +286,68 @@ def _reciprocal_root(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
     return e.b.fdiv(e.number(x, 1.0), e.intrinsic("sqrt", x), flags=CONTRACT)
 
 
-def _logistic(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+_LOG_2E = 1.4426950408889634
+_EXPONENTS = {
+    ir.DoubleType(): (I64, 52, 1.90821492927058770002e-10, 0.693147180369123816490, -746.0, 710.0),
+    ir.FloatType(): (I32, 23, -2.12194440e-4, 0.693359375, -104.0, 89.0),
+}
+"""Whole numbers as wide, bits of the fraction, ln 2 as a small part and one whose multiples have no
+rounding error, and beyond which numbers the exponential is zero and infinite."""
+
+
+def _exponential(e: Emitter, x: ir.Value) -> tuple[ir.Value, ir.Value, ir.Value, ir.Value]:
+    """Return q, s, t, 1/t with exp x = (1 + q)·s·t, s and t powers of two.
+
+    x is k·ln 2 and a rest of half a ln 2 at most, whose exponential is summed up. A function of
+    the C library would be called lane by lane.
+    """
+
+    def number(value: float) -> ir.Value:
+        return e.number(x, value)
+
+    def plus(a: ir.Value, b: ir.Value, factor: ir.Value) -> ir.Value:
+        return e.b.fadd(e.b.fmul(b, factor, flags=CONTRACT), a, flags=CONTRACT)
+
+    integer, fraction, small, large, lowest, highest = _EXPONENTS[base(x.type)]
+    whole = e.vector(integer) if is_vector(x) else integer
+    within = e.select(e.b.fcmp_ordered(">", x, number(highest)), number(highest), x)
+    within = e.select(e.b.fcmp_ordered("<", within, number(lowest)), number(lowest), within)
+    # a number so large has no fraction: the last bits of the sum are k
+    round_to = number(1.5 * 2.0**fraction)
+    rounded = plus(round_to, within, number(_LOG_2E))
+    k = e.b.fsub(rounded, round_to)
+    rest = plus(plus(within, k, number(-large)), k, number(-small))
+    terms = 14 if fraction == 52 else 9
+    total = number(1.0 / math.factorial(terms))
+    for order in range(terms - 1, 1, -1):
+        total = plus(number(1.0 / math.factorial(order)), total, rest)
+    q = plus(rest, e.b.fmul(rest, rest, flags=CONTRACT), total)
+    count = e.b.sub(e.b.bitcast(rounded, whole), e.b.bitcast(round_to, whole))
+    half = e.b.ashr(count, constant(whole, 1))
+
+    def two_to(power: ir.Value) -> ir.Value:
+        bias = constant(whole, 1023 if fraction == 52 else 127)
+        return e.b.bitcast(e.b.shl(e.b.add(power, bias), constant(whole, fraction)), x.type)
+
+    other = e.b.sub(count, half)
+    return q, two_to(half), two_to(other), two_to(e.b.neg(other))
+
+
+def _exp(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    q, s, t, _ = _exponential(e, x)
+    return e.b.fmul(e.b.fmul(e.b.fadd(q, e.number(x, 1.0)), s), t)
+
+
+def _expm1(e: Emitter, _: Parameters, x: ir.Value) -> ir.Value:
+    q, s, t, inverse = _exponential(e, x)
+    rest = e.b.fmul(t, e.b.fadd(e.b.fmul(q, s), e.b.fsub(s, inverse)))
+    tiny = e.b.fcmp_ordered("<", e.intrinsic("fabs", x), e.number(x, 1e-30))
+    return e.select(tiny, x, rest)  # the sign of zero, and what has no square
+
+
+def _logistic(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
     one = e.number(x, 1.0)
-    return e.b.fdiv(one, e.b.fadd(one, e.intrinsic("exp", e.b.fneg(x))))
+    return e.b.fdiv(one, e.b.fadd(one, _exp(e, p, e.b.fneg(x))))
 
 
 def _round(e: Emitter, p: Parameters, x: ir.Value) -> ir.Value:
@@ -382,10 +442,10 @@ ELEMENTWISE: dict[str, Rule] = {
     "sqrt": _intrinsic("sqrt"),
     "rsqrt": _reciprocal_root,
     "cbrt": _libm("cbrt"),
-    "exp": _intrinsic("exp"),
+    "exp": _exp,
     "exp2": _intrinsic("exp2"),
     "log": _intrinsic("log"),
-    "expm1": _libm("expm1"),
+    "expm1": _expm1,
     "log1p": _libm("log1p"),
     "sin": _intrinsic("sin"),
     "cos": _intrinsic("cos"),

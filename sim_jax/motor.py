@@ -42,33 +42,40 @@ class SecondLag(eqx.Module):
     """τ₂, s."""
     step: Scalar | float
     """s."""
+    acts: Flag
+    steps: Scalar
+    """The step over τ₂ where it lags."""
+    decay: Scalar
+    """Which share of e a step leaves where it lags."""
+    mean: Scalar
+    """Its mean over the step."""
+
+    @staticmethod
+    def over(time_constant: Scalar, step: Scalar | float) -> SecondLag:
+        """Prepare a step of ``step`` s; the time constant is τ₂ in s."""
+        acts = time_constant > INSTANT
+        steps = step / jnp.where(acts, time_constant, 1.0)
+        return SecondLag(time_constant, step, acts, steps, jnp.exp(-steps), _mean_decay(steps))
 
     def decays(self) -> tuple[Scalar, Scalar]:
         """Return which share of e a step leaves, and its mean over the step."""
-        acts, steps = self._steps()
-        left = jnp.where(acts, jnp.exp(-steps), 0.0)
-        return left, jnp.where(acts, _mean_decay(steps), 0.0)
+        return jnp.where(self.acts, self.decay, 0.0), jnp.where(self.acts, self.mean, 0.0)
 
-    def carried(self, time_constant: Scalar, decay: Scalar, mean: Scalar) -> tuple[Scalar, Scalar]:
+    def carried(
+        self, time_constant: Scalar, own: Scalar, decay: Scalar, mean: Scalar
+    ) -> tuple[Scalar, Scalar]:
         """Return which share of e is in g after a step, and its mean over the step.
 
         Parameters
         ----------
-        time_constant, decay, mean
-            τ in s, the share of g that a step leaves, and its mean over the step.
+        time_constant, own, decay, mean
+            τ in s, the step over it, the share of g that a step leaves, and its mean over the step.
         """
-        acts, steps = self._steps()
-        own = self.step / time_constant
-        slower = jnp.where(steps < own, jnp.exp(-steps), decay)
-        both = slower * _mean_decay(jnp.abs(steps - own))
-        after, during = own * both, _mean_decay(steps) - both
+        slower = jnp.where(self.steps < own, self.decay, decay)
+        both = slower * _mean_decay(jnp.abs(self.steps - own))
+        after, during = own * both, self.mean - both
         lead = self.time_constant / (time_constant - jnp.minimum(self.time_constant, 0.0))
-        return jnp.where(acts, after, lead * decay), jnp.where(acts, during, lead * mean)
-
-    def _steps(self) -> tuple[Flag, Scalar]:
-        """Return whether it lags, and the step over τ₂ where it does."""
-        acts = self.time_constant > INSTANT
-        return acts, self.step / jnp.where(acts, self.time_constant, 1.0)
+        return jnp.where(self.acts, after, lead * decay), jnp.where(self.acts, during, lead * mean)
 
 
 class Lag(eqx.Module):
@@ -83,7 +90,9 @@ class Lag(eqx.Module):
     slope: LagSlope | None = None
     second: SecondLag | None = None
     constants: tuple[Scalar, ...] = ()
-    """Both time constants, s; for a second lag alone."""
+    """Both time constants, s; for a slope and a second lag."""
+    carried: tuple[tuple[Scalar, Scalar], ...] = ()
+    """What the second lag carries over with both; where nothing changes them."""
 
     @staticmethod
     def over(
@@ -105,16 +114,20 @@ class Lag(eqx.Module):
         second
             s, of a second lag before the rotor's own.
         """
-        up, down = step / motor.time_constant_up, step / motor.time_constant_down
+        constants = motor.time_constant_up, motor.time_constant_down
+        up, down = (step / constant for constant in constants)
+        decays, means = (jnp.exp(-up), jnp.exp(-down)), (_mean_decay(up), _mean_decay(down))
+        lag = None if second is None else SecondLag.over(second, step)
         return Lag(
-            decay_up=jnp.exp(-up),
-            decay_down=jnp.exp(-down),
-            mean_up=_mean_decay(up),
-            mean_down=_mean_decay(down),
+            *decays,
+            *means,
             steps=() if slope is None else (up, down),
             slope=slope,
-            second=None if second is None else SecondLag(second, step),
-            constants=() if second is None else (motor.time_constant_up, motor.time_constant_down),
+            second=lag,
+            constants=() if lag is None or slope is None else constants,
+            carried=()
+            if lag is None or slope is not None
+            else tuple(map(lag.carried, constants, (up, down), decays, means)),
         )
 
     def advance(
@@ -124,19 +137,13 @@ class Lag(eqx.Module):
 
         ``lagged``: the reference speed before the step as the second lag leaves it.
         """
+        gap = speed - reference
         if self.second is None or lagged is None:
-            decay, mean = self._decays(speed, reference > speed)
-            gap = speed - reference
+            decay, mean, _ = self._decays(speed, reference > speed)
             return reference + decay * gap, reference + mean * gap
         behind = lagged - reference
         rising = reference + self.second.decays()[1] * behind > speed
-        decay, mean = self._decays(speed, rising)
-        up, down = self.constants
-        constant = jnp.where(rising, up, down)
-        if self.slope is not None:
-            constant = constant * self.slope.stretch(speed)
-        after, during = self.second.carried(constant, decay, mean)
-        gap = speed - reference
+        decay, mean, (after, during) = self._decays(speed, rising)
         return reference + decay * gap + after * behind, reference + mean * gap + during * behind
 
     def lag_reference(self, lagged: Scalar, reference: Scalar) -> Scalar:
@@ -144,16 +151,28 @@ class Lag(eqx.Module):
         assert self.second is not None
         return reference + self.second.decays()[0] * (lagged - reference)
 
-    def _decays(self, speed: Scalar, rising: Flag) -> tuple[Scalar, Scalar]:
-        """Return which share of a gap the step leaves, and its mean over the step."""
-        if self.slope is not None:
-            up, down = self.steps
-            steps = jnp.where(rising, up, down) / self.slope.stretch(speed)
-            return jnp.exp(-steps), _mean_decay(steps)
-        return (
-            jnp.where(rising, self.decay_up, self.decay_down),
-            jnp.where(rising, self.mean_up, self.mean_down),
-        )
+    def _decays(
+        self, speed: Scalar, rising: Flag
+    ) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
+        """Return which share of a gap the step leaves, its mean over the step, what is carried."""
+        if self.slope is None:
+            decay, mean = (
+                jnp.where(rising, up, down)
+                for up, down in (
+                    (self.decay_up, self.decay_down),
+                    (self.mean_up, self.mean_down),
+                )
+            )
+            both = zip(*self.carried, strict=True)
+            return decay, mean, tuple(jnp.where(rising, up, down) for up, down in both)
+        stretch = self.slope.stretch(speed)
+        steps = jnp.where(rising, *self.steps) / stretch
+        mean = _mean_decay(steps)
+        decay = 1.0 - steps * mean
+        if self.second is None:
+            return decay, mean, ()
+        constant = jnp.where(rising, *self.constants) * stretch
+        return decay, mean, self.second.carried(constant, steps, decay, mean)
 
 
 class SwitchedLag(eqx.Module):
