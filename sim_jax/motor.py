@@ -151,9 +151,7 @@ class Lag(eqx.Module):
         assert self.second is not None
         return reference + self.second.decays()[0] * (lagged - reference)
 
-    def _decays(
-        self, speed: Scalar, rising: Flag
-    ) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
+    def _decays(self, speed: Scalar, rising: Flag) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
         """Return which share of a gap the step leaves, its mean over the step, what is carried."""
         if self.slope is None:
             decay, mean = (

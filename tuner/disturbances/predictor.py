@@ -33,7 +33,6 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.objective.tunable import tunable_of
 from tuner.recordings.flight import Flight
-from tuner.vehicle.model import with_terms_computed
 
 Array = NDArray[np.float64]
 
@@ -68,8 +67,6 @@ class Predictor:
         (7,) of the disturbances, and of the noise of commands.
     noise
         Channel -> factor on the samples' standard deviations.
-    computed
-        Terms that are flown even where a model lacks them, so that one program serves all models.
     found
         What the filter makes of the recordings: None before it has run.
     """
@@ -79,7 +76,6 @@ class Predictor:
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
     noise: Mapping[str, float]
-    computed: tuple[str, ...] = ()
     found: Filtered | None = None
 
     @staticmethod
@@ -87,7 +83,6 @@ class Predictor:
         objective: Objective,
         point: Point,
         flights: Sequence[Flight],
-        computed: tuple[str, ...] = (),
     ) -> Predictor | None:
         """Return the predictor of some flights before anything is learnt.
 
@@ -100,8 +95,6 @@ class Predictor:
             Whole flights, and where their clocks stand.
         flights
             F flights in the order of the segments.
-        computed
-            Terms to be flown even where a model lacks them.
         """
         segments, schedule = objective.segments, objective.schedule
         offsets = np.array(point.offsets)
@@ -131,7 +124,6 @@ class Predictor:
             rows={name: rows for name, (_, rows) in laid.items()},
             strengths=USUAL,
             noise=dict.fromkeys(channels, 1.0),
-            computed=computed,
         )
 
     def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
@@ -139,7 +131,7 @@ class Predictor:
 
         Before it has run.
         """
-        laid = Predictor.of(objective, point, flights, self.computed)
+        laid = Predictor.of(objective, point, flights)
         assert laid is not None
         return replace(laid, strengths=self.strengths, noise=self.noise)
 
@@ -253,8 +245,7 @@ class Predictor:
         factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
-        model = with_terms_computed(objective.model, self.computed)
-        tunable = tunable_of(model, objective.space)
+        tunable = tunable_of(objective.model, objective.space)
         return Expected(tunable, *map(jnp.asarray, (point.coefficients, strengths, noise)))
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -54,7 +54,7 @@ from tuner.search.least_squares import FAR
 from tuner.search.problem import limits_of
 from tuner.search.progress import plain_criterion
 from tuner.vehicle import ControllerFile, VehicleFile, check_mixer, read_vehicle
-from tuner.vehicle.model import Model, model_of, schedule_of, with_terms_computed
+from tuner.vehicle.model import Model, model_of, schedule_of
 
 POSE = ("position", "attitude")
 LAG = 0.03
@@ -120,7 +120,6 @@ class Comparison:
         self,
         vehicle: VehicleFile,
         *,
-        computed: Collection[str] = (),
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors with a vehicle, in the recordings' order.
@@ -129,9 +128,6 @@ class Comparison:
         ----------
         vehicle
             What flies.
-        computed
-            Coefficients of terms that are computed although the vehicle may lack them, so that
-            vehicles with and without them share a program.
         flier
             What flies segments: another simulator than this project's.
 
@@ -142,7 +138,7 @@ class Comparison:
         """
         errors: dict[str, FlightErrors] = {}
         for group in self._groups:
-            errors |= group.fly(vehicle, computed=computed, flier=flier)
+            errors |= group.fly(vehicle, flier=flier)
         return {name: errors[name] for name in self._names}
 
 
@@ -207,7 +203,6 @@ class _Group:
         vehicle: VehicleFile,
         *,
         fitted_starts: bool = False,
-        computed: Collection[str] = (),
         flier: Callable[..., Flown] = fly,
     ) -> dict[str, FlightErrors]:
         """Return flight name to its errors, those of windows behind each other."""
@@ -215,7 +210,6 @@ class _Group:
             check_mixer(vehicle)
         flights = [recording.flight for recording in self._recordings]
         model = model_of(with_reference_voltage(vehicle, flights), self._controller)
-        model = with_terms_computed(model, computed)
         segments, states = self._segments, None
         if fitted_starts:
             segments = self._laid(free_starts=True)

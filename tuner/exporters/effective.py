@@ -11,7 +11,7 @@ the run ended with them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -116,7 +116,7 @@ def effective_fit(
         if conditions not in comparisons:
             still = replace(fitted, point=_without_conditions(fitted, conditions))
             comparisons[conditions] = comparison_of(job, still)
-        errors = comparisons[conditions].fly(flying, computed=_effects(names))
+        errors = comparisons[conditions].fly(flying)
         return {name: flight.rmse for name, flight in errors.items()}
 
     result = _result(
@@ -308,10 +308,6 @@ def _without_conditions(fitted: Fitted, names: Collection[str]) -> Point:
     return Point(fitted.point.coefficients, fitted.point.offsets * keep[:, None])
 
 
-def _effects(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in names if name in COEFFICIENTS and COEFFICIENTS[name].is_effect)
-
-
 def pose_rmse(flights: Iterable[AxesRmse]) -> PoseRmse:
     """Return the root mean square over flights of what each misses; a crash leaves none of it.
 
@@ -483,7 +479,7 @@ def effective_in(run: Run, simulator: Simulator) -> tuple[VehicleFile, Effective
     comparison = Comparison(still, settings.controller, window=settings.job.search.window)
 
     def flown(vehicle: VehicleFile, _: Collection[str]) -> dict[str, AxesRmse]:
-        errors = comparison.fly(vehicle, computed=_effects(names))
+        errors = comparison.fly(vehicle)
         return {name: flight.rmse for name, flight in errors.items()}
 
     start = bare if simulator.start is None else simulator.flown(simulator.start(run.vehicle))

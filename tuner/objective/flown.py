@@ -30,7 +30,13 @@ from sim_jax.state import Start, State
 from sim_jax.terms import total
 from tuner.objective.flight import MOTION, SPEEDS, TURNED, beginning_of, recorded_of
 from tuner.objective.segments import Segments
-from tuner.vehicle.model import Model, coefficients_in, with_coefficients
+from tuner.vehicle import COEFFICIENTS
+from tuner.vehicle.model import (
+    Model,
+    coefficients_in,
+    with_coefficients,
+    with_terms_computed,
+)
 
 Array = NDArray[np.float64]
 
@@ -41,6 +47,9 @@ AT_ONCE = 2
 instruction cache and takes longer to build."""
 
 
+EFFECTS = tuple(name for name, row in COEFFICIENTS.items() if row.is_effect)
+TERMS = tuple(name for name in EFFECTS if COEFFICIENTS[name].group)
+"""Coefficients beyond the base model, and those of them that a fit may add."""
 CODE = ("sim_jax", "tuner")
 """Packages whose code is run while a program of this one is traced."""
 
@@ -119,11 +128,12 @@ def fly(
     channels
         What is logged; by default what was measured.
     """
+    if conditions or {*model.vehicle.effects, *coefficients}.intersection(EFFECTS):
+        model, conditions = _with_all(model, segments, conditions)
     names = tuple(segments.measured) if channels is None else channels
     moves = tangents is not None
     logged = names if moves else tuple(dict.fromkeys((*LOGGED, *names)))
-    if not moves:
-        coefficients = {**coefficients_in(model), **coefficients}
+    coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
     if segments.freedom is not None and states is None:
         states = np.zeros(np.shape(segments.freedom))
@@ -159,6 +169,20 @@ def fly(
         still if run.columns is None else run.columns[0],
         crash_time,
     )
+
+
+def _with_all(
+    model: Model, segments: Segments, conditions: Mapping[str, Any]
+) -> tuple[Model, dict[str, Any]]:
+    """Return model and conditions with all terms, and all that surrounds, at neutral values.
+
+    So two programs serve all that flies alike: of the base model, and of any terms beyond it.
+    """
+    around = ["wind_x", "wind_y"]
+    if segments.log_voltage is None:
+        around.append("battery_decline")
+    calm = dict.fromkeys(around, np.zeros(segments.count))
+    return with_terms_computed(model, TERMS), {**calm, **conditions}
 
 
 def flown_part(segments: Segments) -> Segments:
