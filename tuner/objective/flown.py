@@ -29,6 +29,7 @@ from sim_jax.schedule import Schedule
 from sim_jax.state import Start, State
 from sim_jax.terms import total
 from tuner.objective.flight import MOTION, SPEEDS, TURNED, beginning_of, recorded_of
+from tuner.objective.initial_conditions import SPIN
 from tuner.objective.segments import Segments
 from tuner.vehicle import COEFFICIENTS
 from tuner.vehicle.model import (
@@ -135,13 +136,16 @@ def fly(
     logged = names if moves else tuple(dict.fromkeys((*LOGGED, *names)))
     coefficients = {**coefficients_in(model), **coefficients}
     own = not moves or any(np.ndim(value) for value in coefficients.values())
-    if segments.freedom is not None and states is None:
+    if segments.freedom is None:  # as flights with a spin have it: one program serves both
+        nothing = np.zeros((len(SPIN), segments.count))
+        segments = replace(segments, freedom=nothing, freed=SPIN)
+    if states is None:
         states = np.zeros(np.shape(segments.freedom))
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},
         segments=flown_part(segments),
-        states=None if segments.freedom is None else states,
+        states=states,
         conditions=dict(conditions),
     )
     if own:
@@ -263,9 +267,7 @@ def _directions(given: _Given, tangents: Mapping[str, Array]) -> list[Array]:
     count = len(next(iter(tangents.values())))
     still = np.zeros(count)
     moved = [tangents.get(name, still) for name in sorted(given.coefficients)]
-    if given.states is not None:
-        length = np.shape(given.states)[0]
-        moved.append(tangents.get("states", np.zeros((count, length))))
+    moved.append(tangents.get("states", np.zeros((count, len(given.states)))))
     return [*moved, *(tangents.get(name, still) for name in sorted(given.conditions))]
 
 

@@ -44,6 +44,8 @@ ROWS: Mapping[str, slice] = {
 }
 """State -> its rows in the vector of a start."""
 
+SPIN = (ROWS["position"].start, ROWS["position"].start + 1, ROWS["rate_integral"].stop - 1)
+"""Rows of what a spin does not forget: position across, and the yaw integrator."""
 YAW_INTEGRAL_GAIN, TICKS = 0.1, 2.0
 """PX4's default of MC_YAWRATE_I; and by how many ticks it is open when it integrates."""
 
@@ -76,14 +78,9 @@ def freedom_of_spin(
     position
         (F,) m, standard errors of where the flights are taken to begin.
     """
-    spins = yaw_rate != 0.0
-    x, y, _ = range(*ROWS["position"].indices(_ENDS[-1]))
-    yaw = ROWS["rate_integral"].stop - 1
-    return {
-        x: position * spins,
-        y: position * spins,
-        yaw: TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate,
-    }
+    swaying = position * (yaw_rate != 0.0)
+    integral = TICKS * YAW_INTEGRAL_GAIN * np.abs(yaw_rate) / rate
+    return dict(zip(SPIN, (swaying, swaying, integral), strict=True))
 
 
 def whole(change: Float[Array, "L F"], rows: tuple[int, ...]) -> Float[Array, "N F"]:
