@@ -154,22 +154,18 @@ class Lag(eqx.Module):
     def _decays(self, speed: Scalar, rising: Flag) -> tuple[Scalar, Scalar, tuple[Scalar, ...]]:
         """Return which share of a gap the step leaves, its mean over the step, what is carried."""
         if self.slope is None:
-            decay, mean = (
-                jnp.where(rising, up, down)
-                for up, down in (
-                    (self.decay_up, self.decay_down),
-                    (self.mean_up, self.mean_down),
-                )
-            )
+            decay = jnp.where(rising, self.decay_up, self.decay_down)
+            mean: Scalar = jnp.where(rising, self.mean_up, self.mean_down)
             both = zip(*self.carried, strict=True)
             return decay, mean, tuple(jnp.where(rising, up, down) for up, down in both)
-        stretch = self.slope.stretch(speed)
-        steps = jnp.where(rising, *self.steps) / stretch
+        stretch, (up, down) = self.slope.stretch(speed), self.steps
+        steps = jnp.where(rising, up, down) / stretch
         mean = _mean_decay(steps)
         decay = 1.0 - steps * mean
         if self.second is None:
             return decay, mean, ()
-        constant = jnp.where(rising, *self.constants) * stretch
+        up, down = self.constants
+        constant = jnp.where(rising, up, down) * stretch
         return decay, mean, self.second.carried(constant, steps, decay, mean)
 
 

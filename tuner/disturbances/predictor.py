@@ -33,6 +33,7 @@ from tuner.objective.normal import Objective
 from tuner.objective.segments import CLOCKS
 from tuner.objective.tunable import tunable_of
 from tuner.recordings.flight import Flight
+from tuner.vehicle.model import with_terms_computed
 
 Array = NDArray[np.float64]
 
@@ -67,6 +68,8 @@ class Predictor:
         (7,) of the disturbances, and of the noise of commands.
     noise
         Channel -> factor on the samples' standard deviations.
+    computed
+        Terms that are flown even where a model lacks them, so that one program serves all models.
     found
         What the filter makes of the recordings: None before it has run.
     """
@@ -76,6 +79,7 @@ class Predictor:
     rows: Mapping[str, NDArray[np.intp]]
     strengths: Array
     noise: Mapping[str, float]
+    computed: tuple[str, ...] = ()
     found: Filtered | None = None
 
     @staticmethod
@@ -83,6 +87,7 @@ class Predictor:
         objective: Objective,
         point: Point,
         flights: Sequence[Flight],
+        computed: tuple[str, ...] = (),
     ) -> Predictor | None:
         """Return the predictor of some flights before anything is learnt.
 
@@ -95,6 +100,8 @@ class Predictor:
             Whole flights, and where their clocks stand.
         flights
             F flights in the order of the segments.
+        computed
+            Terms to be flown even where a model lacks them.
         """
         segments, schedule = objective.segments, objective.schedule
         offsets = np.array(point.offsets)
@@ -124,6 +131,7 @@ class Predictor:
             rows={name: rows for name, (_, rows) in laid.items()},
             strengths=USUAL,
             noise=dict.fromkeys(channels, 1.0),
+            computed=computed,
         )
 
     def laid(self, objective: Objective, point: Point, flights: Sequence[Flight]) -> Predictor:
@@ -131,7 +139,7 @@ class Predictor:
 
         Before it has run.
         """
-        laid = Predictor.of(objective, point, flights)
+        laid = Predictor.of(objective, point, flights, self.computed)
         assert laid is not None
         return replace(laid, strengths=self.strengths, noise=self.noise)
 
@@ -245,7 +253,8 @@ class Predictor:
         factors = {**self.noise, "command": np.exp(strengths[COMMAND_NOISE])}
         noise = np.stack([np.broadcast_to(factors[name], shape) for name in widths])
         noise = noise.repeat(list(widths.values()), axis=0)
-        tunable = tunable_of(objective.model, objective.space)
+        model = with_terms_computed(objective.model, self.computed)
+        tunable = tunable_of(model, objective.space)
         return Expected(tunable, *map(jnp.asarray, (point.coefficients, strengths, noise)))
 
     def among(self, flights: NDArray[np.intp]) -> Predictor:

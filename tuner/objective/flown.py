@@ -140,7 +140,7 @@ def fly(
         nothing = np.zeros((len(SPIN), segments.count))
         segments = replace(segments, freedom=nothing, freed=SPIN)
     if states is None:
-        states = np.zeros(np.shape(segments.freedom))
+        states = np.zeros((len(segments.freed), segments.count))
     given = _Given(
         model=model,
         coefficients={name: np.asarray(value, float) for name, value in coefficients.items()},

@@ -109,12 +109,11 @@ class RecordedReference(RecordedInlet):
             Vec3.of(np.stack([c[part] for c in columns], axis=-1)) for part in range(3)
         )
         spins = [flight.yaw_rate_setpoint for flight in flights]
-        level_held = [flight.level_held for flight in flights]
         return ReferenceInlet(
             ReferencePoint(position, velocity, acceleration),
             spins=np.asarray([spin is not None for spin in spins]),
             yaw_rate=np.asarray([spin or 0.0 for spin in spins]),
-            level_held=np.asarray(level_held) if any(level_held) else None,
+            level_held=np.asarray([flight.level_held for flight in flights]),
         )
 
 
