@@ -109,6 +109,26 @@ def test_functions_of_a_real_number(name, dtype):
     agree(UNARY[name], values, rtol=unit, each=500 if name in ACCURATE else 4)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("name", ["exp", "expm1"])
+def test_an_exponential_is_right_to_two_units_in_the_last_place(name, dtype):
+    rng = np.random.default_rng(1)
+    info = np.finfo(dtype)
+    beyond, least = np.log(float(info.max)) + 2.0, np.log(float(info.tiny)) - 50.0
+    special = [0.0, -0.0, 1e-35, -1e-35, np.inf, -np.inf, np.nan, beyond, least]
+    inside = [rng.uniform(-3, 3, 500), rng.uniform(least, beyond, 500)]
+    values = np.concatenate([special, *inside]).astype(dtype)
+    program = Program(lambda x, _: UNARY[name](x), Argument((), dtype, lanes=True))
+    got = program(values, lanes=len(values)).values
+    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+        want = getattr(np, name)(values.astype(np.longdouble)).astype(dtype)
+    whole = np.isfinite(want)
+    units = np.spacing(np.maximum(np.abs(want[whole]), info.tiny))
+    assert np.max(np.abs(got[whole] - want[whole]) / units) <= 2.0
+    np.testing.assert_array_equal(got[~whole], want[~whole])
+    np.testing.assert_array_equal(np.signbit(got[:2]), np.signbit(want[:2]))
+
+
 BINARY = {
     "add": lambda x, y: x + y,
     "sub": lambda x, y: x - y,
