@@ -790,14 +790,13 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
                 to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
                 changed[to] = update[place]
             return changed
+    if not isinstance(value, Memory) or not value.storage.writable:
         flat = [x for e in update.ravel() for x in (e if isinstance(e, tuple) else (e,))]
         value = lower.spilled(
             value,
             lane=any(map(is_vector, flat)),
             column=any(isinstance(e, tuple) for e in update.ravel()),
         )
-    if not isinstance(value, Memory) or not value.storage.writable:
-        value = lower.spilled(value)
     if any(map(is_vector, starts)):
         raise UnsupportedError("a change in place at an index of each lane's own")
     if value.version != value.storage.version:

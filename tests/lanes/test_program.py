@@ -275,6 +275,29 @@ def test_an_array_changed_in_place_is_what_jax_makes_of_it(how):
     np.testing.assert_allclose(got.values, want.values, rtol=1e-12, atol=1e-12)
 
 
+def test_a_long_constant_that_a_loop_reads_is_changed_to_each_lanes_own():
+    empty = jnp.zeros((7, 4))
+
+    def function(given, lengths):
+        def turn(state, number):
+            def push(place, total):
+                line = lax.dynamic_update_index_in_dim(empty, total * state, place, 0)
+                return total + line.sum(axis=0) * 0.1
+
+            state = lax.fori_loop(0, 3, push, state)
+            return state, state
+
+        return lax.scan(turn, given, jnp.arange(lengths["turns"]))[1]
+
+    program = Program(function, Argument((4,), float, lanes=True, moves=True))
+    values, tangents = RANDOM.normal(size=(4, 5)), [RANDOM.normal(size=(2, 4))]
+    assert program.is_kernel
+    got = program(values, tangents, lanes=5, turns=6)
+    want = program.by_xla(values, tangents, turns=6)
+    np.testing.assert_allclose(got.values, want.values, rtol=1e-12)
+    np.testing.assert_allclose(got.columns, want.columns, rtol=1e-12)
+
+
 def test_what_has_no_rule_runs_through_xla_and_is_named(caplog):
     def sorted_(x, _):
         return jnp.sort(x)
