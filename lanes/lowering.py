@@ -783,13 +783,12 @@ def _dynamic_update_slice(lower: Lowering, _: JaxprEqn, operands: list[Value]) -
         lower.start_within(lower.elements(s)[()], length, size)
         for s, length, size in zip(operands[2:], value.shape, update.shape, strict=True)
     ]
-    if isinstance(value, np.ndarray):
-        if all(isinstance(s, ir.Constant) for s in starts):
-            changed = value.copy()
-            for place in np.ndindex(update.shape):
-                to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
-                changed[to] = update[place]
-            return changed
+    if isinstance(value, np.ndarray) and all(isinstance(s, ir.Constant) for s in starts):
+        changed = value.copy()
+        for place in np.ndindex(update.shape):
+            to = tuple(i + s.constant for i, s in zip(place, starts, strict=True))
+            changed[to] = update[place]
+        return changed
     if not isinstance(value, Memory) or not value.storage.writable:
         flat = [x for e in update.ravel() for x in (e if isinstance(e, tuple) else (e,))]
         value = lower.spilled(

@@ -279,7 +279,7 @@ def test_a_long_constant_that_a_loop_reads_is_changed_to_each_lanes_own():
     empty = jnp.zeros((7, 4))
 
     def function(given, lengths):
-        def turn(state, number):
+        def turn(state, _):
             def push(place, total):
                 line = lax.dynamic_update_index_in_dim(empty, total * state, place, 0)
                 return total + line.sum(axis=0) * 0.1

@@ -36,7 +36,7 @@ def robust_sd(values: ArrayLike, axis: int | tuple[int, ...] | None = None) -> A
 
 def huber_weights(error: Array, limit: float) -> Array:
     """Return Huber's weights: 1 up to a limit of the scaled error, then falling as its inverse."""
-    return np.asarray(np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-300)))
+    return np.asarray(1.0 / np.maximum(1.0, np.abs(error) / limit))
 
 
 def unit_diagonal(matrix: Array) -> Array:

@@ -5,6 +5,8 @@ the linearised loop as the state has numbers, where products of matrices would t
 operations. The m samples of a tick, whose noise is independent, are taken one after the other
 (Anderson and Moore, "Optimal filtering", 1979, 6.4), which is the Cholesky factorisation of their
 covariance, row by row; what all of them tell is taken off the covariance as it is propagated.
+It is made symmetric now and then: no sample corrects a difference between its halves, which an
+unstable vehicle lets grow from rounding errors until variances are negative.
 """
 
 from __future__ import annotations
@@ -224,14 +226,24 @@ def propagated(
     scratch = lax.fori_loop(0, size, first, scratch)
 
     def second(i: Array, into: Array) -> Array:
-        column = lax.dynamic_slice(scratch, (0, i), (size, 1))[:, 0]
-        return _with_row(into, i, follow(column))
+        return _with_row(into, i, follow(_column(scratch, i)))
 
     def added(i: Array, matrix: Array) -> Array:
         return _with_entry(matrix, i, i, _entry(matrix, i, i) + at(unrest, i))
 
     covariance = lax.fori_loop(0, size, second, covariance)
     return lax.fori_loop(0, size, added, covariance), scratch
+
+
+def symmetric(matrix: Array, count: Array) -> Array:
+    """Return a square matrix whose first rows and columns, so many, are the mean of both."""
+
+    def mean(i: Array, matrix: Array) -> Array:
+        both = 0.5 * (row(matrix, i, len(matrix)) + _column(matrix, i))
+        return lax.dynamic_update_slice(_with_row(matrix, i, both), both[:, None], (0, i))
+
+    found: Array = lax.fori_loop(0, count, mean, matrix)
+    return found
 
 
 def rows_of(function: Callable[[Array], Array], count: int) -> Array:
@@ -258,6 +270,10 @@ def _side_by_side(size: int) -> list[tuple[int, int]]:
 
 def _part(matrix: Array, number: Array, first: int, count: int) -> Array:
     return lax.dynamic_slice(matrix, (number, first), (1, count))[0]
+
+
+def _column(matrix: Array, number: Array) -> Array:
+    return lax.dynamic_slice(matrix, (0, number), (len(matrix), 1))[:, 0]
 
 
 def _entry(matrix: Array, i: Array, j: Array | int) -> Array:

@@ -5,8 +5,17 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array, lax
+from scipy.linalg import solve_discrete_are
 
-from tuner.disturbances.covariance import Samples, Sparse, innovations_of, propagated
+from tuner.disturbances.covariance import (
+    Samples,
+    Sparse,
+    innovations_of,
+    propagated,
+    symmetric,
+)
+from tuner.disturbances.extended_kalman_filter import MADE_SYMMETRIC
 
 SIZE, SHOWN, WIDE = 23, 9, 6
 
@@ -65,3 +74,40 @@ def test_samples_tell_and_time_spreads_what_products_of_matrices_say(sampled: li
     )
     expected = follow @ (covariance - gain.T @ gain) @ follow.T + np.diag(unrest)
     np.testing.assert_allclose(after, expected, atol=1e-8)
+
+
+def test_halves_that_differ_become_their_mean_and_otherwise_stay() -> None:
+    matrix = np.random.default_rng(0).standard_normal((SIZE, SIZE))
+    np.testing.assert_array_equal(symmetric(jnp.asarray(matrix), jnp.asarray(0)), matrix)
+    mean = symmetric(jnp.asarray(matrix), jnp.asarray(SIZE))
+    np.testing.assert_allclose(mean, 0.5 * (matrix + matrix.T), rtol=1e-15)
+
+
+def test_the_covariance_of_an_unstable_vehicle_settles_as_riccatis_equation_says() -> None:
+    """Halves that rounding errors let differ grow with it, until a variance is negative."""
+    rng, size, ticks = np.random.default_rng(0), 6, 4000
+    shapes = rng.standard_normal((size, size))
+    follow = shapes @ np.diag([1.02, 1.01, 1.0, 0.99, 0.9, 0.5]) @ np.linalg.inv(shapes)
+    seen = rng.standard_normal((2, size))
+    samples = Samples(
+        jnp.zeros(2),
+        jnp.ones(2),
+        Sparse.of(lambda c: [sum(map(jnp.multiply, row, c))[None] for row in seen], size),
+        lambda number: number,
+        jnp.asarray(2),
+    )
+    unrest = np.full(size, 0.01)
+
+    def tick(matrices: tuple[Array, ...], number: Array) -> tuple[tuple[Array, ...], None]:
+        covariance, gain, scratch = matrices
+        told = innovations_of(covariance, gain, samples)
+        covariance, scratch = propagated(
+            (covariance, scratch), told, samples, lambda c: follow @ c, jnp.asarray(unrest)
+        )
+        rows = jnp.where(number % MADE_SYMMETRIC == 0, size, 0)
+        return (symmetric(covariance, rows), told.gain, scratch), None
+
+    begin = jnp.eye(size), jnp.zeros((2, size)), jnp.zeros((size, size))
+    (covariance, *_), _ = lax.scan(tick, begin, jnp.arange(ticks))
+    settled = solve_discrete_are(follow.T, seen.T, np.diag(unrest), np.eye(2))
+    np.testing.assert_allclose(covariance, settled, rtol=1e-9)
